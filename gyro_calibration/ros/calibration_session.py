@@ -55,7 +55,7 @@ from gyro_calibration.model.motion import (
     read_motion,
 )
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.clock import Clock
+from gyro_calibration.ros.clock import Clock, node_time
 from gyro_calibration.ros.health_monitor import changed, HealthMonitor
 from gyro_calibration.ros.state_store import StateStore
 from gyro_calibration.ros.wheels import Velocity
@@ -83,6 +83,10 @@ _ECHOES = 256
 #: The sample with the least delay within this time shows how far stamps are behind the clock, s:
 #: few are held up for so long, and the clock of a gyro that is 3 % off moves by 15 ms in it.
 _PROMPT = 0.5
+#: By this part the stamps may be faster or slower than the clock: the clocks of gyros are 3 % off.
+_PACE = 0.05
+#: The zero that ends a drive is repeated for this time, s: the link to the base may lose one.
+_REPEATED = 1.0
 
 
 @dataclass
@@ -145,10 +149,14 @@ class Run:
         return self.times[-1] - self.times[0] if self.times else 0.0
 
     @property
+    def total(self) -> float:
+        """Return how long it takes at most, s."""
+        return LONGEST if math.isinf(self.duration) else self.duration + self.after
+
+    @property
     def progress(self) -> float:
         """Return which part is done."""
-        total = LONGEST if math.isinf(self.duration) else self.duration + self.after
-        return min(self.elapsed / total, 1.0)
+        return min(self.elapsed / self.total, 1.0)
 
     @property
     def status(self) -> str:
@@ -216,13 +224,16 @@ class Drive:
         self._begun = clock.steady()
         self._received, self._suspected, self._due = False, False, -math.inf
         self._called = self._alone = False
+        self._polled = self._begun
+        # When the pace of the stamps was last compared, and their delay then, s.
+        self._pace: tuple[float, float] | None = None
         # Time of arrival and delay, s, of samples with less delay than any before them.
         self._prompt: deque[tuple[float, float]] = deque()
         self.command_lateness = self.sample_lateness = 0.0
 
     def see_sample(self, time: float) -> None:
         """Measure how much later than the most prompt one of the last time a sample came."""
-        now = self._now()
+        now = node_time(self._clock)
         while self._prompt and self._prompt[-1][1] >= now - time:
             self._prompt.pop()
         self._prompt.append((now, now - time))
@@ -238,18 +249,39 @@ class Drive:
     def fault(self, receivers: int, ros_time_stands: bool) -> str:
         """Return why the run must end; '' where it goes on."""
         now = self._clock.steady()
+        pause, self._polled = now - self._polled, now
         if self.waits(receivers):
             return self._not_received if now - self._begun > DISCOVERY else ''
         if not receivers:
             return self._not_received
         if ros_time_stands:
             return STANDING_TIME
+        if pause > 2.0 * BLIND:
+            return (f'this computer was busy: the node was held up for {pause:.1f} s while it '
+                    'drove the robot; reduce its load and run again')
+        if astray := self._astray():
+            return astray
         # Decided at the second poll: after a pause of this process the samples that wait in its
         # queue come after its timers.
         silence = now - self._run.received
         before, self._suspected = self._suspected, silence > self._blind()
         return (f'no sample came for {silence:.2f} s while the robot was driven: check the gyro '
                 'and its driver') if before and self._suspected else ''
+
+    def _astray(self) -> str:
+        """Return that the stamps, by which the motion goes on, leave the clock; ''."""
+        if not self._prompt:
+            return ''
+        now, delay = node_time(self._clock), self._prompt[0][1]
+        then, before = self._pace or (now, delay)
+        # Samples that are held up by 0.25 s are behind a fast simulation by more.
+        limit = BLIND if self._clock.simulated() is None else 4.0 * BLIND
+        if abs(delay - before) > limit + _PACE * abs(now - then):
+            return (f'the stamps on imu/data_raw went on by {now - then - delay + before:.2f} s '
+                    f'in {now - then:.2f} s: check the clock of the driver, and use_sim_time')
+        if self._pace is None or now - then > 4.0 * _PROMPT:
+            self._pace = now, delay
+        return ''
 
     def is_abandoned(self, callers: int) -> bool:
         """Tell whether the callers of the service have left, at two polls."""
@@ -259,7 +291,7 @@ class Drive:
 
     def command(self) -> float | None:
         """Return the rate to command now, rad/s; None where the last command is young enough."""
-        now = self._now()
+        now = node_time(self._clock)
         left = self._due - now  # more than an interval where ROS time has jumped back
         if 0.5 * self.INTERVAL < left <= 1.5 * self.INTERVAL:
             return None
@@ -271,11 +303,6 @@ class Drive:
         # By the stamps, but samples that are held up do not hold up the motion.
         elapsed = max(now - self._prompt[0][1] - self._run.times[0], self._run.elapsed)
         return float(self._motion.rate_at(np.array(elapsed)))
-
-    def _now(self) -> float:
-        """Return the time of the simulation, where there is one, else of the steady clock, s."""
-        simulated = self._clock.simulated()
-        return self._clock.steady() if simulated is None else simulated
 
     _not_received = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel '
                      'to its topic, or change cmd_vel_stamped')
@@ -326,8 +353,8 @@ class CalibrationSession:
         self._rules = Rules()
         self._drive: Drive | None = None
         self._sent: deque[float] = deque(maxlen=_ECHOES)
-        self._others = self._stopped = -math.inf
-        self._suspected = False
+        self._others = self._stopped = self._repeats_until = -math.inf
+        self._begun, self._suspected = 0.0, False
 
     @property
     def drives(self) -> bool:
@@ -370,8 +397,8 @@ class CalibrationSession:
         if drives and (obstacle := obstacle or self._commanded()):
             return obstacle
         self._rules, self._suspected, self.warning = rules(values), False, ''
-        now = self._clock.steady()
-        self.run = run = Run(kind, duration, self._rules.after(kind), now, motion)
+        self._begun = node_time(self._clock)
+        self.run = run = Run(kind, duration, self._rules.after(kind), self._clock.steady(), motion)
         self._drive = Drive(run, self._clock, self._blind) if drives else None
         self._monitor.restart()
         return ''
@@ -433,6 +460,7 @@ class CalibrationSession:
         if self._drive:
             self.end('another node sent a command on cmd_vel while the robot was driven, and '
                      'controls the robot now: stop that node and run again')
+        self._repeats_until = -math.inf
 
     # Guards
 
@@ -452,6 +480,8 @@ class CalibrationSession:
 
         """
         run = self.run
+        if self._clock.steady() < self._repeats_until and not self._drive:
+            self._command(0.0)
         if run is None or run.reason is not None:
             return
         reason = conflict
@@ -464,6 +494,9 @@ class CalibrationSession:
             self.end(reason)
         elif self._drive:
             self._command_if_due(self._drive)
+        if node_time(self._clock) - self._begun > 2.0 * run.total + SILENCE:
+            self.end('the stamps on imu/data_raw go on too slowly: check the clock of the driver, '
+                     'and use_sim_time')
         suspected, self._suspected = self._suspected, self._clock.steady() - run.received > SILENCE
         if suspected and self._suspected:
             self.end(f'no sample came for {SILENCE:g} s: check the gyro and its driver')
@@ -502,7 +535,8 @@ class CalibrationSession:
         """End the run, and stop the robot at once; '' where its samples are complete."""
         if self.run and self.run.reason is None:
             self.run.reason = reason
-            self.stop_robot()
+            if self.stop_robot() and reason:
+                self._repeats_until = self._stopped + _REPEATED
 
     def finish(self) -> tuple[bool, str]:
         """Let the motion of a run by turns or by odometry be over now."""

@@ -29,6 +29,12 @@ class Clock(Protocol):
         """Return simulated time, s, 0 before the simulation starts; None without one."""
 
 
+def node_time(clock: Clock) -> float:
+    """Return the time of the simulation, s, where there is one, else of the steady clock."""
+    simulated = clock.simulated()
+    return clock.steady() if simulated is None else simulated
+
+
 class RosTime:
     """
     Whether ROS time advances.

@@ -26,7 +26,7 @@ from gyro_calibration.ros.calibration_session import (
 from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 import pytest
-from rig import PROFILE, rested, Rig, Robot
+from rig import INTERVAL, PROFILE, rested, Rig, Robot
 
 SCALE, BIAS = 0.0373, 0.01  # of the robot's gyro
 FULL = 45.0 * DEGREE
@@ -252,6 +252,78 @@ def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers
     rig.step()
     rig.pipeline.watch(1)
     assert not rig.ended
+
+
+def paced(rig, pace):
+    """Let the stamps of a rig go on from now at another pace than the clock."""
+    stamp, begin = rig.stamp, rig.clock.now
+    rig.stamp = lambda reading: stamp(reading) + round(1e9 * (pace - 1) * (rig.clock.now - begin))
+
+
+@pytest.mark.parametrize('ros, within', [(None, 1.0), (1000.0, 2.2)], ids=['host', 'simulated'])
+@pytest.mark.parametrize('pace', [1e-6, 0.3, 3.0])
+def test_stamps_that_leave_the_clock_end_a_drive(tmp_path, pace, ros, within):
+    """The motion goes on by them: where they all but stand, it would never end."""
+    rig = rested(tmp_path, calibration_drive=True, ros=ros)
+    rig.drive_to()
+    begin = rig.clock.now
+    paced(rig, pace)
+    assert rig.go(5.0, lambda: rig.ended)
+    assert rig.stopped_after(begin) < within
+    assert 'the stamps on imu/data_raw went on by' in rig.session.conclude()[1]
+
+
+def test_a_gyro_whose_clock_is_3_percent_off_is_calibrated(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    paced(rig, 1.03)
+    success, message = rig.calibrate()
+    assert success, message
+
+
+def test_stamps_that_all_but_stand_end_a_run_that_does_not_drive(tmp_path):
+    rig = rested(tmp_path)
+    paced(rig, 1e-6)
+    success, message = rig.calibrate(REST)
+    assert not success and 'go on too slowly' in message
+
+
+@pytest.mark.parametrize('timer_first', [True, False])
+def test_a_node_that_was_stopped_in_a_drive_does_not_go_on_with_it(tmp_path, timer_first):
+    """As by SIGSTOP: what came meanwhile waits, and the robot followed the last command."""
+    rig, waiting = rested(tmp_path, calibration_drive=True), []
+    rig.drive_to()
+    for _ in range(200):
+        rig.clock.now += INTERVAL
+        reading = rig.robot.step()
+        waiting.append((rig.stamp(reading), reading.output, reading.heading))
+    if timer_first:
+        rig.pipeline.watch(1)
+    for each in waiting:
+        rig.sample(*each)
+    rig.go(2 * Drive.INTERVAL)
+    assert rig.ended and rig.commands[-1][1] == 0.0
+    assert 'the node was held up for 2.0 s' in rig.session.conclude()[1]
+
+
+def test_a_stop_that_is_lost_on_the_way_is_repeated(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    command, rig.robot.command = rig.robot.command, lambda rate: None
+    assert rig.session.cancel()[0] and not rig.session.conclude()[0]
+    rig.robot.command = command
+    rig.go(3.0)
+    assert rig.robot.rate == pytest.approx(0.0, abs=1e-3)
+    assert rig.commands[-1][0] < rig.clock.now - 1.9, 'only for a second'
+
+
+def test_a_stop_is_not_repeated_once_another_node_commands(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.session.cancel()
+    rig.session.conclude()
+    sent, rig.other = len(rig.commands), 0.3
+    rig.go(2.0)
+    assert len(rig.commands) <= sent + 1 and rig.robot.rate == pytest.approx(0.3, abs=1e-3)
 
 
 # What a drive does not begin over
