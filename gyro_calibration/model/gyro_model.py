@@ -19,9 +19,9 @@ from functools import cached_property
 import math
 from typing import Any
 
-from gyro_calibration.logs.log import Array, DEGREE, Mask
+from gyro_calibration.logs.log import Array, DEGREE, Mask, Number
 from gyro_calibration.model.channels import clip, History
-from gyro_calibration.model.effects import Channels, Effect, Number
+from gyro_calibration.model.effects import Channels, Effect
 from gyro_calibration.model.noise import Noise
 import numpy as np
 

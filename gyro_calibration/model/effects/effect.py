@@ -105,11 +105,6 @@ class Parameter:
     begin_with: tuple[float, ...] = ()
 
 
-def nothing_added(_channels: Channels, *_shapes: float) -> Sequence[Number]:
-    """Return the columns of an effect that changes the signal itself: none."""
-    return ()
-
-
 @dataclass(frozen=True)
 class Effect:
     """
@@ -138,9 +133,9 @@ class Effect:
 
     name: str
     cause: str
-    looks_at: frozenset[str]
-    coefficients: tuple[Parameter, ...]
-    columns: Callable[..., Sequence[Number]]
+    looks_at: frozenset[str] = frozenset()
+    coefficients: tuple[Parameter, ...] = ()
+    columns: Callable[..., Sequence[Number]] = lambda _channels, *_shapes: ()
     shapes: tuple[Parameter, ...] = ()
     shown_by: str = ''
     nested: Callable[[Channels, Sequence[float], Sequence[float]], Number] | None = None
