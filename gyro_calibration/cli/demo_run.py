@@ -23,7 +23,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, field
-import itertools
 import math
 import os
 from pathlib import Path
@@ -120,7 +119,10 @@ class Robot:
 
     def _noise(self) -> Iterator[float]:
         for phase, values in enumerate(self.noise):
-            yield from itertools.takewhile(lambda _, phase=phase: self.phase <= phase, values)
+            for value in values:
+                if self.phase > phase:
+                    break
+                yield value
 
 
 class Client:
