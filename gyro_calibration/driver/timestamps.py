@@ -646,7 +646,8 @@ class HostClock:
             self._recent.append(_Step(step, even))
         return step
 
-    def of_sample(self, stamp: float, before: float, usual: float) -> float:
+    def of_sample(self, stamp: float, before: float, usual: float,
+                  silence: float = 0.0) -> float:
         """
         Return the time of a sample.
 
@@ -656,6 +657,8 @@ class HostClock:
         before : time of the sample before it, s; -inf for the first, which shows no step of the
             clock
         usual : interval, s; inf while it is not known
+        silence : time between their arrivals, s: over a gap it is as long as the jump of the
+            stamps, over a step of the clock it is not
 
         """
         if before == -math.inf:
@@ -664,7 +667,8 @@ class HostClock:
         interval = stamp - self._offset - before
         unshown = [step for step in self._recent if not step.shown]
         found = min(unshown, key=lambda step: abs(interval - step.size), default=None)
-        if found is None or not abs(interval - found.size) < 0.5 * abs(interval):
+        if (found is None or not abs(interval - found.size) < 0.5 * abs(interval)
+                or abs(interval - silence) < abs(interval - silence - found.size)):
             return stamp - self._offset
         found.shown = True
         left = interval - found.size

@@ -309,13 +309,17 @@ class Drive:
 
     def lateness(self, limits: Limits) -> str:
         """Return how late commands and samples were, where that exceeds the residual limit."""
-        fastest = float(np.abs(self._motion.rate_at(
-            np.linspace(0.0, self._motion.duration, 1000))).max())
-        if max(self.command_lateness, self.sample_lateness) * fastest <= limits.residual:
+        late = max(self.command_lateness, self.sample_lateness)
+        if late * _fastest(self._motion) <= limits.residual:
             return ''
         return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s '
                 f'late and samples up to {self.sample_lateness:.2f} s; reduce its load and '
                 'run again')
+
+
+def _fastest(motion: Motion) -> float:
+    """Return the fastest rate of a motion, rad/s."""
+    return float(np.abs(motion.rate_at(motion.time)).max())
 
 
 STANDING_TIME = ('ROS time stands still: start or resume the simulation that publishes /clock, or '
@@ -394,6 +398,11 @@ class CalibrationSession:
         elif kind != ODOMETRY:
             duration = REST_DURATION if kind == REST else math.inf
         drives = motion is not None and values.calibration_drive
+        if drives and motion is not None:
+            fastest, limit = _fastest(motion), self._estimator.used.rate_limit
+            if fastest > limit:
+                return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but the gyro measures '
+                        f'at most {limit / DEGREE:.0f} deg/s: correct calibration.profile_file')
         if drives and (obstacle := obstacle or self._commanded()):
             return obstacle
         self._rules, self._suspected, self.warning = rules(values), False, ''
@@ -457,6 +466,9 @@ class CalibrationSession:
                     self._sent.popleft()
                 return
         self._others = self._clock.steady()
+        if self.run and self.run.kind == REST and velocity.moves:
+            self.end('another node sent a command to move on cmd_vel during the rest: stop that '
+                     'node and run again')
         if self._drive:
             self.end('another node sent a command on cmd_vel while the robot was driven, and '
                      'controls the robot now: stop that node and run again')
@@ -616,6 +628,10 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
     """
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
     if run.kind == REST:
+        if abs(turned := _turned(run.odometry)) > _TURNED:
+            raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
+                              f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap '
+                              'odom to an odometry of the wheels')
         bias, deviation = calibrate_bias(time - time[0], rate, rules.limits, noise, output)
         return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), when,
                                run.temperature, 'rest'), ''
@@ -626,6 +642,16 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
     begin, motion = (time[0], run.motion) if run.motion is not None else _odometry_motion(run)
     return _compared(run, time - begin, rate, output, motion, rules, noise, when, prior)
+
+
+def _turned(odometry: list[tuple[float, float, float]]) -> float:
+    """Return the angle that odometry shows by its headings or its rates, rad."""
+    if len(odometry) < 2:
+        return 0.0
+    time, heading, rate = np.array(odometry).T
+    by_rates = float(np.mean(rate) * np.ptp(time))
+    by_headings = float(np.unwrap(heading)[-1] - heading[0])
+    return max(by_rates, by_headings, key=abs)
 
 
 def _odometry_motion(run: Run) -> tuple[float, Motion]:

@@ -170,7 +170,8 @@ class CompensationNode(Node):
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:
             output = math.nan  # REP-145: the message holds no rate
-        found = self._pipeline.sample(_stamp(message.header), output, known, self._receivers)
+        found = self._pipeline.sample(_stamp(message.header), output, known, self._receivers,
+                                      message.header.frame_id)
         if found is not None:
             self._publish(message, found)
         if self._waiting:

@@ -56,7 +56,8 @@ class CompensationReport:
     def _evaluate(self, growing: set[str]) -> tuple[bytes, str]:
         pipeline = self._pipeline
         silent = self._clock.steady() - pipeline.journal.received
-        if error := pipeline.store.problem or pipeline.conflict or pipeline.several:
+        if error := (pipeline.store.problem or pipeline.conflict or pipeline.several
+                     or pipeline.stuck):
             return ERROR, error
         if pipeline.ros_time.standing > max(BLIND, 1.0):
             return ERROR, STANDING_TIME
@@ -72,8 +73,9 @@ class CompensationReport:
         missing = [f'the model needs the {channel.replace("_", " ")}, which no message contains; '
                    'that effect is left out'
                    for channel in estimator.missing(pipeline.journal.channels)]
-        others = (pipeline.session.warning, store.hint, store.shared_hint, monitor.bias_alarm,
-                  monitor.noise_alarm, estimator.sentence, store.table_hint)
+        others = (pipeline.session.warning, pipeline.odometry_fault, store.hint,
+                  store.shared_hint, monitor.bias_alarm, monitor.noise_alarm, estimator.sentence,
+                  store.table_hint)
         low, high = estimator.model.temperature_range
         event = pipeline.journal.event
         counted = {

@@ -46,6 +46,13 @@ QUIET = 3.0
 _STEADY = 6.0
 #: Chance that a calibration is falsely reported to differ from the one before.
 CHANCE = 1e-3
+#: A value that comes so often, and for so long, s, is stuck: a gyro whose noise is QUIET times less
+#: than that of the model and 2 steps of its output repeats a value with a probability of 0.2.
+_REPEATS, _STUCK = 20, 0.25
+#: So many changes show the step of an output.
+_CHANGES = 100
+#: Odometry shows a turn from this rate on, rad/s.
+_TURNS = 0.05
 #: Number of stretches in a row that decide where the rest is not announced, since a robot that
 #: goes straight may shake for a while.
 _IN_A_ROW = 3
@@ -78,6 +85,46 @@ class Rest:
     bias_fits: bool
     bias_deviation: float
     announced: bool
+
+
+class StuckOutput:
+    """
+    Find out whether a gyro repeats one value: it is dead, saturated, or its driver stands.
+
+    That is so where odometry shows another turn, and where its noise is larger than the steps of
+    its output; apart from a value of zero, which some gyros report at rest.
+
+    """
+
+    def __init__(self, noise: Noise):
+        """Begin with nothing seen; `noise` of the model."""
+        self._noise, self._step, self._changes = noise, math.inf, 0
+        self._value, self._since, self._count = math.nan, 0.0, 0
+
+    def add(self, time: float, output: float, turning: float) -> bool:
+        """
+        Take a sample; tell whether it is stuck.
+
+        Parameters
+        ----------
+        time, output : s and rad/s
+        turning : rate that odometry shows, rad/s; 0 where there is none
+
+        """
+        if output != self._value:
+            self._step = min(abs(output - self._value), self._step)
+            self._value, self._since, self._count = output, time, 0
+            self._changes += 1
+            return False
+        self._count += 1
+        lasts = time - self._since
+        if self._count < _REPEATS or lasts < _STUCK:
+            return False
+        if lasts > _PART and abs(turning) > _TURNS and abs(output - turning) > 0.5 * abs(turning):
+            return True
+        sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
+        return (output != 0.0 and self._changes > _CHANGES
+                and 2.0 * QUIET * self._step < sample)
 
 
 class HealthMonitor:

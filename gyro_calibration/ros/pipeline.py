@@ -42,10 +42,10 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import BLIND, CalibrationSession, REST, STANDING_TIME
 from gyro_calibration.ros.clock import Clock, RosTime
-from gyro_calibration.ros.health_monitor import HealthMonitor
+from gyro_calibration.ros.health_monitor import HealthMonitor, StuckOutput
 from gyro_calibration.ros.parameters import Parameter
 from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.ros.wheels import COMMAND, ODOMETRY, Velocity, Wheels
+from gyro_calibration.ros.wheels import COMMAND, FRESH, ODOMETRY, Velocity, Wheels
 
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
@@ -98,6 +98,13 @@ POWER_OFF = 10.0
 _LOOKED_BACK = 0.5
 #: A mean rate is a turn from this number of standard deviations of the bias on.
 _SIGMAS = 4.0
+#: Between two samples a robot may begin and end a turn with this acceleration, rad/s²: the default
+#: of Nav2's controllers.
+_ACCELERATION = 3.2
+#: A temperature that differs by more from the one before it, K, waits for another like it.
+_LEAP = 5.0
+#: Odometry that turns by this, rad, while its rate is zero shows for some time, s, no standstill.
+_CONTRADICTION, _DISTRUST = 1.0 * DEGREE, 600.0
 #: Stamps of ROS time are below it, ns: `builtin_interfaces/Time` has 31 bits for seconds.
 _END_OF_TIME = NSEC_PER_SEC << 31
 #: Stamps that jump back twice within this time, s, are those of several publishers.
@@ -167,6 +174,8 @@ class Pipeline:
     store, estimator, monitor, wheels, session, journal, ros_time : its parts
     conflict : why the samples cannot be used, in a sentence; ''
     several : the same for publishers that are there, of which perhaps one alone sends; ''
+    stuck : that the gyro repeats one value, in a sentence; ''
+    odometry_fault : why odometry is not taken for a standstill, in a sentence; ''
 
     """
 
@@ -203,6 +212,7 @@ class Pipeline:
         self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last, self._interval = -math.inf, math.inf
         self._newest, self._jumps = 0, deque[float](maxlen=2)
+        self._frame: str | None = None
         self.several, self._switches = '', 0
         # Of a driver that was started again, which may send faster than before: when the last
         # sample arrived, s, and the longest interval since a silence, ns.
@@ -210,6 +220,10 @@ class Pipeline:
         self._good = 0.0, 0.0
         # When samples with a repeated stamp began, s, and the fastest rate among them, rad/s.
         self._standing: tuple[float, float] | None = None
+        self.stuck, self._repeats = '', StuckOutput(noise)
+        self._suspect = math.nan  # a temperature, degC
+        # What odometry's heading was when its rate became zero, rad, and when both differed, s.
+        self._stood, self._contradicted = math.nan, -math.inf
         self._recent, self._beginnings = deque[tuple[float, float]](), 0
 
     # Time
@@ -230,13 +244,13 @@ class Pipeline:
         since = self._since_epoch(stamp)
         return since if self._last == -math.inf else self._host.of_other(since, self._last)
 
-    def _time_of_sample(self, stamp: int) -> float:
-        """Return the time of a sample, s; it goes on where the clock of the host is set."""
+    def _time_of_sample(self, stamp: int, silence: float) -> float:
+        """Return the time of a sample that came after a silence; both in s."""
         since = self._since_epoch(stamp)
         if self.simulated:
             return since
         self._look_at_host_clock()
-        return self._host.of_sample(since, self._last, self._interval)
+        return self._host.of_sample(since, self._last, self._interval, silence)
 
     def _look_at_host_clock(self) -> None:
         """Take dates that the clock of the host gave before it was set for those after it."""
@@ -260,18 +274,42 @@ class Pipeline:
         time = self._time(stamp)
         if time - self._last > TEMPERATURE_TIMEOUT and self._last > -math.inf:
             time = self._last
-        self.estimator.take_temperature(time, value)
-        refused = self.estimator.refused_temperatures
-        if refused > self.journal.counts['refused_temperatures']:
-            self.journal.counts['refused_temperatures'] = refused
-            self.journal.event = f'a temperature of {value:g} degC is implausible and not used'
+        estimator, counts = self.estimator, self.journal.counts
+        refused, known = estimator.refused_temperatures, estimator.temperature
+        odd = (known is not None and not estimator.temperature_is_lost
+               and not abs(value - known) <= _LEAP and not abs(value - self._suspect) <= _LEAP)
+        self._suspect = value if odd else math.nan
+        if not odd:
+            estimator.take_temperature(time, value)
+        if odd or estimator.refused_temperatures > refused:
+            counts['refused_temperatures'] += 1
+            self.journal.event = (f'a temperature of {value:g} degC is implausible'
+                                  f'{f" after {known:g} degC" if odd else ""} and not used')
 
     def odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Take a heading, rad, and a velocity by the wheels."""
-        now, rate = self._clock.steady(), velocity.angular[2]
-        self.wheels.add(ODOMETRY, velocity, now)
+        now, rate, time = self._clock.steady(), velocity.angular[2], self._time(stamp)
+        if velocity.moves:
+            self._stood = math.nan
+        elif abs(math.remainder(heading - self._stood, math.tau)) > _CONTRADICTION:
+            self._contradicted, self._stood = now, heading
+            tracker = self.estimator.tracker
+            self.estimator.rewind(tracker.heading, tracker.variance + _CONTRADICTION ** 2)
+        elif math.isnan(self._stood):
+            self._stood = heading
+        # A late message shows nothing of now, and one that contradicts itself no standstill.
+        if not self._last - time > FRESH and (velocity.moves or not self.odometry_fault):
+            self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
-            self.session.add_odometry(self._time(stamp), heading, rate)
+            self.session.add_odometry(time, heading, rate)
+
+    @property
+    def odometry_fault(self) -> str:
+        """Return why odometry is not taken for a standstill, in a sentence; ''."""
+        if self._clock.steady() - self._contradicted > _DISTRUST:
+            return ''
+        return ('odom turns by its headings while its rate is zero: check its twist, without which '
+                'it does not show that the robot stands')
 
     def command(self, velocity: Velocity) -> None:
         """Take a command from cmd_vel, those of this node included."""
@@ -280,7 +318,7 @@ class Pipeline:
         self.session.add_command(velocity)
 
     def sample(self, stamp: int, output: float, specific_force: float | None = None,
-               receivers: int = 0) -> Output | None:
+               receivers: int = 0, frame: str = '') -> Output | None:
         """
         Take a sample.
 
@@ -290,6 +328,7 @@ class Pipeline:
         output : rad/s
         specific_force : along the input axis, m/s², where it came
         receivers : number of other nodes that receive cmd_vel
+        frame : of the gyro
 
         Returns
         -------
@@ -298,22 +337,27 @@ class Pipeline:
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
-        if not 0 <= stamp < _END_OF_TIME:
+        if not max(0, -self._delay) <= stamp < _END_OF_TIME - max(0, self._delay):
             counts['refused_samples'] += 1
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
                              'time; the sample is not used')
             return None
         if stamp < self._newest:
-            self._see_jump(now)
+            self._see_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
+        if frame != self._frame:
+            before, self._frame = self._frame, frame
+            if before is not None:
+                self._see_jump(now, f'samples of the frames {before} and {frame} alternate on '
+                                    'imu/data_raw')
         if self.several:
             self._look_for_switch(stamp)
         self._longest = (0 if now - self._arrived > BLIND
                          else max(self._longest, stamp - self._newest))
-        self._newest, self._arrived = stamp, now
+        silence, self._newest, self._arrived = now - self._arrived, stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
             return None
-        time = self._time_of_sample(stamp)
+        time = self._time_of_sample(stamp, silence)
         if time == self._last:
             counts['repeated_stamps'] += 1
             first, fastest = self._standing or (now, 0.0)
@@ -322,14 +366,14 @@ class Pipeline:
             return None
         if self._standing is not None:
             self._add_unseen_turn(now)
-        gap = not 0.0 < time - self._last <= self.values.maximum_gap
-        if not gap:
-            self._interval = min(time - self._last, self.estimator.tracker.intervals.usual)
+        interval = time - self._last
+        if 0.0 < interval <= self.values.maximum_gap:
+            self._interval = min(interval, self.estimator.tracker.intervals.usual)
         if self._was_silent(time, now):
             self.estimator.begin_run(self._clock.date())
         self._last = time
         journal.channels = set() if specific_force is None else {'specific_force'}
-        return self._use(stamp, time, gap, output, specific_force, now, receivers)
+        return self._use(stamp, time, interval, output, specific_force, now, receivers)
 
     def _add_unseen_turn(self, now: float) -> None:
         """Add to the variance what the gyro may have turned while its stamps stood still."""
@@ -341,12 +385,12 @@ class Pipeline:
             self.journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                   'came; turns in this time are not in the heading')
 
-    def _see_jump(self, now: float) -> None:
-        """Take the second jump back of the stamps within 1 s for those of several publishers."""
+    def _see_jump(self, now: float, what: str) -> None:
+        """Take the second jump of stamps or frames within 1 s for that of several gyros."""
         self._jumps.append(now)
         if len(self._jumps) > 1 and now - self._jumps[0] < _INTERLEAVED:
-            self._refuse_all('the stamps on imu/data_raw jump back repeatedly, as with several '
-                             'gyros on one topic: give each gyro a topic of its own')
+            self._refuse_all(f'{what}, as with several gyros on one topic: give each gyro a topic '
+                             'of its own')
 
     def _was_silent(self, time: float, now: float) -> bool:
         """Tell whether the gyro may have been without power, and samples did not only wait."""
@@ -354,11 +398,12 @@ class Pipeline:
         silent = now - self.journal.received > POWER_OFF
         return silent and since < math.inf and not 0.0 < since < POWER_OFF
 
-    def _use(self, stamp: int, time: float, gap: bool, output: float, force: float | None,
+    def _use(self, stamp: int, time: float, interval: float, output: float, force: float | None,
              now: float, receivers: int) -> Output | None:
         estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
         moving = self.wheels.moving(now, self._sources) if self._sources else None
-        if gap and not moving and not self.wheels.stood(self.journal.received, now, self._sources):
+        lost, unseen = estimator.tracker.intervals.lost, not 0.0 < interval <= BLIND
+        if unseen and not moving and not self.wheels.stood(self.journal.received, now, self._sources):
             moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused > refused:
@@ -372,6 +417,10 @@ class Pipeline:
         counts['lost_samples'], counts['rebuilt'] = tracker.intervals.lost, tracker.rebuilt
         if restarted:
             self._note_restart(restarted)
+        elif unseen and moving is not False and tracker.intervals.lost > lost:
+            turned = 0.25 * _ACCELERATION * interval ** 2
+            estimator.rewind(tracker.heading, tracker.variance + turned ** 2)
+        self._look_for_repeats(time, output, now)
         if self.monitor.works and self.monitor.add(time, output, estimator.corrected):
             run = self.session.run
             self.monitor.examine(estimator.bias_variance,
@@ -397,6 +446,19 @@ class Pipeline:
         while time - self._recent[0][0] > _LOOKED_BACK:
             self._recent.popleft()
         return found
+
+    def _look_for_repeats(self, time: float, output: float, now: float) -> None:
+        """Take a turn for unknown while the gyro repeats one value."""
+        if not self._repeats.add(time, output, self.wheels.turning(now)):
+            self.stuck = ''
+        elif not self.stuck:
+            self.stuck = (f'the gyro reports {output:g} rad/s again and again: it is dead, '
+                          'saturated, or its driver stands')
+            self.journal.event = self.stuck
+            tracker = self.estimator.tracker
+            self.estimator.rewind(tracker.heading, tracker.variance + math.tau ** 2)
+            if self.session.drives:
+                self.session.interrupt(self.stuck)
 
     @property
     def _sources(self) -> tuple[str, ...]:

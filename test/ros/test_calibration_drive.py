@@ -26,7 +26,7 @@ from gyro_calibration.ros.calibration_session import (
 from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 import pytest
-from rig import INTERVAL, PROFILE, rested, Rig, Robot
+from rig import INTERVAL, MODEL, PROFILE, rested, Rig, Robot
 
 SCALE, BIAS = 0.0373, 0.01  # of the robot's gyro
 FULL = 45.0 * DEGREE
@@ -641,6 +641,32 @@ def test_calibrate_bias_keeps_the_scale_factor_error(tmp_path):
     assert stored(rig).bias == pytest.approx(0.02, abs=4e-4)
     assert stored(rig).scale_factor_error == before.scale_factor_error
     assert stored(rig).standard_deviations[0] == pytest.approx(before.standard_deviations[0])
+
+
+@pytest.mark.parametrize('shown, words', [
+    ('rate', 'odom shows that the robot turned by 43.0'),
+    ('heading', 'odom shows that the robot turned by 43.0'),
+    ('command', 'another node sent a command to move')])
+def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
+    rig = rested(tmp_path)
+    rig.other = 0.05 if shown == 'command' else None
+    rig.robot.command(0.05)
+    rig.odometry = lambda stamp, reading: rig.pipeline.odometry(
+        stamp, reading.heading * (shown == 'heading'),
+        Velocity(angular=(0.0, 0.0, reading.rate * (shown == 'rate'))))
+    rig.go(3.0)
+    success, message = rig.calibrate(REST)
+    assert not success and words in message, message
+
+
+def test_a_profile_that_is_too_fast_for_the_gyro_is_not_driven(tmp_path):
+    profile = tmp_path / 'profile.csv'
+    profile.write_text('time_s,rate_rad_s\n0,0\n1,0\n2,45\n3,0\n20,0\n')
+    valid = 'valid: {rate: [-2.0, 2.0]}\n'
+    rig = rested(tmp_path, model=MODEL + valid, calibration_profile_file=str(profile),
+                 calibration_drive=True)
+    assert not rig.pipeline.store.problem
+    assert 'the profile turns at 2578 deg/s, but the gyro measures at most' in rig.begin()
 
 
 def test_calibrate_bias_refuses_a_gyro_that_is_moved(tmp_path):

@@ -186,6 +186,65 @@ def test_no_variance_is_zero(tmp_path):
     assert min(each.rate_variance for each in found) > 0.0
 
 
+def test_a_turn_within_a_gap_that_is_bridged_is_in_the_variance(tmp_path):
+    """It rests before and after; the gap is shorter than `maximum_gap`."""
+    rig = rested(tmp_path)
+    begin, rig.robot.unplugged = len(rig.outputs) - 1, True
+    rig.robot.command(1.5)
+    rig.go(0.4)
+    rig.robot.command(0.0)
+    rig.go(0.5)
+    rig.robot.unplugged = False
+    rig.go(5.0)
+    error, deviation = rig.error(begin)
+    assert abs(error) > 0.2 and abs(error) < 3.0 * deviation, (error, deviation)
+
+
+@pytest.mark.parametrize('wheels', ['none', 'odom'])
+@pytest.mark.parametrize('value', ['at rest', 'in a turn', 'saturated'])
+def test_a_gyro_that_repeats_one_value_is_an_error_and_the_heading_claims_nothing(
+        tmp_path, reported, value, wheels):
+    rig = rested(tmp_path, seconds=5.0, wheels=wheels)
+    begin, turns, still = len(rig.outputs) - 1, rig.robot.step, rig.robot.bias
+    if value == 'in a turn':
+        rig.robot.command(0.7)
+        rig.go(3.0)
+
+    def step():
+        reading = turns()
+        output = {'at rest': still, 'in a turn': 0.7, 'saturated': min(reading.output, 0.3)}[value]
+        return type(reading)(reading.stamp, output, reading.heading, reading.rate)
+
+    rig.robot.step = step
+    rig.robot.command(0.0 if value == 'in a turn' else 0.7)
+    rig.go(6.0)
+    level, message, _ = reported(rig)
+    assert level == ERROR and 'again and again: it is dead' in message, message
+    rig.robot.step = turns
+    rig.go(3.0)
+    error, deviation = rig.error(begin)
+    assert abs(error) < 3.0 * deviation, (error, deviation)
+    reported(rig)
+    rig.go(1.0)
+    assert reported(rig)[0] != ERROR
+
+
+@pytest.mark.parametrize('output', [
+    np.zeros(3000), np.round(noisy(120.0) / 0.02) * 0.02, np.repeat(noisy(30.0), 4)],
+    ids=['zero', 'coarse steps', 'each sample four times'])
+def test_gyros_that_repeat_values_by_themselves_are_no_error(tmp_path, output):
+    rig = Rig(tmp_path, model=KNOWN)
+    rig.feed(noisy(10.0), SLOW)
+    rig.feed(output, SLOW)
+    assert rig.pipeline.stuck == ''
+
+
+def test_a_gyro_of_zeros_beside_odometry_that_turns_is_an_error(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN)
+    rig.feed(np.zeros(50), SLOW, moving=0.3)
+    assert 'the gyro reports 0 rad/s again and again' in rig.pipeline.stuck
+
+
 # Rest
 
 
@@ -228,6 +287,39 @@ def test_wheels_decide_on_slow_turns(tmp_path, wheels):
     assert end - begin == pytest.approx(60.0 * slow, rel=0.5)
 
 
+def slow_turn(rig, late=0.0, twist=True):
+    """Turn by 4.5 deg in a minute; odometry comes late, or has a heading alone."""
+    begin, late, odometry = len(rig.outputs) - 1, round(late / INTERVAL), []
+
+    def told(stamp, reading):
+        odometry.append((stamp, reading.heading, reading.rate if twist else 0.0))
+        stamp, heading, rate = odometry[max(len(odometry) - 1 - late, 0)]
+        rig.pipeline.odometry(stamp, heading, Velocity(angular=(0.0, 0.0, rate)))
+
+    rig.odometry = told
+    for _ in range(10):
+        rig.robot.command(0.15 * DEGREE)
+        rig.go(3.0)
+        rig.robot.command(0.0)
+        rig.go(3.0)
+    return rig.error(begin)
+
+
+def test_odometry_that_is_late_does_not_show_that_the_robot_stands(tmp_path):
+    rig = rested(tmp_path, seconds=60.0, wheels='odom')
+    error, deviation = slow_turn(rig, late=2.0)
+    assert abs(error) < 4.0 * deviation, (error, deviation)
+
+
+def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill(
+        tmp_path, reported):
+    rig = rested(tmp_path, seconds=60.0, wheels='odom')
+    error, deviation = slow_turn(rig, twist=False)
+    level, message, _ = reported(rig)
+    assert level == WARN and 'odom turns by its headings' in message, message
+    assert abs(error) < 4.0 * deviation, (error, deviation)
+
+
 def test_wheels_that_are_not_asked_decide_nothing(tmp_path):
     rates = noisy(30.0, 0.05 * DEGREE)
     without = Rig(tmp_path, model=KNOWN).feed(rates, SLOW)
@@ -249,6 +341,26 @@ def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, sh
     assert 'jump back repeatedly' in rig.pipeline.conflict
     turned = rig.outputs[-1].heading - rig.outputs[250].heading
     assert abs(turned) < 0.7 * 0.5, 'half a second at most'
+
+
+def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
+    """As of a relay that joins two topics: the stamps increase, and the graph shows one node."""
+    rig = Rig(tmp_path, model='')
+    for _ in range(100):
+        rig.feed([0.5])
+        rig.pipeline.sample(rig.fed + 5 * 10 ** 6, 0.0, frame='other')
+    assert 'samples of the frames  and other alternate' in rig.pipeline.conflict
+    assert rig.outputs[-1].heading < 0.5 * 0.2
+    rig.feed(np.full(150, 0.5))
+    assert not rig.pipeline.conflict
+
+
+def test_a_driver_that_comes_back_with_another_frame_is_none_of_two(tmp_path):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(100, 0.5))
+    for _ in range(100):
+        rig.skip(INTERVAL)
+        assert rig.pipeline.sample(rig.fed, 0.5, frame='other')
 
 
 def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_path):
@@ -315,6 +427,15 @@ def test_two_publishers_that_both_send_are_found_by_their_stamps(tmp_path, offse
     assert '2 publishers send' in rig.pipeline.conflict
 
 
+def test_no_published_stamp_is_outside_of_ros_time(tmp_path):
+    for offset, stamp in ((0.2, 0), (-0.2, 2 ** 31 * 10 ** 9 - 1)):
+        model = f'effects: {{time_offset: {{time_offset: {offset}}}}}\n' + KNOWN.split('\n')[1]
+        rig = Rig(tmp_path, model=model)
+        assert not rig.pipeline.store.problem
+        found = rig.pipeline.sample(stamp, 0.5)
+        assert found is None or 0 <= found.stamp < 2 ** 31 * 10 ** 9
+
+
 @pytest.mark.parametrize('stamp', [-1, 2 ** 31 * 10 ** 9, (2 ** 31 - 1) * 10 ** 9 + 2 ** 32])
 def test_a_stamp_that_is_none_of_ros_time_is_refused(tmp_path, stamp):
     rig = Rig(tmp_path, model='')
@@ -325,6 +446,30 @@ def test_a_stamp_that_is_none_of_ros_time_is_refused(tmp_path, stamp):
 
 
 # Temperature
+
+
+THERMAL = ('effects: {bias: {bias: 0.01}, bias_temperature: {bias_temperature: 2.0e-3}}\n'
+           'reference_temperature: 25.0\nnoise: {angle_random_walk: 5.0e-4}\n')
+
+
+@pytest.mark.parametrize('odd', [(60.0,), (60.0, 25.0, 60.0, 25.0, 60.0)],
+                         ids=['once', 'of a second sensor'])
+def test_a_temperature_that_leaps_is_not_used(tmp_path, odd):
+    rig = Rig(tmp_path, model=THERMAL)
+    before = rig.feed(noisy(20.0), SLOW, temperature=25.0)[-1]
+    for each in odd:
+        rig.pipeline.temperature(rig.fed, each)
+        after = rig.feed(noisy(1.0), SLOW)[-1]
+    assert after.heading == pytest.approx(before.heading, abs=1e-3)
+    assert rig.journal.counts['refused_temperatures'] == odd.count(60.0)
+
+
+def test_a_temperature_that_stays_where_it_has_leapt_is_used(tmp_path):
+    rig = Rig(tmp_path, model=THERMAL)
+    rig.feed(noisy(5.0), SLOW, temperature=25.0)
+    for each in (60.0, 61.0):
+        rig.pipeline.temperature(rig.fed, each)
+    assert rig.pipeline.estimator.temperature == 61.0
 
 
 def test_a_temperature_of_the_future_is_one_of_now(tmp_path):
@@ -441,6 +586,23 @@ def test_a_clock_of_the_host_that_is_set_changes_neither_heading_nor_variance(tm
 def _folder(path, name):
     (path / name).mkdir()
     return path / name
+
+
+def test_a_gap_as_long_as_a_step_of_the_clock_is_none(tmp_path):
+    """The samples are stamped by another host, whose clock was not set."""
+    rig = rested(tmp_path)
+    stamp, clock, begin = rig.stamp, rig.clock, len(rig.outputs) - 1
+    rig.stamp = lambda reading: stamp(reading) - round(1e9 * clock.set_by)
+    clock.set_by = 5.0
+    rig.go(1.0)
+    rig.robot.unplugged = True
+    rig.robot.command(0.7)
+    rig.go(5.0)
+    rig.robot.unplugged = False
+    rig.robot.command(0.0)
+    rig.go(5.0)
+    error, deviation = rig.error(begin)
+    assert abs(error) > 3.0 and abs(error) < 3.0 * deviation, (error, deviation)
 
 
 def test_a_simulation_that_is_set_back_begins_the_integration_anew(tmp_path):
