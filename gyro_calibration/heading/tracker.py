@@ -146,6 +146,8 @@ class HeadingTracker:
         self._reached = self._hesitates = 0.0
         self._drives, self.outliers, self._taken = StraightDrives(), 0, 0
         self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
+        # Stamp, s, and rate, rad/s, of the last sample before the last jump that was taken.
+        self._leap = -math.inf, 0.0
         self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
         self._biased: Array | None = None
@@ -273,6 +275,11 @@ class HeadingTracker:
                 return ''
             # the rate stays there: when it began to, the samples do not tell
             self._part.lost += (0.5 * (spike[1] - self._last[1]) * (spike[0] - self._last[0])) ** 2
+            # nor does it come back by itself within 2 s: what came between were no turns
+            begun, before = self._leap
+            if 0.0 < spike[0] - begun < _BRIEF:
+                self._part.lost += ((self._last[1] - before) * (spike[0] - begun)) ** 2
+            self._leap = self._last[:2]
             self._add(*spike)
         elif spike is not None:
             self.outliers += 1

@@ -401,8 +401,9 @@ class CalibrationSession:
         if drives and motion is not None:
             fastest, limit = _fastest(motion), self._estimator.used.rate_limit
             if fastest > limit:
-                return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but the gyro measures '
-                        f'at most {limit / DEGREE:.0f} deg/s: correct calibration.profile_file')
+                return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but the gyro '
+                        f'measures at most {limit / DEGREE:.0f} deg/s: correct '
+                        'calibration.profile_file')
         if drives and (obstacle := obstacle or self._commanded()):
             return obstacle
         self._rules, self._suspected, self.warning = rules(values), False, ''

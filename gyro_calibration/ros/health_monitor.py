@@ -46,8 +46,8 @@ QUIET = 3.0
 _STEADY = 6.0
 #: Chance that a calibration is falsely reported to differ from the one before.
 CHANCE = 1e-3
-#: A value that comes so often, and for so long, s, is stuck: a gyro whose noise is QUIET times less
-#: than that of the model and 2 steps of its output repeats a value with a probability of 0.2.
+#: A value that comes so often, and for so long, s, is stuck: a gyro whose noise is QUIET times
+#: less than that of the model, and 2 steps of its output, repeats a value with a chance of 0.2.
 _REPEATS, _STUCK = 20, 0.25
 #: So many changes show the step of an output.
 _CHANGES = 100

@@ -308,8 +308,8 @@ class Pipeline:
         """Return why odometry is not taken for a standstill, in a sentence; ''."""
         if self._clock.steady() - self._contradicted > _DISTRUST:
             return ''
-        return ('odom turns by its headings while its rate is zero: check its twist, without which '
-                'it does not show that the robot stands')
+        return ('odom turns by its headings while its rate is zero: check its twist, without '
+                'which it does not show that the robot stands')
 
     def command(self, velocity: Velocity) -> None:
         """Take a command from cmd_vel, those of this node included."""
@@ -403,7 +403,8 @@ class Pipeline:
         estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
         moving = self.wheels.moving(now, self._sources) if self._sources else None
         lost, unseen = estimator.tracker.intervals.lost, not 0.0 < interval <= BLIND
-        if unseen and not moving and not self.wheels.stood(self.journal.received, now, self._sources):
+        since = self.journal.received
+        if unseen and not moving and not self.wheels.stood(since, now, self._sources):
             moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused > refused:

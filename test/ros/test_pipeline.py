@@ -186,6 +186,17 @@ def test_no_variance_is_zero(tmp_path):
     assert min(each.rate_variance for each in found) > 0.0
 
 
+@pytest.mark.parametrize('count', [1, 2, 3, 5, 20])
+def test_impossible_rates_in_a_row_are_in_the_variance(tmp_path, count):
+    """As lines that lost their decimal point; one alone is left out."""
+    rig = Rig(tmp_path, model=CERTAIN)
+    before = rig.feed(noisy(5.0, bias=0.01), SLOW)[-1]
+    rig.feed(noisy(count * SLOW, 30.0, bias=0.01), SLOW)
+    after = rig.feed(noisy(5.0, bias=0.01), SLOW)[-1]
+    off = after.heading - before.heading
+    assert abs(off) < 3.0 * math.sqrt(after.heading_variance), off
+
+
 def test_a_turn_within_a_gap_that_is_bridged_is_in_the_variance(tmp_path):
     """It rests before and after; the gap is shorter than `maximum_gap`."""
     rig = rested(tmp_path)
