@@ -88,7 +88,7 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
 
 
 def forecasts(duration: float) -> list[Forecast]:
-    return [Forecast(XV3500.noise, duration, drive, DRIVE) for drive in DRIVES.values()]
+    return [Forecast(XV3500.noise, duration, drive, DRIVE, 0.0) for drive in DRIVES.values()]
 
 
 def planned(place: str, duration: float) -> Motion:

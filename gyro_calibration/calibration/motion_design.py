@@ -13,12 +13,14 @@ The motion, within what a robot can do, after which the heading of a later drive
 
 What a run determines is known before it is driven. `fit_likelihood` weighs increments of headings;
 the same columns, the same priors on delay and lag and the noise figures of the gyro give the
-covariance of scale factor error s and bias b, and with it that of the heading of any later drive
-that is integrated from them. Flicker and random walk of the bias, which the fit does not weigh, go
-through its weights.
+covariance of scale factor error s and bias b. The rest after the run is combined with them as in
+`check_rest`. With that follows the covariance of the heading of any later drive that is integrated
+from them. Flicker and random walk of the bias, which the fit does not weigh, go through its
+weights.
 
 A motion that comes back has no net turn, so that s and b are estimated independently: the bias as
-well as white noise N allows in the time T, N / √T, whatever the motion. The motion decides on s.
+well as white noise N allows in the time T, N / √T, and as the rest shows it, whatever the motion.
+The motion decides on s.
 
 """
 
@@ -34,17 +36,25 @@ from gyro_calibration.calibration.likelihood import (
     following,
     LAG_DEVIATION,
 )
-from gyro_calibration.calibration.self_calibration import Limits
+from gyro_calibration.calibration.self_calibration import (
+    combined_rest,
+    Limits,
+    rest_variance,
+    SETTLED,
+)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Number
 from gyro_calibration.model.motion import from_rates, Motion
 from gyro_calibration.model.noise import increment_covariance, Noise
 import numpy as np
 from scipy.optimize import differential_evolution
+from scipy.special import ndtri
 
 #: Cells in which the noise is counted, in one block of the fit; points of the motion in one cell.
 _CELLS, _POINTS = 5, 5
 #: Cells of the drive: of 1 s, but at most so many.
 _MOST = 600
+#: Of a normal value, half are further off than so many standard deviations.
+_MEDIAN = float(ndtri(0.75))
 
 
 @dataclass(frozen=True)
@@ -105,7 +115,8 @@ class Prediction:
     Attributes
     ----------
     scale_deviation : standard deviation of s, 1
-    bias_deviation : standard deviation of b against the mean bias of the drive that follows, rad/s
+    bias_deviation : standard deviation of b against the mean bias of the drive that follows,
+        rad/s; without flicker and random walk it is what the calibration states
     heading_error : mean of the error of the heading over that drive, taken positive, rad
     floor : the part of it that white noise causes: what stays if s and the bias at every moment
         were known
@@ -121,7 +132,8 @@ class Prediction:
 class Forecast:
     """Predictions for all motions of one length, one gyro and one later drive."""
 
-    def __init__(self, noise: Noise, duration: float, drive: Motion, length: float):
+    def __init__(self, noise: Noise, duration: float, drive: Motion, length: float,
+                 rest: float = Limits.rest):
         """
         Prepare.
 
@@ -129,11 +141,12 @@ class Forecast:
         ----------
         noise : of the gyro; its angle random walk is above 0
         duration : of the motions, s
-        drive : what the robot does afterwards, begun again where it ends
+        drive : what the robot does after the rest, begun again where it ends
         length : of the drive, s
+        rest : after the motion, which is taken in from `SETTLED` s on, s; 0 for none
 
         """
-        self._noise, self._duration, self._length = noise, duration, length
+        self._noise, self._duration, self._length, self._rest = noise, duration, length, rest
         time = np.linspace(0.0, length, min(max(round(length), 1), _MOST) + 1)[1:]
         self._used = np.vstack([_heading(drive, time), time])
         self.floor = (math.sqrt(2.0 / math.pi) * noise.angle_random_walk
@@ -158,8 +171,8 @@ class Forecast:
 
     def _predict(self, motion: Motion, blocks: int, follows: bool) -> Prediction:
         if blocks not in self._noises:
-            self._noises[blocks] = _noises(self._noise, self._duration, blocks, self._length,
-                                           self._used.shape[1])
+            self._noises[blocks] = _noises(self._noise, self._duration, blocks, self._rest,
+                                           self._length, self._used.shape[1])
         noises = self._noises[blocks]
         weights, own = self._weights(motion, blocks, noises, follows)
         own = own + weights @ noises.run @ weights.T
@@ -176,7 +189,7 @@ class Forecast:
     def _weights(self, motion: Motion, blocks: int, noises: _Noises,
                  follows: bool) -> tuple[Array, Array]:
         """
-        Return the weights of (s, b) on increments of the gyro's integral, shape (2, n).
+        Return the weights of (s, b) on increments of the gyro's integral and the rest, (2, n).
 
         Then their covariance by what the fit leaves open of gyro and robot, shape (2, 2).
 
@@ -191,21 +204,36 @@ class Forecast:
             known, prior = np.hstack([known, columns]), np.append(prior, parts[0] * deviations)
         columns = np.diff(known.reshape(blocks, -1, len(prior)).mean(axis=1), axis=0)
         weighted = noises.inverse @ columns
-        weights = np.linalg.solve(columns.T @ weighted + np.diag(prior ** -2.0), weighted.T)[:2]
+        covariance = np.linalg.inv(columns.T @ weighted + np.diag(prior ** -2.0))
+        weights = (covariance @ weighted.T)[:2]
         left = weights @ columns[:, 4:] * prior[4:]
-        return weights, left @ left.T
+        if not self._rest:
+            return weights, left @ left.T
+        white = self._noise.angle_random_walk / math.sqrt(self._rest)
+        stated = covariance[:2, :2] + np.diag([0.0, self._noise.floor ** 2])
+        variance = rest_variance(self._noise, self._rest, white, 2.0 * white)
+        gain, combined = combined_rest(
+            stated, _MEDIAN * math.sqrt(stated[1, 1] + variance), variance)
+        of_run = np.eye(2) - np.outer(gain, (0.0, 1.0))
+        # the chance that the robot turned otherwise is no noise, but the calibration states it
+        more = combined - of_run @ stated @ of_run.T - variance * np.outer(gain, gain)
+        return (np.column_stack([of_run @ weights, gain]),
+                of_run @ left @ left.T @ of_run.T + more)
 
 
 @dataclass(frozen=True)
 class _Noises:
     """
-    Noise of the increments between the blocks of a run, and of the heading of the drive.
+    Noise of what a run and its rest show, and of the heading of the drive.
+
+    Shown are the increments between the blocks of the run, rad, and the mean rate of the rest,
+    rad/s, if there is one: n values.
 
     Attributes
     ----------
-    inverse : of the covariance that white noise gives the increments, rad⁻², shape (n, n)
-    run : covariance of the increments by all noise, rad², shape (n, n)
-    shared : covariance of the increments with the heading of the drive, rad², shape (n, m)
+    inverse : of the covariance that white noise gives the increments, rad⁻²
+    run : covariance of what is shown by all noise, shape (n, n)
+    shared : covariance of what is shown with the heading of the drive, shape (n, m)
     drive : variance of the heading of the drive, rad², shape (m,)
 
     """
@@ -216,16 +244,24 @@ class _Noises:
     drive: Array
 
 
-def _noises(noise: Noise, duration: float, blocks: int, length: float, later: int) -> _Noises:
+def _noises(noise: Noise, duration: float, blocks: int, rest: float, length: float,
+            later: int) -> _Noises:
     cells = blocks * _CELLS
-    edges = np.concatenate([np.linspace(0.0, duration, cells + 1),
-                            duration + np.linspace(0.0, length, later + 1)[1:]])
+    waited = np.cumsum([SETTLED, rest]) if rest else np.zeros(0)
+    begin = duration + (waited[-1] if rest else 0.0)
+    edges = np.concatenate([np.linspace(0.0, duration, cells + 1), duration + waited,
+                            begin + np.linspace(0.0, length, later + 1)[1:]])
     covariance, spread = increment_covariance(noise, edges), _spread(blocks, duration / blocks)
     sums = np.tril(np.full((later, later), length / later))
     white = spread @ spread.T * (noise.angle_random_walk ** 2 * cells / duration)
-    return _Noises(np.linalg.inv(white), spread @ covariance[:cells, :cells] @ spread.T,
-                   spread @ covariance[:cells, cells:] @ sums.T,
-                   ((sums @ covariance[cells:, cells:]) * sums).sum(axis=1))
+    before = cells + len(waited)
+    shown = spread
+    if rest:
+        shown = np.zeros((len(spread) + 1, before))
+        shown[:-1, :cells], shown[-1, -1] = spread, 1.0
+    return _Noises(np.linalg.inv(white), shown @ covariance[:before, :before] @ shown.T,
+                   shown @ covariance[:before, before:] @ sums.T,
+                   ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
 
 
 def _spread(blocks: int, length: float) -> Array:

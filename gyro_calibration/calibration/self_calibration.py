@@ -386,9 +386,7 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
                           f'wanted {limits.rest:g} s: leave the robot at rest after it')
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
     noise, white, mean = noise or Noise(), _deviation_of_mean(corrected), float(corrected.mean())
-    # a robot that settles in the first half of the rest moves the mean by half of the change
-    variance = (max(white, noise.angle_random_walk / math.sqrt(duration)) ** 2
-                + noise.wander(duration, duration) + 0.25 * _change_at_rest(corrected) ** 2)
+    variance = rest_variance(noise, duration, white, _change_at_rest(corrected))
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
     scale = 1.0 + fit.scale_factor_error
     check = RestCheck(mean, deviation,
@@ -406,9 +404,35 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
     return check
 
 
-def _with_rest(fit: Fit, rate: float, variance: float) -> Fit:
+def rest_variance(noise: Noise, duration: float, white: float, change: float) -> float:
     """
-    Return the fit with what a rest after its run says of the bias.
+    Return the variance of a mean at rest about the bias, (rad/s)².
+
+    A robot that settles in the first half of the rest moves the mean by half of the change.
+
+    Parameters
+    ----------
+    duration : of the rest, s
+    white : standard deviation of the mean by the white noise of the samples, rad/s
+    change : by how much the means of both halves differ, rad/s
+
+    """
+    return (max(white, noise.angle_random_walk / math.sqrt(duration)) ** 2
+            + float(noise.wander(duration, duration)) + 0.25 * change ** 2)
+
+
+def _with_rest(fit: Fit, rate: float, variance: float) -> Fit:
+    """Return the fit with what a rest after its run says of the bias, as in `combined_rest`."""
+    if not np.isfinite(fit.covariance).all():
+        return fit
+    gain, covariance = combined_rest(fit.covariance, rate, variance)
+    s, b = (gain * rate + (fit.scale_factor_error, fit.bias)).tolist()
+    return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
+
+
+def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Array, Array]:
+    """
+    Combine a run with the rest after it.
 
     A run may be off by more than its stated deviation (`TURNED_ODDS`): by a slip, by a turn by
     hand, or by a robot that follows otherwise. How much more is not known: the ratio of that error
@@ -417,25 +441,26 @@ def _with_rest(fit: Fit, rate: float, variance: float) -> Fit:
 
     Parameters
     ----------
-    rate, variance : mean of the output at rest less the bias of the fit, rad/s, and the variance
+    covariance : of (s, b) by the run, shape (2, 2)
+    rate, variance : mean of the output at rest less the bias of the run, rad/s, and the variance
         of that mean, (rad/s)²
 
+    Returns
+    -------
+    by how much s and b change with that rate, shape (2,), and their covariance, shape (2, 2)
+
     """
-    if not np.isfinite(fit.covariance).all():
-        return fit
-    stated, run = fit.covariance[1, 1], fit.covariance[:, 1]
+    stated, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
     total = (1.0 + ratios ** 2) * stated + variance
     weights = np.exp(-0.5 * rate ** 2 / total) / np.sqrt(total)
     weights[1:] *= TURNED_ODDS / 100
     weights /= weights.sum()
     shared = run + np.outer(ratios ** 2 * stated, (0.0, 1.0))
-    steps = shared * (rate / total)[:, None]
-    s, b = (weights @ steps + (fit.scale_factor_error, fit.bias)).tolist()
-    within = (fit.covariance + np.diag([0.0, stated * float(weights @ ratios ** 2)])
+    gains = shared / total[:, None]
+    within = (covariance + np.diag([0.0, stated * float(weights @ ratios ** 2)])
               - (shared * (weights / total)[:, None]).T @ shared)
-    return replace(fit, scale_factor_error=s, bias=b,
-                   covariance=within + np.cov(steps.T, aweights=weights, ddof=0))
+    return weights @ gains, within + rate ** 2 * np.cov(gains.T, aweights=weights, ddof=0)
 
 
 def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
