@@ -19,7 +19,7 @@ the angle, and mean squares of Gaussian values have the covariance 2 c² summed 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -31,6 +31,7 @@ from gyro_calibration.model.noise import (
     ALLAN_FLOOR,
     ANGLE_RANDOM_WALK,
     FLICKER,
+    GaussMarkov,
     Part,
     PARTS,
     QUANTIZATION,
@@ -207,7 +208,7 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
         # quantization is white: its covariance is above zero at single lags only
         stride = 1 if part is QUANTIZATION else max(1, size // _FINE)
         lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
-        squares = _lag_covariance(part, size, size, lags) ** 2 * (count - lags) * stride
+        squares = _lag_covariance(part.covariance, size, size, lags) ** 2 * (count - lags) * stride
         freedom.append(max(1.0, float(squares[0]) * count / stride
                            / float(2.0 * squares.sum() - squares[0])))
     return np.array(freedom)
@@ -234,23 +235,34 @@ def _parts_by_slope(sizes: Integers, variance: Array) -> list[Part]:
 
 # covariance of second differences of the angle, and of Allan variances
 
-def _lag_covariance(part: Part, first: int, second: int, lags: Integers) -> Array:
-    """Return the covariance of second differences over `first` and `second` samples at lags."""
-    return np.sum([a * b * part.covariance(lags + (j * second - i * first))
+def _lag_covariance(covariance: Callable[[Integers], Array], first: int, second: int,
+                    lags: Integers) -> Array:
+    """
+    Return the covariance of second differences over `first` and `second` samples at lags.
+
+    Given is that of the angle.
+
+    """
+    return np.sum([a * b * covariance(lags + (j * second - i * first))
                    for i, a in enumerate((1.0, -2.0, 1.0))
                    for j, b in enumerate((1.0, -2.0, 1.0))], axis=0)
 
 
-def covariance_form(samples: int, first: int, second: int) -> Array:
+def covariance_form(samples: int, first: int, second: int,
+                    process: GaussMarkov | None = None) -> Array:
     """
     Return the covariance of two Allan variances as a form of squared coefficients, shape (5, 5).
 
     Angle quantization is white: only lags at which two of its samples meet count. A ramp is no
     noise, but multiplies it: the covariance of squares of values with a mean m also has 4 m² c.
+    With a process, its times in samples, the shape is (6, 6), and its coefficient is 1.
 
     """
     counts, area = ((samples + 1 - 2 * first, samples + 1 - 2 * second),
                     float(first) ** 2 * float(second) ** 2)
+    angles = [part.covariance for part in PARTS]
+    if process is not None:
+        angles.append(process.angle_covariance)
 
     def pairs_at(lags: Integers) -> Integers:
         """Return how many pairs of second differences stand at each lag."""
@@ -261,14 +273,16 @@ def covariance_form(samples: int, first: int, second: int) -> Array:
     stride = max(1, shorter // _FINE, longer // _COARSE)
     lags = np.arange(-(min(10 * longer, counts[0]) // stride),
                      min(10 * longer, counts[1]) // stride + 1) * stride
-    values = np.array([_lag_covariance(part, first, second, lags) for part in PARTS])
+    values = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])
     values[_QUANTIZATION] = 0.0
     if stride > max(1, shorter // 2):
         values[_FORGETTING] = 0.0  # independent over times so far apart
+        if process is not None and process.correlation_time < stride:
+            values[-1] = 0.0
     pairs = pairs_at(lags) * float(stride)
     # lags at which two samples of quantization meet
     lags = np.unique([i * first - j * second for i in range(3) for j in range(3)])
-    meeting = np.array([_lag_covariance(part, first, second, lags) for part in PARTS])
+    meeting = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])
     meeting_pairs = pairs_at(lags)
     # not a product of matrices, which starts threads
     form = np.array([[2.0 * (pairs * one * other).sum() for other in values] for one in values])

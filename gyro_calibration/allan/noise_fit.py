@@ -19,7 +19,7 @@ ranked by likelihood (`Ranking`); the best of them gives the figures.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 import itertools
 import math
@@ -31,7 +31,8 @@ from gyro_calibration.allan.deviation import (
     covariance_form,
 )
 from gyro_calibration.logs.log import Array, DataRefused
-from gyro_calibration.model.noise import Noise, Part, PARTS, QUANTIZATION
+from gyro_calibration.logs.stamps import Integers
+from gyro_calibration.model.noise import GaussMarkov, Noise, Part, PARTS, QUANTIZATION
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc
@@ -52,10 +53,9 @@ _CHANCE = 0.05
 _MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
 #: The least number of octaves that shows a slope and its end.
 _FEWEST_OCTAVES = 4
-#: Places of the parts; then what a filter takes from the variance: over times beyond its
-#: memory that has the slope of quantization, with the other sign.
-_N, _B, _K, _Q, _R = range(len(PARTS))
-_BEND = len(PARTS)
+#: Places of the parts and of a Gauss-Markov process; then what a filter takes from the variance:
+#: over times beyond its memory that has the slope of quantization, with the other sign.
+_N, _B, _K, _Q, _R, _PROCESS, _BEND = range(len(PARTS) + 2)
 #: Combinations of parts, without and with quantization, and with a bend of a random walk.
 _COMBINATIONS = [
     combination for count in range(len(PARTS))
@@ -71,44 +71,67 @@ class Octaves:
 
     Attributes
     ----------
+    samples : of the record
+    size : averaging times, shape (n,)
+    scarcity : how much wider an Allan deviation scatters where windows are lost, shape (n,)
     variance : shape (n,)
-    columns : of each part, and of a bend, for a coefficient of 1, shape (n, 6)
-    forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5)
+    columns : of each part, a process, and a bend, for a coefficient of 1, shape (n, 7)
+    forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or (n,
+        n, 6, 6) with a process
+    process : one of 1 rad/s, None for none
 
     """
 
+    samples: int
+    size: Integers
+    scarcity: Array
     variance: Array
     columns: Array
     forms: Array
+    process: GaussMarkov | None = None
 
     @classmethod
     def of(cls, chart: AllanChart) -> Octaves:
         columns = np.column_stack([*(part.variance(chart.size) for part in PARTS),
-                                   -QUANTIZATION.variance(chart.size)])
+                                   np.zeros(len(chart.size)), -QUANTIZATION.variance(chart.size)])
         scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.differences)
         forms = (_forms(chart.samples, tuple(chart.size.tolist()))
                  * np.outer(scarcity, scarcity)[:, :, None, None])
-        return cls(chart.deviation ** 2, columns, forms)
+        return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns, forms)
 
     def since(self, start: int) -> Octaves:
         """Leave out the shortest averaging times."""
-        return Octaves(self.variance[start:], self.columns[start:], self.forms[start:, start:])
+        return Octaves(self.samples, self.size[start:], self.scarcity[start:],
+                       self.variance[start:], self.columns[start:], self.forms[start:, start:])
+
+    def with_column(self, process: GaussMarkov) -> Array:
+        """Return the columns with that of a process of 1 rad/s, its times in samples."""
+        columns = self.columns.copy()
+        columns[:, _PROCESS] = process.allan_variance(self.size)
+        return columns
+
+    def with_process(self, process: GaussMarkov) -> Octaves:
+        """Add such a process, and its terms of the covariance."""
+        forms = _forms(self.samples, tuple(self.size.tolist()), process)
+        return replace(self, columns=self.with_column(process), process=process,
+                       forms=forms * np.outer(self.scarcity, self.scarcity)[:, :, None, None])
 
     def covariance(self, squares: Array) -> Array:
         """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
-        return np.einsum('ijpq,p,q->ij', self.forms, squares[:_BEND], squares[:_BEND])
+        known = squares[:self.forms.shape[-1]]
+        return np.einsum('ijpq,p,q->ij', self.forms, known, known)
 
     def model(self, squares: Array) -> Array:
         """Return the sum of the parts for these squared coefficients, kept above zero."""
         return np.maximum(self.columns @ squares, 1e-3 * self.variance)
 
 
-@lru_cache(maxsize=8)
-def _forms(samples: int, sizes: tuple[int, ...]) -> Array:
-    """Return the covariances as forms of the squared coefficients, shape (n, n, 5, 5)."""
-    forms = np.zeros((len(sizes),) * 2 + (len(PARTS),) * 2)
+@lru_cache(maxsize=64)
+def _forms(samples: int, sizes: tuple[int, ...], process: GaussMarkov | None = None) -> Array:
+    """Return the covariances as forms of the squared coefficients, as `Octaves.forms`."""
+    forms = np.zeros((len(sizes),) * 2 + (len(PARTS) + (process is not None),) * 2)
     for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
-        form = covariance_form(samples, sizes[i], sizes[j])
+        form = covariance_form(samples, sizes[i], sizes[j], process)
         forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
     return forms
 
@@ -160,15 +183,18 @@ class Description:
         """
         Return -2 ln likelihood with the evidence that each part must bring.
 
-        A ramp must bring more, since in a single record a random walk looks like one.
+        A ramp must bring more, since in a single record a random walk looks like one. A
+        Gauss-Markov process has two figures.
 
         """
-        return self.surprise + _EVIDENCE * len(self.held) + _ALIKE * (_R in self.held)
+        return (self.surprise + _EVIDENCE * (len(self.held) + (_PROCESS in self.held))
+                + _ALIKE * (_R in self.held))
 
     def likely(self) -> bool:
         """Return whether chance explains the residuals."""
         normal, _ = self._scores()
-        return chdtrc(len(normal) - len(self.held), float(normal @ normal)) > _CHANCE
+        freedom = len(normal) - len(self.held) - (_PROCESS in self.held)
+        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > _CHANCE
 
     def estimate(self, places: Sequence[int]) -> tuple[Array, Array]:
         """Return the squares of parts by least squares, also negative; standard deviations."""
@@ -235,17 +261,39 @@ class Ranking:
     start : the first octave that they describe
     misfit : see `NoiseFit`
     descriptions : the likeliest first
+    processes : the best with a Gauss-Markov process in place of its flicker and rate random walk,
+        and in place of the walk alone
 
     """
 
     start: int
     misfit: float
     descriptions: tuple[Description, ...]
+    processes: tuple[Description, ...] = ()
 
     @property
     def best(self) -> Description:
         """Return the likeliest."""
         return self.descriptions[0]
+
+    @property
+    def process(self) -> Description | None:
+        """Return the likeliest with a process, where it costs less than the best."""
+        found = min(self.processes, key=Description.cost, default=None)
+        return found if found and found.cost() < self.best.cost() else None
+
+    def without(self, place: int) -> bool:
+        """
+        Tell whether a process may stand in place of a part.
+
+        A random walk is a process with an endless correlation time, so that the likelihood alone
+        counts; in place of flicker, its two figures must bring their evidence.
+
+        """
+        best = self.best
+        return any(place not in each.held and (
+            each.surprise - best.surprise if place == _K else each.cost() - best.cost())
+            < _CONFIDENCE for each in self.processes)
 
     @property
     def seen(self) -> list[int]:
@@ -285,7 +333,7 @@ def rank(octaves: Octaves) -> Ranking:
     last = max(len(octaves.variance) // 2 - 1, 0)
     for misfit, start in itertools.product(_MISFITS, range(last + 1)):
         ranking = _rank_since(octaves, start, misfit)
-        if ranking.best.likely():
+        if ranking.best.likely() or (ranking.process is not None and ranking.process.likely()):
             return _rank_since(octaves, start + 1, misfit) if 0 < start < last else ranking
     raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum '
                       'of the five kinds of noise: there is something else in the record, such as '
@@ -294,8 +342,42 @@ def rank(octaves: Octaves) -> Ranking:
 
 def _rank_since(octaves: Octaves, start: int, misfit: float) -> Ranking:
     since = octaves.since(start)
-    return Ranking(start, misfit, tuple(sorted(
-        (describe(since, places, misfit) for places in _COMBINATIONS), key=Description.cost)))
+    descriptions = tuple(sorted((describe(since, places, misfit) for places in _COMBINATIONS),
+                                key=Description.cost))
+    best = descriptions[0]
+    kept = {tuple(place for place in best.held if place not in replaced)
+            for replaced in ((_B, _K), (_K,)) if set(replaced) & set(best.held)}
+    return Ranking(start, misfit, descriptions, tuple(filter(None, (
+        _with_process(best, each, misfit) for each in kept))))
+
+
+def _with_process(best: Description, kept: tuple[int, ...], misfit: float) -> Description | None:
+    """
+    Return the likeliest description by some parts and a Gauss-Markov process, None without one.
+
+    The peak of its Allan deviation, at 1.9 correlation times, is in the chart: a process with a
+    longer correlation time is a random walk. To find the time, the covariance of the best is
+    taken, scaled by the Allan deviations.
+
+    """
+    octaves, places = best.octaves, (*kept, _PROCESS)
+    longest, known = octaves.size[-1] / 1.9, octaves.model(best.squares)
+
+    def roughly(process: GaussMarkov) -> float:
+        columns, squares, half = octaves.with_column(process), np.zeros(_BEND + 1), best.half
+        for _ in range(2):
+            white = np.linalg.solve(half, np.column_stack(
+                [columns[:, places], octaves.variance]))
+            size = np.linalg.norm(white[:, :-1], axis=0)
+            squares[list(places)] = nnls(white[:, :-1] / size, white[:, -1])[0] / size
+            model = np.maximum(columns @ squares, 1e-3 * octaves.variance)
+            half = best.half * (model / known)[:, None]
+        return Description(replace(octaves, columns=columns), squares, half).surprise
+
+    process = min((GaussMarkov(math.sqrt(2.0 / constant), constant) for constant in np.geomspace(
+        octaves.size[0], longest, 4 * len(octaves.size)).tolist()), key=roughly)
+    found = describe(octaves.with_process(process), places, misfit)
+    return found if _PROCESS in found.held else None
 
 
 @dataclass(frozen=True)
@@ -339,6 +421,8 @@ class NoiseFit:
         allows, as a share of them
     alternatives : the symbols of other combinations of parts that explain the record nearly as
         well
+    process : a Gauss-Markov process in place of flicker and rate random walk, where the record
+        asks for one; these two then stand for it at averaging times of the chart
 
     """
 
@@ -348,6 +432,7 @@ class NoiseFit:
     longest: float
     misfit: float
     alternatives: tuple[str, ...] = ()
+    process: GaussMarkov | None = None
 
     @property
     def noise(self) -> Noise:
@@ -408,38 +493,54 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
     return NoiseFit(figures, chart, float(chart.time[ranking.start]), float(chart.time[-1]),
                     ranking.misfit, tuple(sorted({
                         ''.join(PARTS[place].symbol for place in each.held if place != _BEND)
-                        for each in ranking.alternatives})))
+                        for each in ranking.alternatives})), _process(ranking, interval))
+
+
+def _process(ranking: Ranking, interval: float) -> GaussMarkov | None:
+    """Return the process that a record asks for."""
+    if ranking.process is None or ranking.process.octaves.process is None:
+        return None
+    time = ranking.process.octaves.process.correlation_time * interval
+    return GaussMarkov(math.sqrt(2.0 / time * ranking.process.squares[_PROCESS]), time)
 
 
 def _figure(ranking: Ranking, place: int, interval: float) -> Figure:
     """Return a figure with bounds that hold with and without parts of too little evidence."""
-    best, part = ranking.best, PARTS[place]
+    part, process = PARTS[place], ranking.process
+    # flicker and rate random walk stand for a process, and the other parts are beside it
+    beside = process is not None and place not in (_B, _K)
+    best = process if process is not None and beside else ranking.best
     value, deviation = 0.0, math.nan
-    lower, upper = _bounds(ranking, place)
-    if place in ranking.seen:
+    lower, upper = _bounds(ranking, place, beside)
+    if place in ranking.seen and place in best.held:
         value = math.sqrt(best.squares[place])
         deviation = 0.5 * best.deviation(place) / value
-        ends = [(lower, upper), *(each.bounds(place) for each in ranking.possible
-                                  if place in each.held)]
+        possible = [best] if beside else ranking.possible
+        ends = [(lower, upper), *(each.bounds(place) for each in possible if place in each.held)]
         lower, upper = min(value, *(low for low, _ in ends)), max(value, *(up for _, up in ends))
+        if place in (_B, _K) and ranking.without(place):
+            lower = 0.0
     else:
         lower = 0.0
     unit = interval ** -part.slope
     return Figure(part, *(each * unit for each in (value, deviation, lower, upper)))
 
 
-def _bounds(ranking: Ranking, place: int) -> tuple[float, float]:
+def _bounds(ranking: Ranking, place: int, beside: bool) -> tuple[float, float]:
     """
     Return the coefficients between which -2 ln likelihood is within `_CONFIDENCE` of the least.
 
     At each coefficient the other parts are fitted anew, N, B and K among them, which may be there
-    without being seen, so that what one of them takes from another is in the bounds.
+    without being seen, so that what one of them takes from another is in the bounds; so is a
+    process beside the part.
 
     """
     octaves, misfit = ranking.best.octaves, ranking.misfit
+    if beside and ranking.process is not None:
+        octaves = ranking.process.octaves
     held = {_N, _B, _K, *(each for one in (*ranking.possible, *ranking.alternatives)
                           for each in one.held)}
-    others = tuple(sorted(held - {place}))
+    others = tuple(sorted(held - {place} | ({_PROCESS} if beside else set())))
     joint = describe(octaves, (*others, place), misfit)
     (*_, square), (*_, deviation) = joint.estimate((*others, place))
 

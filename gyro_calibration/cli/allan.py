@@ -144,6 +144,10 @@ def _fit_line(fit: NoiseFit) -> str:
     if fit.alternatives:
         others = ' or '.join(' + '.join(each) for each in fit.alternatives)
         text += f'; {others} fit nearly as well, and a longer record would distinguish them'
+    if fit.process:
+        text += (f'; a Gauss-Markov process of {fit.process.deviation * UNITS["B"][1]:.3g} deg/h '
+                 f'with a correlation time of {fit.process.correlation_time:.3g} s describes them '
+                 'better than B and K, which stand for it here and may be zero')
     return f'{text}.'
 
 
@@ -165,5 +169,8 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart,
             'floor': {**vars(chart.floor), 'reached': fit.floor_reached},
             'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit,
             'rivals': list(fit.alternatives),
+            'gauss_markov': None if fit.process is None else {
+                'standard_deviation': fit.process.deviation,
+                'correlation_time_s': fit.process.correlation_time},
             'chart': {name: values.tolist() for name, values in columns.items()},
             'picture': given.picture, 'out': given.out}

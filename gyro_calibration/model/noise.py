@@ -160,6 +160,19 @@ class GaussMarkov:
         bracket = np.where(ratio < 1e-3, series, bracket)
         return self.density ** 2 * self.correlation_time * bracket / (2.0 * ratio ** 2)
 
+    @property
+    def deviation(self) -> float:
+        """Return the standard deviation of the process, rad/s."""
+        return self.density * math.sqrt(0.5 * self.correlation_time)
+
+    def angle_covariance(self, time: Number) -> Array:
+        """Return that of the angle, rad², as `Part.covariance` does."""
+        ratio = np.abs(np.asarray(time, dtype=float)) / self.correlation_time
+        # ratio - 1 + exp(-ratio) loses all digits where the ratio is small
+        growth = np.where(ratio < 1e-4, ratio ** 2 * (0.5 - ratio / 6.0),
+                          ratio + np.expm1(-ratio))
+        return -(self.deviation * self.correlation_time) ** 2 * growth
+
 
 @dataclass(frozen=True)
 class Part:

@@ -155,6 +155,21 @@ def test_a_standard_deviation_is_the_scatter_of_its_figure(case):
             assert 0.9 * low < ratio < 1.1 * high, (symbol, ratio)
 
 
+def test_a_gauss_markov_process_is_found_and_a_flicker_or_random_walk_is_not_taken_for_one():
+    """Of 1e-3 rad/s and 20 s, in 2000 s of white noise."""
+    generator, kept, found = np.random.default_rng(8), math.exp(-0.01 / 20.0), []
+    for _ in range(5):
+        shocks = 1e-3 * math.sqrt(1.0 - kept ** 2) * generator.standard_normal(200_000)
+        fit = fit_noise(simulate_noise(WHITE, 200_000, 0.01, generator)
+                        + lfilter([1.0], [1.0, -kept], shocks), 0.01)
+        found.append((fit.process.deviation, fit.process.correlation_time))
+        assert fit.figures['K'].lower == 0.0
+        assert fit.figures['N'].value == pytest.approx(1e-3, rel=0.02)
+    assert np.median(found, axis=0) == pytest.approx((1e-3, 20.0), rel=0.5)
+    for noise in (Noise(1e-3, 3e-4), Noise(1e-3, 0.0, 1e-4)):
+        assert fit_noise(simulate_noise(noise, 200_000, 0.01, generator), 0.01).process is None
+
+
 def test_white_noise_alone_shows_nothing_else():
     """At most 5 % of records show what is not there."""
     found = figures(WHITE, 25, 5, samples=3000)
