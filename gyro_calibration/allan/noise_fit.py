@@ -107,7 +107,7 @@ class Octaves:
     def with_column(self, process: GaussMarkov) -> Array:
         """Return the columns with that of a process of 1 rad/s, its times in samples."""
         columns = self.columns.copy()
-        columns[:, _PROCESS] = process.allan_variance(self.size)
+        columns[:, _PROCESS] = process.allan_variance(self.size.astype(float))
         return columns
 
     def with_process(self, process: GaussMarkov) -> Octaves:
