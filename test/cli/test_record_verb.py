@@ -117,7 +117,10 @@ def read(path, **topics):
 
 def holds(path, count):
     """Return whether so many samples are in a file; before the first piece it is empty."""
-    return path.exists() and path.stat().st_size > 0 and len(read(path)) >= count
+    try:
+        return path.stat().st_size > 0 and len(read(path)) >= count
+    except FileNotFoundError:  # also after the try at the start
+        return False
 
 
 def is_unbroken(log):
