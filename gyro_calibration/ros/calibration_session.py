@@ -55,7 +55,7 @@ from gyro_calibration.model.motion import (
     read_motion,
 )
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.clock import Clock, node_time
+from gyro_calibration.ros.clock import Clock, node_time, StampDelay
 from gyro_calibration.ros.health_monitor import changed, HealthMonitor
 from gyro_calibration.ros.state_store import StateStore
 from gyro_calibration.ros.wheels import Velocity
@@ -80,11 +80,9 @@ STOPPING = 1.5
 _TURNED = 1.0 * DEGREE
 #: Own commands that have not come back yet; at 50 Hz that is 5 s.
 _ECHOES = 256
-#: The sample with the least delay within this time shows how far stamps are behind the clock, s:
-#: few are held up for so long, and the clock of a gyro that is 3 % off moves by 15 ms in it.
-_PROMPT = 0.5
-#: By this part the stamps may be faster or slower than the clock: the clocks of gyros are 3 % off.
-_PACE = 0.05
+#: A node that was held up for this time, s, does not go on with a drive: the base itself has
+#: stopped, or turned on.
+_HELD_UP = 1.0
 #: The zero that ends a drive is repeated for this time, s: the link to the base may lose one.
 _REPEATED = 1.0
 
@@ -225,21 +223,12 @@ class Drive:
         self._received, self._suspected, self._due = False, False, -math.inf
         self._called = self._alone = False
         self._polled = self._begun
-        # When the pace of the stamps was last compared, and their delay then, s.
-        self._pace: tuple[float, float] | None = None
-        # Time of arrival and delay, s, of samples with less delay than any before them.
-        self._prompt: deque[tuple[float, float]] = deque()
+        self._delay = StampDelay(clock, BLIND)
         self.command_lateness = self.sample_lateness = 0.0
 
     def see_sample(self, time: float) -> None:
         """Measure how much later than the most prompt one of the last time a sample came."""
-        now = node_time(self._clock)
-        while self._prompt and self._prompt[-1][1] >= now - time:
-            self._prompt.pop()
-        self._prompt.append((now, now - time))
-        while now - self._prompt[0][0] > _PROMPT:
-            self._prompt.popleft()
-        self.sample_lateness = max(self.sample_lateness, now - time - self._prompt[0][1])
+        self.sample_lateness = max(self.sample_lateness, self._delay.add(time))
 
     def waits(self, receivers: int) -> bool:
         """Tell whether the run has not begun because no node receives its commands."""
@@ -256,32 +245,17 @@ class Drive:
             return self._not_received
         if ros_time_stands:
             return STANDING_TIME
-        if pause > 2.0 * BLIND:
+        if pause > _HELD_UP:
             return (f'this computer was busy: the node was held up for {pause:.1f} s while it '
                     'drove the robot; reduce its load and run again')
-        if astray := self._astray():
-            return astray
+        if fault := self._delay.fault():
+            return fault
         # Decided at the second poll: after a pause of this process the samples that wait in its
         # queue come after its timers.
         silence = now - self._run.received
         before, self._suspected = self._suspected, silence > self._blind()
         return (f'no sample came for {silence:.2f} s while the robot was driven: check the gyro '
                 'and its driver') if before and self._suspected else ''
-
-    def _astray(self) -> str:
-        """Return that the stamps, by which the motion goes on, leave the clock; ''."""
-        if not self._prompt:
-            return ''
-        now, delay = node_time(self._clock), self._prompt[0][1]
-        then, before = self._pace or (now, delay)
-        # Samples that are held up by 0.25 s are behind a fast simulation by more.
-        limit = BLIND if self._clock.simulated() is None else 4.0 * BLIND
-        if abs(delay - before) > limit + _PACE * abs(now - then):
-            return (f'the stamps on imu/data_raw went on by {now - then - delay + before:.2f} s '
-                    f'in {now - then:.2f} s: check the clock of the driver, and use_sim_time')
-        if self._pace is None or now - then > 4.0 * _PROMPT:
-            self._pace = now, delay
-        return ''
 
     def is_abandoned(self, callers: int) -> bool:
         """Tell whether the callers of the service have left, at two polls."""
@@ -301,7 +275,7 @@ class Drive:
         if self._suspected or not self._run.times:
             return 0.0
         # By the stamps, but samples that are held up do not hold up the motion.
-        elapsed = max(now - self._prompt[0][1] - self._run.times[0], self._run.elapsed)
+        elapsed = max(now - self._delay.least - self._run.times[0], self._run.elapsed)
         return float(self._motion.rate_at(np.array(elapsed)))
 
     _not_received = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel '

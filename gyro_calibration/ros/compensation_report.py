@@ -73,7 +73,7 @@ class CompensationReport:
         missing = [f'the model needs the {channel.replace("_", " ")}, which no message contains; '
                    'that effect is left out'
                    for channel in estimator.missing(pipeline.journal.channels)]
-        others = (pipeline.session.warning, pipeline.odometry_fault, store.hint,
+        others = (pipeline.session.warning, pipeline.pace, pipeline.odometry_fault, store.hint,
                   store.shared_hint, monitor.bias_alarm, monitor.noise_alarm, estimator.sentence,
                   store.table_hint)
         low, high = estimator.model.temperature_range

@@ -41,7 +41,7 @@ from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import BLIND, CalibrationSession, REST, STANDING_TIME
-from gyro_calibration.ros.clock import Clock, RosTime
+from gyro_calibration.ros.clock import Clock, RosTime, StampDelay
 from gyro_calibration.ros.health_monitor import HealthMonitor, StuckOutput
 from gyro_calibration.ros.parameters import Parameter
 from gyro_calibration.ros.state_store import StateStore
@@ -175,6 +175,7 @@ class Pipeline:
     conflict : why the samples cannot be used, in a sentence; ''
     several : the same for publishers that are there, of which perhaps one alone sends; ''
     stuck : that the gyro repeats one value, in a sentence; ''
+    pace : that the stamps of samples leave the clock, in a sentence; ''
     odometry_fault : why odometry is not taken for a standstill, in a sentence; ''
 
     """
@@ -221,6 +222,7 @@ class Pipeline:
         # When samples with a repeated stamp began, s, and the fastest rate among them, rad/s.
         self._standing: tuple[float, float] | None = None
         self.stuck, self._repeats = '', StuckOutput(noise)
+        self.pace, self._astray, self._stamps = '', '', StampDelay(clock, _INTERLEAVED)
         self._suspect = math.nan  # a temperature, degC
         # What odometry's heading was when its rate became zero, rad, and when both differed, s.
         self._stood, self._contradicted = math.nan, -math.inf
@@ -421,6 +423,7 @@ class Pipeline:
         elif unseen and moving is not False and tracker.intervals.lost > lost:
             turned = 0.25 * _ACCELERATION * interval ** 2
             estimator.rewind(tracker.heading, tracker.variance + turned ** 2)
+        self._stamps.add(time)
         self._look_for_repeats(time, output, now)
         if self.monitor.works and self.monitor.add(time, output, estimator.corrected):
             run = self.session.run
@@ -469,6 +472,7 @@ class Pipeline:
         self.monitor.restart()
         self.journal.counts['restarts'] += 1
         self.journal.event = f'{reason}: integration was restarted'
+        self._stamps = StampDelay(self._clock, _INTERLEAVED)
         self._recent.clear()
         self.session.interrupt(reason)
 
@@ -558,6 +562,9 @@ class Pipeline:
         """Let the bias table learn from rests; to be called once a second, and at the end."""
         if not self.simulated:
             self._look_at_host_clock()
+        # Twice in a row: samples that were held up come at once, and are late until they have.
+        before, self._astray = self._astray, self._stamps.fault()
+        self.pace = before and self._astray
         date = self._clock.date()
         if event := self.estimator.learn(date, ending):
             self.journal.event = event

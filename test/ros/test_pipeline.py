@@ -784,6 +784,36 @@ def test_the_diagnostics_name_what_is_wrong_within_two_seconds(
     assert (found, words in message) == (level, True), message
 
 
+@pytest.mark.parametrize('pace, warns', [(1e-6, True), (0.5, True), (2.0, True), (1.03, False),
+                                         (1.0, False)])
+def test_stamps_that_leave_the_clock_are_a_warning(tmp_path, reported, pace, warns):
+    """What turns in the meantime is not what the stamps say."""
+    rig = rested(tmp_path)
+    stamp, begin = rig.stamp, rig.clock.now
+    rig.stamp = lambda reading: stamp(reading) + round(1e9 * (pace - 1) * (rig.clock.now - begin))
+    rig.robot.command(0.5)
+    rig.go(6.0)
+    reported(rig)
+    rig.go(1.0)
+    level, message, _ = reported(rig)
+    assert (level == WARN and 'the stamps on imu/data_raw went on by' in message) == warns, message
+
+
+def test_samples_that_were_held_up_do_not_leave_the_clock(tmp_path, reported):
+    rig, waiting = rested(tmp_path), []
+    for _ in range(400):
+        rig.clock.now += INTERVAL
+        reading = rig.robot.step()
+        waiting.append((rig.stamp(reading), reading.output, reading.heading))
+    rig.guards()
+    for each in waiting:
+        rig.sample(*each)
+    for _ in range(4):
+        rig.go(1.0)
+        level, message, _ = reported(rig)
+    assert level == OK, message
+
+
 def test_an_absent_clock_is_an_error_from_the_begin_on(tmp_path, reported):
     rig = Rig(tmp_path, ros=0.0)
     for _ in range(200):
