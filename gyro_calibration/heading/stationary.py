@@ -20,13 +20,15 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 import math
 
 from gyro_calibration.heading.gaps import CLOSE
 from gyro_calibration.heading.kalman import Drift, RateIntegral
+from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import Noise
+import numpy as np
 from scipy.special import chdtri, ndtri
 
 #: Length of a block of samples, and of the window whose energy is looked at, s.
@@ -40,13 +42,12 @@ _SAMPLES = 8
 #: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
 #: of the model.
 _REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
-#: What is assumed of a robot at first: so many rests and straight drives that pass for rests, so
-#: much scatter of means over 1 s on them beyond the noise, over its variance, as if seen for
-#: so long, s.
-_RESTS, _STRAIGHT, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
-#: Rests and drives are remembered, and the scatter for so long, s; a mean counts up to so many
-#: squared standard deviations.
-_STRETCHES, _SCATTER_MEMORY, SCATTER_MOST = 20.0, 200.0, 40.0
+#: Possible scatter of means over 1 s on what passes for a rest, beyond the white noise and over
+#: its variance; the first is that of a rest, the others are those of straight drives.
+SCATTERS = np.append(0.0, 4.0 ** np.arange(7))
+#: What is assumed of a robot at first: so many rests, and straight drives that pass for rests;
+#: of so many the scatter is remembered.
+_RESTS, _STRAIGHT, _STRETCHES = 3.0, 1.0, 20.0
 #: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
 BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
 
@@ -225,8 +226,7 @@ class Snapshot:
     drift, deleted, steps : the state, heading deleted until then, rad, and steps kept
     turn : what the rates came to since it began
     squares, means : sum of the squared surprises of the steps since it began, and their number
-    excess, weight : weighted sum of what their scatter had beyond the noise, over its variance
-    odds : logarithm of how much likelier they are on a straight drive than at a rest
+    likelihood : logarithm of how likely their scatter is for each of `SCATTERS`, shape (k,)
 
     """
 
@@ -236,45 +236,32 @@ class Snapshot:
     steps: int
     squares: float = 0.0
     means: int = 0
-    excess: float = 0.0
-    weight: float = 0.0
-    odds: float = 0.0
+    likelihood: Array = field(default_factory=lambda: np.zeros(len(SCATTERS)))
 
 
 @dataclass
 class StraightDrives:
     """
-    How often a straight drive passed for a rest, and how much the rates scatter there.
+    How much the rates scatter on what passed for rests.
 
     Attributes
     ----------
-    rests, drives : how many there were
-    excess, weight : weighted sum of the scatter of means over 1 s, over the variance of the noise
+    counts : how many had each of `SCATTERS`, shape (k,)
 
     """
 
-    rests: float = _RESTS
-    drives: float = _STRAIGHT
-    excess: float = _SCATTER * _SCATTER_SEEN
-    weight: float = _SCATTER_SEEN
+    counts: Array = field(default_factory=lambda: np.append(
+        _RESTS, np.full(len(SCATTERS) - 1, _STRAIGHT / (len(SCATTERS) - 1))))
 
-    @property
-    def scatter(self) -> float:
-        """Return the scatter on a straight drive, over the variance of the noise."""
-        return max(self.excess / self.weight, 0.0)
-
-    def chance(self, odds: float) -> float:
-        """Return the probability that what passes for a rest is a straight drive."""
-        return 1.0 / (1.0 + self.rests / self.drives * math.exp(min(-odds, 700.0)))
+    def chances(self, likelihood: Array) -> Array:
+        """Return the probability of each scatter, shape (k,)."""
+        chances = self.counts * np.exp(likelihood - likelihood.max())
+        return np.asarray(chances / chances.sum())
 
     def learn(self, last: Snapshot) -> None:
         """Take in all of what passed for a rest."""
-        drive = self.chance(last.odds)
-        kept = _STRETCHES / max(_STRETCHES, self.rests + self.drives)
-        self.rests, self.drives = kept * self.rests + 1.0 - drive, kept * self.drives + drive
-        kept = _SCATTER_MEMORY / max(_SCATTER_MEMORY, self.weight)
-        self.excess, self.weight = (kept * self.excess + drive * last.excess,
-                                    kept * self.weight + drive * last.weight)
+        kept = _STRETCHES / max(_STRETCHES, float(self.counts.sum()))
+        self.counts = kept * self.counts + self.chances(last.likelihood)
 
 
 @dataclass

@@ -35,8 +35,8 @@ from gyro_calibration.heading.stationary import (
     Energy,
     LAGS,
     most_scatter,
-    SCATTER_MOST,
     SCATTERED,
+    SCATTERS,
     sigmas,
     SlowTurn,
     Snapshot,
@@ -54,7 +54,7 @@ JUMP, ACCELERATION = 0.5, 200.0
 _STEP = 1.0
 #: A sample at rest may be off by so many standard deviations of the bias.
 _FAR = 4.0
-#: A rest that is over sooner was none, s.
+#: A rest that is over sooner, without a sudden motion, was none, s.
 _BRIEF = 2.0
 #: While the wheels stand, the robot does not turn, and the bias may have moved by so much, rad/s.
 _UNSEEN = 0.2 * DEGREE
@@ -69,6 +69,8 @@ _SLOW_TURN, _DECIDED = 1.5, 2.0 * LAGS[-1]
 _RECOGNIZED = 1.0
 #: Samples of a log that are taken at once.
 _AT_ONCE = 1 << 15
+#: Last blocks of a rest that are remembered, among which its end is looked for.
+_BLOCKS = round((2.0 * _STEP + WINDOW) / BLOCK)
 #: States of a rest that are remembered.
 _SNAPSHOTS = round(LAGS[-1] / _STEP) + 8
 #: The slowest turn that is noticed is missed with a probability of 5 %.
@@ -509,6 +511,7 @@ class HeadingTracker:
         part, self._part, self._known = self._part, self._none(), None
         self._open += part
         if self.resting:
+            self._blocks.append(part)
             if quiet is False:
                 self._notice(WINDOW)
             elif self._open.duration >= _STEP - CLOSE:
@@ -526,6 +529,7 @@ class HeadingTracker:
         if quiet and self._stands(wheels):
             self._advance(self._settled())
             self._rest()
+            self._blocks.extend([*self._recent][1:])
 
     def _hold(self, part: RateIntegral) -> None:
         """Hold the last blocks back that may turn out to be the begin of a rest."""
@@ -632,6 +636,7 @@ class HeadingTracker:
     def _rest(self) -> None:
         """Take the robot for standing from here on."""
         self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
+        self._blocks = deque[RateIntegral](maxlen=_BLOCKS)
         self._snapshots = [Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
 
     def _move(self, wanted: float) -> None:
@@ -648,10 +653,14 @@ class HeadingTracker:
     def _notice(self, lag: float, before: Snapshot | None = None) -> None:
         """Take the robot for moving since `lag` s before the last block, or some snapshot."""
         self._advance()
-        scattered, before = before is not None, before or self._before(lag) or self._snapshots[0]
-        if self._rested.duration < _BRIEF - CLOSE:
+        scattered = before is not None
+        before = before or self._before(max(lag, WINDOW)) or self._snapshots[0]
+        sudden = lag <= WINDOW and not scattered
+        if not sudden and self._rested.duration < _BRIEF - CLOSE:
             before = self._snapshots[0]
         turn = self._rested - before.turn
+        if sudden:
+            before, turn = self._until_motion(before, turn)
         self._slow = (self._slow_turn(before, turn) if lag >= LAGS[0] and not scattered else None)
         if self._snapshots[-1].means:
             self._drives.learn(self._snapshots[-1])
@@ -659,6 +668,41 @@ class HeadingTracker:
         del self.steps[before.steps:]
         self._move(max(lag, WINDOW))
         self._advance()
+
+    def _until_motion(self, before: Snapshot,
+                      turn: RateIntegral) -> tuple[Snapshot, RateIntegral]:
+        """
+        Return the state behind the last block at rest after a snapshot, and the turn since.
+
+        Of all blocks at which motion may have begun, it is the likeliest, where the rates of a
+        motion scatter by an unknown size; the block before it is left out, for it may hold the
+        very begin.
+
+        """
+        blocks, duration = list[RateIntegral](), 0.0
+        for block in reversed(self._blocks):
+            if duration + block.duration > turn.duration + CLOSE:
+                break
+            blocks.insert(0, self._at_rest(block))
+            duration += block.duration
+        if len(blocks) < 3 or turn.duration - duration > BLOCK:
+            return before, turn
+        squares = np.square([self._surprise(before.drift, block) for block in blocks])
+        at_rest = np.cumsum(squares)[:-1]
+        moving = np.maximum((squares.sum() - at_rest) / np.arange(len(blocks) - 1, 0, -1), 1.0)
+        last = int(np.argmin(at_rest + np.arange(len(blocks) - 1, 0, -1)
+                             * (1.0 + np.log(moving))))
+        if not last:
+            return before, turn
+        quiet = sum(blocks[1:last], blocks[0])
+        while self._snapshots[-1] is not before:
+            self._snapshots.pop()
+        del self.steps[before.steps:]
+        self._drift, self._rested = before.drift, before.turn + self._nothing
+        self.deleted = (before.deleted + quiet.turned - before.drift.expected(quiet)[0]
+                        + self._corrected(self._part))
+        self._advance_at_rest(quiet, turn - quiet)
+        return self._snapshots[-1], turn - quiet
 
     def _slow_turn(self, before: Snapshot, turn: RateIntegral) -> SlowTurn | None:
         """Return what was noticed, where it is so slow that the bias may have moved."""
@@ -716,19 +760,14 @@ class HeadingTracker:
         """Take the state on over a part of a rest, and see how much its rates scatter."""
         before, (expected, variance) = self._snapshots[-1], self._drift.expected(turn)
         white = self._drift.noise.angle_random_walk ** 2 * turn.duration
-        squared, weight = (turn.turned - expected) ** 2 / variance, (white / variance) ** 2
-        scatter = self._drives.scatter * white
-        ratio = 1.0 + scatter / variance
-        odds = before.odds + 0.5 * (squared * (1.0 - 1.0 / ratio) - math.log(ratio))
-        turn.wander = self._drives.chance(odds) * scatter
-        squares, squared = before.squares + squared, min(squared, SCATTER_MOST)
+        squared, ratios = (turn.turned - expected) ** 2 / variance, 1.0 + SCATTERS * white / variance
+        likelihood = before.likelihood - 0.5 * (squared / ratios + np.log(ratios))
+        turn.wander = float(self._drives.chances(likelihood) @ SCATTERS) * white
         self._go_on(turn, self._reached - self._part.duration - left.duration)
         self._rested += turn
         self._snapshots.append(Snapshot(
             self._drift, self._rested, self.deleted - self._corrected(self._part),
-            len(self.steps), squares, before.means + 1,
-            before.excess + weight * (squared - 1.0) * variance / white, before.weight + weight,
-            odds))
+            len(self.steps), before.squares + squared, before.means + 1, likelihood))
         del self._snapshots[:-_SNAPSHOTS]
 
     def _go_on(self, turn: RateIntegral, end: float) -> None:
