@@ -13,60 +13,73 @@ Writes calibrations and bias tables in processes that are killed meanwhile.
 
     python killed_writer.py FOLDER KILLS
 
-Each of KILLS children is forked, so that it writes at once, and is killed at a random time around
-its writing. What it leaves must be, byte by byte, what was there before or what the same writing
+Each of KILLS children is forked and killed before a random one of the lines of files.py that it
+runs, or ends. What it leaves must be, byte by byte, what was there before or what the same writing
 gives that nobody kills. Prints the number of each, as JSON.
 
 """
 
 import copy
+import itertools
 import json
 import os
 from pathlib import Path
 import random
 import signal
 import sys
-import time
 
+from gyro_calibration import files
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.ros.state_store import StateStore
 
-FILES = ('calibration.yaml', 'biases.yaml')
+KEPT = ('calibration.yaml', 'biases.yaml')
 BEGIN, STEP = 1.7e9, 86400.0  # s since 1970, and from one run of the robot to the next
 
 
 def opened(folder):
     """Return the memory of a robot that starts."""
-    return StateStore('', folder / FILES[0], folder / FILES[1], Prior())
+    return StateStore('', folder / KEPT[0], folder / KEPT[1], Prior())
 
 
 def write(memory, number):
-    """Write a calibration, and each fourth time a bias table as well, as the node does."""
+    """Write a calibration, and each second time a bias table as well, as the node does."""
     memory.keep(SelfCalibration(0.01 + 1e-6 * number, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)),
                                 '2026-01-01T00:00:00+00:00', 25.0, 'rest'))
-    if number % 4:
+    if number % 2:
         return
     memory.table.add(10.0 + number % 32, 1e-3 + 1e-5 * (number % 7), 1e-10, BEGIN + STEP * number)
     memory.keep_table(BEGIN + STEP * number, ending=True)
 
 
-def forked(memory, number):
-    """Return the process number of a child that has just begun to write."""
-    ready, begun = os.pipe()
+def lines_of(memory, number, on_line=lambda line: None):
+    """Write, call a function before each line of files.py with its number; return how many."""
+    lines = itertools.count()
+
+    def trace(frame, event, _):
+        if frame.f_code.co_filename == files.__file__:
+            on_line(next(lines))
+            return trace
+        return None
+    sys.settrace(trace)
+    write(memory, number)
+    sys.settrace(None)
+    return next(lines)
+
+
+def write_killed(memory, number, line):
+    """Write in a child that is killed before this line, or ends."""
     child = os.fork()
     if child == 0:
-        os.write(begun, b'x')
-        write(memory, number)
+        lines_of(memory, number,
+                 lambda each: each == line and os.kill(os.getpid(), signal.SIGKILL))
         os._exit(0)
-    os.read(ready, 1)
-    os.close(ready), os.close(begun)
-    return child
+    os.waitpid(child, 0)
 
 
 def contents(folder):
     """Return what the files hold."""
-    return [(folder / name).read_bytes() if (folder / name).exists() else b'' for name in FILES]
+    return [(folder / name).read_bytes() if (folder / name).exists() else b'' for name in KEPT]
 
 
 def taught(folder):
@@ -84,19 +97,16 @@ def main():
     robot, unharmed = taught(folder / 'robot'), taught(folder / 'unharmed')
     found = {'old': [0, 0], 'new': [0, 0], 'torn': 0, 'half_written': 0}
     for number in range(kills):
-        old, begin = contents(folder / 'robot'), time.monotonic()
-        write(copy.deepcopy(unharmed), number)
-        new, lasts = contents(folder / 'unharmed'), time.monotonic() - begin
-        child = forked(robot, number)
-        time.sleep(moments.uniform(0.0, 1.5 * lasts))
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        old, memory = contents(folder / 'robot'), copy.deepcopy(unharmed)
+        lines = lines_of(memory, number)
+        new = contents(folder / 'unharmed')
+        write_killed(robot, number, moments.randrange(round(1.3 * lines)))
         for place, content in enumerate(contents(folder / 'robot')):
             if content not in (old[place], new[place]):
                 found['torn'] += 1
             elif old[place] != new[place]:
                 found['new' if content == new[place] else 'old'][place] += 1
-        found['half_written'] += len(os.listdir(folder / 'robot')) > len(FILES)
+        found['half_written'] += len(os.listdir(folder / 'robot')) > len(KEPT)
     memory = opened(folder / 'robot')
     print(json.dumps(found | {'hints': memory.hint + memory.table_hint,
                               'left': sorted(os.listdir(folder / 'robot'))}))

@@ -27,7 +27,7 @@ from rig import rested
 
 @pytest.mark.parametrize('kills', [60, pytest.param(500, marks=pytest.mark.evidence)])
 def test_kills_leave_the_old_files_or_the_new_ones(tmp_path, kills):
-    """A process writes what the node writes, with the same code; the node is killed below."""
+    """A process writes what the node writes, with the same code."""
     command = [sys.executable, Path(__file__).parents[1] / 'killed_writer.py', tmp_path,
                str(kills)]
     found = json.loads(
