@@ -15,7 +15,6 @@ import math
 import subprocess
 import sys
 
-from gyro_calibration.cli.main import main
 from gyro_calibration.logs.log import Log, read_log, read_log_blocks, write_log
 from gyro_calibration.model.motion import ROBOT
 import numpy as np
@@ -84,7 +83,7 @@ WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--inver
 
 
 @pytest.mark.parametrize('words', WORDS.values(), ids=WORDS)
-def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, request, capsys):
+def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, request, run):
     write_robot(tmp_path / 'log.csv', 4001)
     lines = (tmp_path / 'log.csv').read_text().splitlines()
     for lost in (1, 2, *range(290, 1300), 4001):  # outputs of whole blocks and of the last row
@@ -93,9 +92,10 @@ def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, 
     (tmp_path / 'log.csv').write_text('\n'.join(lines) + '\n')
     answers = []
     for out in ('whole.csv', 'blocks.csv.gz'):
-        assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
-                     '--out', str(tmp_path / out), '--json', *words]) == 0
-        answers.append(capsys.readouterr().out.replace(out, ''))
+        code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model,
+                            '--out', tmp_path / out, '--json', *words)
+        assert code == 0
+        answers.append(text.replace(out, ''))
         request.getfixturevalue('small_blocks')
     assert answers[0] == answers[1] and '"rows_without_output": 1013' in answers[0]
     whole, blocks = (read_log(tmp_path / out).others for out in ('whole.csv', 'blocks.csv.gz'))
@@ -105,12 +105,12 @@ def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, 
                                    rtol=1e-12, err_msg=name)
 
 
-def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, capsys):
+def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, run):
     (tmp_path / 'log.csv').write_text(
         'time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))
-    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
-                 '--out', str(tmp_path / 'out.csv')]) == 1
-    assert ('no gyro output is finite' in capsys.readouterr().err
+    code, _, error = run('compensate', tmp_path / 'log.csv', '--model', model,
+                         '--out', tmp_path / 'out.csv')
+    assert (code == 1 and 'no gyro output is finite' in error
             and not (tmp_path / 'out.csv').exists())
 
 
@@ -123,13 +123,12 @@ def test_a_log_may_come_through_a_pipe(model, tmp_path):
     assert done.returncode == 0 and b'1000 rows compensated' in done.stdout, done.stderr
 
 
-def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(tmp_path, small_blocks):
+def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(tmp_path, small_blocks, run):
     (tmp_path / 'model.yaml').write_text('effects: {}\nnoise: {angle_random_walk: 7.3e-4}')
     # A gap of 3 s, then only every other sample.
     time = np.cumsum([0.0, *np.full(499, 0.01), 3.0, *np.full(500, 0.02)])
     write_log(tmp_path / 'log.csv', Log(output=np.zeros(len(time)), time=time))
-    words = ['compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
-             '--out', tmp_path / 'out.csv']
-    assert main([str(word) for word in words]) == 0
+    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+               '--out', tmp_path / 'out.csv')[0] == 0
     deviation = np.array(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'], float)
     assert deviation == pytest.approx(np.full(len(time), 7.3e-4 / math.sqrt(0.01)), rel=1e-9)

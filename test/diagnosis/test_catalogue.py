@@ -13,7 +13,6 @@
 import json
 import math
 
-from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.model.effects import ADDED, CATALOGUE
 import pytest
@@ -49,41 +48,36 @@ def own(tmp_path):
         known.pop('soft_iron', None)
 
 
-def test_an_effect_of_ones_own_is_simulated_found_and_compensated(own, tmp_path, capsys):
+def test_an_effect_of_ones_own_is_simulated_found_and_compensated(own, tmp_path, run):
     (tmp_path / 'real.yaml').write_text(MODEL)
     (tmp_path / 'profile.csv').write_text(PROFILE)
-    log, catalogue = str(tmp_path / 'log.csv'), ['--catalogue', str(own)]
-    assert main(['simulate', '--model', str(tmp_path / 'real.yaml'), '--motion',
-                 str(tmp_path / 'profile.csv'), '--sample-rate', '20', '--seed', '4', '--out', log,
-                 *catalogue]) == 0
-    capsys.readouterr()
-    assert main(['diagnose', log, '--out', str(tmp_path / 'out'), '--json', *catalogue]) == 0
-    finding, = json.loads(capsys.readouterr().out)['findings']
+    log, catalogue = tmp_path / 'log.csv', ['--catalogue', own]
+    assert run('simulate', '--model', tmp_path / 'real.yaml', '--motion', tmp_path / 'profile.csv',
+               '--sample-rate', '20', '--seed', '4', '--out', log, *catalogue)[0] == 0
+    code, text, error = run('diagnose', log, '--out', tmp_path / 'out', '--json', *catalogue)
+    assert code == 0, error
+    finding, = json.loads(text)['findings']
     assert finding['effect'] == 'soft_iron' and finding['status'] == 'established'
     low, high = finding['parameters']['soft_iron']['ci95']
     assert low - 1e-4 < math.hypot(2e-3, 1e-3) < high + 1e-4 and high - low < 1e-3
-    assert main(['compensate', log, '--model', str(tmp_path / 'out/model.yaml'), '--out',
-                 str(tmp_path / 'compensated.csv'), *catalogue]) == 0
+    assert run('compensate', log, '--model', tmp_path / 'out/model.yaml', '--out',
+               tmp_path / 'compensated.csv', *catalogue)[0] == 0
 
 
-def test_without_its_file_a_model_with_such_an_effect_is_refused(tmp_path, capsys):
+def test_without_its_file_a_model_with_such_an_effect_is_refused(tmp_path, run):
     (tmp_path / 'real.yaml').write_text(MODEL)
-    assert main(['simulate', '--model', str(tmp_path / 'real.yaml'), '--motion', 'robot',
-                 '--out', str(tmp_path / 'log.csv')]) == 2
-    assert '--catalogue' in capsys.readouterr().err
+    code, _, error = run('simulate', '--model', tmp_path / 'real.yaml', '--motion', 'robot',
+                         '--out', tmp_path / 'log.csv')
+    assert code == 2 and '--catalogue' in error
 
 
 @pytest.mark.parametrize('text, message', [
-    ('EFFECTS = [1]', '1 is not an Effect'), ('x = 1', 'EFFECTS'), ('1 / 0', 'ZeroDivisionError'),
+    (None, 'not a Python file'), ('EFFECTS = [1]', '1 is not an Effect'), ('x = 1', 'EFFECTS'),
+    ('1 / 0', 'ZeroDivisionError'),
     (OWN.replace("'soft_iron'", "'bias'"), 'the name bias is taken'),
     (OWN.replace('return np.sin(2.0 * channels.heading), ', 'return '), 'coefficients')])
-def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(text, message, tmp_path, capsys):
-    (tmp_path / 'own.py').write_text(text)
-    assert main(['allan', 'log.csv', '--catalogue', str(tmp_path / 'own.py')]) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count('\n') == 1
-
-
-def test_a_missing_file_is_refused(tmp_path, capsys):
-    assert main(['allan', 'log.csv', '--catalogue', str(tmp_path / 'none.py')]) == 2
-    assert 'not a Python file' in capsys.readouterr().err
+def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(text, message, tmp_path, run):
+    if text is not None:
+        (tmp_path / 'own.py').write_text(text)
+    code, _, said = run('allan', 'log.csv', '--catalogue', tmp_path / 'own.py')
+    assert code == 2 and message in said and said.count('\n') == 1

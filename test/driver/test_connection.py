@@ -121,12 +121,13 @@ def test_stamps_go_on_when_another_gyro_is_recognized():
     assert reading.connection.protocol is find('csv') and min(reading.steps) > 0.0
 
 
-def test_listening_ends_on_request():
-    stop = threading.Event()
-    world = World(60.0)
-    connection = Connection('/dev/gyro', on_change=lambda state: stop.set(), clock=world,
+@pytest.mark.parametrize('protocol, state', [('auto', 'listening'), ('csv', 'failed')])
+def test_listening_and_waiting_end_on_request(protocol, state):
+    stop, world = threading.Event(), World(60.0)
+    world.plugged = protocol == 'auto'
+    connection = Connection('/dev/gyro', protocol, on_change=lambda _: stop.set(), clock=world,
                             make_port=world.port)
-    assert list(connection.chunks(stop)) == [] and connection.state.name == 'listening'
+    assert list(connection.chunks(stop)) == [] and connection.state.name == state
 
 
 # Finding and waiting
@@ -178,12 +179,6 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     doubling = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
     assert waits == pytest.approx([*doubling, *5 * [5.0], *doubling, 5.0])
     assert reading.connection.waited == pytest.approx(31.3 + 10.0, abs=0.2)
-
-
-def test_waiting_ends_on_request():
-    stop = threading.Event()
-    connection = Connection('/nonexistent/gyro', 'csv', on_change=lambda state: stop.set())
-    assert list(connection.chunks(stop)) == [] and connection.state.name == 'failed'
 
 
 def test_a_protocol_that_is_not_known_is_refused():

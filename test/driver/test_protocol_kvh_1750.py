@@ -111,12 +111,6 @@ def test_the_temperature_has_a_sign(temperature):
     assert decoded(PROTOCOL.encode(Sample(0.1, temperature + 0.3)))[0].temperature == temperature
 
 
-@pytest.mark.parametrize('force', [9.81, -9.81, 0.0, 98.0665, None])
-def test_the_specific_force_keeps_its_sign(force):
-    sample, = decoded(PROTOCOL.encode(Sample(0.1, specific_force=force)))
-    assert sample.specific_force == (force if force is None else pytest.approx(force, rel=1e-6))
-
-
 def test_the_sequence_wraps_at_128():
     samples = decoded(b''.join(PROTOCOL.encode(Sample(0.1, sequence=number))
                                for number in range(300)))

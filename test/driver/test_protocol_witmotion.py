@@ -48,12 +48,6 @@ def test_the_temperature_has_a_sign(temperature):
             == pytest.approx(temperature))
 
 
-@pytest.mark.parametrize('force', [9.81, -9.81, None])
-def test_the_specific_force_keeps_its_sign(force):
-    sample, = decoded(PROTOCOL.encode(Sample(0.1, specific_force=force)))
-    assert sample.specific_force == (force if force is None else pytest.approx(force, abs=0.003))
-
-
 def test_an_acceleration_belongs_to_the_next_rate_only():
     force, rate = frame(0x51, 0, 0, 2048, 0), frame(0x52, 0, 0, 1, 0)
     assert ([sample.specific_force is None for sample in decoded(force, rate, rate, force, rate)]

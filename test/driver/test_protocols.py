@@ -102,6 +102,14 @@ def test_csv_keeps_time_and_temperature():
         1700000000.125, 21.25, None, {})
 
 
+@pytest.mark.parametrize('force', [9.81, -9.81, 0.0, 98.0665, None])
+@pytest.mark.parametrize('name, step', [('kvh_1750', 1e-9), ('witmotion', 0.003)])
+def test_a_specific_force_keeps_its_sign(name, step, force):
+    sample, = opened(name).feed(find(name).encode(Sample(0.1, specific_force=force)))
+    assert sample.specific_force == (
+        force if force is None else pytest.approx(force, rel=1e-6, abs=step))
+
+
 @pytest.mark.parametrize('name', ALL)
 def test_a_temperature_that_cannot_be_sent_does_not_stop_an_emulated_gyro(name):
     """A log has nan where its sensor failed."""

@@ -23,7 +23,7 @@ from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import CACHED, DEGREE
 from gyro_calibration.model.compensation import compensate, covariance, rate_sensitivity
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
-from gyro_calibration.model.motion import CALIBRATION, ROBOT
+from gyro_calibration.model.motion import ROBOT
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -49,12 +49,6 @@ def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
     time = np.concatenate([[0.0], np.cumsum(np.random.default_rng(0).uniform(0.001, 0.1, 500))])
     heading = integrate(time, 0.3 - 0.02 * time)
     assert heading == pytest.approx(0.3 * time - 0.01 * time ** 2, abs=1e-12)
-
-
-def test_the_calibration_comes_back_to_its_first_heading():
-    time = np.arange(2001) * INTERVAL
-    assert integrate(time, CALIBRATION.rate_at(time)) == pytest.approx(
-        CALIBRATION.heading_at(time), abs=1e-12)
 
 
 SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(),

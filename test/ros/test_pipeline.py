@@ -86,14 +86,6 @@ def test_after_a_jump_of_the_stamps_integration_begins_anew(tmp_path, jump, word
     assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.5 * INTERVAL, abs=1e-6)
 
 
-def test_a_stamp_that_stands_is_not_integrated(tmp_path):
-    rig = Rig(tmp_path, model='')
-    heading = rig.feed(np.full(10, 0.5))[-1].heading
-    rig.skip(-INTERVAL)
-    assert rig.feed([0.5]) == [None] and 'stands still' in rig.journal.event
-    assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.5 * INTERVAL, abs=1e-6)
-
-
 def test_what_turns_while_the_stamps_stand_is_in_the_variance(tmp_path):
     rig = Rig(tmp_path, model=CERTAIN)
     before = rig.feed(np.full(100, 0.01))[-1]
@@ -139,17 +131,6 @@ def test_without_known_noise_an_assumed_variance_is_published_never_zero(tmp_pat
     found = Rig(tmp_path, model='').feed(np.full(20, 0.5))
     assert all(each.rate_variance >= (0.5 * DEGREE) ** 2 for each in found)
     assert all(each.heading_variance == UNMEASURED_VARIANCE for each in found)
-
-
-@pytest.mark.parametrize('motion', [(0.0, 0.7), (0.5, -0.5), (0.2, 0.0)])
-def test_the_error_of_the_heading_is_within_what_is_claimed(tmp_path, motion):
-    rig = rested(tmp_path, robot=Robot(scale_factor_error=0.02, bias=0.4 * DEGREE))
-    begin = len(rig.outputs) - 1
-    for rate in motion:
-        rig.robot.command(rate)
-        rig.go(5.0)
-    error, deviation = rig.error(begin)
-    assert abs(error) < 3.0 * deviation, (error, deviation)
 
 
 def test_over_a_gap_that_is_not_integrated_the_variance_holds_what_may_have_been_turned(tmp_path):
@@ -257,20 +238,6 @@ def test_a_gyro_of_zeros_beside_odometry_that_turns_is_an_error(tmp_path):
 
 
 # Rest
-
-
-def test_at_rest_the_heading_stands_and_in_turns_it_goes_on(tmp_path):
-    rig = Rig(tmp_path, model=KNOWN)
-    found = []
-    for number, turn in enumerate((0.5, -0.3)):
-        rest = rig.feed(noisy(20.0, seed=2 * number), SLOW)
-        assert np.ptp(headings(rest[-100:])) == 0.0 and rest[-1].rate == 0.0
-        found += rest + rig.feed(noisy(4.0, turn, seed=2 * number + 1), SLOW)
-    found += rig.feed(noisy(15.0, seed=9), SLOW)
-    assert found[-1].heading - found[0].heading == pytest.approx(0.8, abs=0.02)
-    assert np.abs(np.diff(headings(found))).max() < 1.2 * 0.5 * SLOW
-    bias, deviation = rig.pipeline.estimator.tracker.bias
-    assert bias == pytest.approx(BIAS - 0.01, abs=4.0 * deviation)
 
 
 def test_the_threshold_filter_deletes_rates_at_rest_until_it_is_switched_off(tmp_path):
@@ -527,16 +494,6 @@ def test_a_rate_beyond_the_calibrated_range_is_counted(tmp_path):
     assert rig.journal.counts['beyond_range'] + rig.journal.counts['refused_samples'] == 10
 
 
-def test_a_temperature_that_stops_is_held_and_the_bias_becomes_less_known(tmp_path):
-    rig = Rig(tmp_path, model=KNOWN, stationary_method='none')
-    known = rig.feed(noisy(30.0), SLOW, temperature=25.0)[-1].rate_variance
-    assert not rig.pipeline.estimator.temperature_is_lost
-    grown = rig.feed(noisy(600.0), SLOW)[-1].rate_variance
-    assert grown > known + (5.0 * 0.03 * DEGREE) ** 2, '1 K a minute'
-    assert rig.pipeline.estimator.temperature_is_lost
-    assert rig.pipeline.estimator.temperature == 25.0
-
-
 def test_biases_of_two_temperatures_are_kept_for_the_next_start(tmp_path):
     shift = 10.0 * 0.02 * DEGREE
     (tmp_path / 'calibration_biases.yaml').write_text('format: something else\n')
@@ -731,20 +688,6 @@ def test_with_a_bad_model_raw_rates_go_on_and_the_problem_names_the_file(tmp_pat
     assert rig.feed(np.full(10, 0.5))[-1].rate == 0.5
     problem = rig.pipeline.store.problem
     assert words in problem and str(path) in problem
-
-
-def test_two_pipelines_with_one_file_leave_it_whole_and_the_other_is_warned(tmp_path):
-    first, second = rested(tmp_path), rested(tmp_path)
-    for number in range(3):
-        for rig in (first, second):
-            rig.robot.bias = 0.005 * (number + 1)
-            success, message = rig.calibrate(REST)
-            assert success, message
-            assert read_model(tmp_path / 'calibration.yaml').self_calibration.method == 'rest'
-        first.go(2.0)
-    assert 'was written by another process' in first.pipeline.store.shared_hint
-    names = {path.name for path in tmp_path.iterdir()} - {'calibration_biases.yaml'}
-    assert names == {'calibration.yaml', 'model.yaml'}
 
 
 # What is reported

@@ -15,9 +15,7 @@ import math
 from pathlib import Path
 import re
 
-from gyro_calibration.logs.cdr import UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
-import numpy as np
 import pytest
 from rig import INTERVAL, rested, Robot
 import yaml
@@ -53,15 +51,6 @@ def test_it_names_parameters_that_exist(parameters):
 def test_of_one_gyro_only_one_thing_is_fused_and_nothing_twice(parameters):
     assert parameters['imu0'] == 'imu/data' and parameters['two_d_mode'] is True
     assert fused(parameters, 'imu0') == ['vyaw'] and fused(parameters, 'odom0') == ['vx', 'vy']
-
-
-@pytest.mark.parametrize('roll, added', [(0.0, 0.0), (math.pi, 0.0), (0.1 * DEGREE, 3.0)])
-def test_a_tilt_in_the_transform_takes_the_weight_of_the_gyro_as_the_page_says(roll, added):
-    """robot_localization rotates the covariance, R C R' (prepareTwist in ros_filter.cpp)."""
-    cosine, sine = math.cos(roll), math.sin(roll)
-    rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
-    covariance = rotation @ np.diag([UNMEASURED_VARIANCE, UNMEASURED_VARIANCE, 1e-4]) @ rotation.T
-    assert covariance[2, 2] == pytest.approx(1e-4 + added, rel=0.02)
 
 
 def test_the_launch_file_in_the_documentation_can_be_read():
