@@ -462,7 +462,7 @@ class Pipeline:
             tracker = self.estimator.tracker
             self.estimator.rewind(tracker.heading, tracker.variance + math.tau ** 2)
             if self.session.drives:
-                self.session.interrupt(self.stuck)
+                self.session.end(self.stuck)
 
     @property
     def _sources(self) -> tuple[str, ...]:
