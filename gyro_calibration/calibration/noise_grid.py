@@ -432,7 +432,8 @@ def noise_grid(
         weights /= weights.sum()
         if remaining:
             axes = [
-                _refined(axis, grid.sizes[:, place], weights) for place, axis in enumerate(axes)
+                _refined(axis, grid.sizes[:, place], weights, part.range)
+                for place, (axis, part) in enumerate(zip(axes, regression.parts))
             ]
     unseen = grid.sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
         [part.unseen for part in shared]
@@ -456,8 +457,14 @@ def _axis(limits: tuple[float, float]) -> Array:
     return np.array(limits[:1]) if limits[0] == limits[1] else np.geomspace(*limits, POINTS)
 
 
-def _refined(axis: Array, sizes: Array, weights: Array) -> Array:
-    """Return an axis where the sizes are likely, at least to the middle between old points."""
+def _refined(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:
+    """
+    Return an axis where the sizes are likely, at least to the middle between old points.
+
+    Where they are likely at an end of the old axis, it goes on beyond that: the likeliest point of
+    a coarse grid is not always next to the likeliest size.
+
+    """
     if len(axis) == 1:
         return axis
     logarithms, step = np.log(sizes), math.log(axis[1] / axis[0])
@@ -465,7 +472,7 @@ def _refined(axis: Array, sizes: Array, weights: Array) -> Array:
     spread = math.sqrt(float(weights @ (logarithms - middle) ** 2))
     half = max(2.5 * spread, 0.6 * step)
     low, high = (
-        min(max(end, math.log(axis[0])), math.log(axis[-1]))
+        min(max(end, math.log(limits[0])), math.log(limits[1]))
         for end in (middle - half, middle + half)
     )
     return np.exp(np.linspace(low, high, len(axis)))

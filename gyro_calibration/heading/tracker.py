@@ -760,7 +760,8 @@ class HeadingTracker:
         """Take the state on over a part of a rest, and see how much its rates scatter."""
         before, (expected, variance) = self._snapshots[-1], self._drift.expected(turn)
         white = self._drift.noise.angle_random_walk ** 2 * turn.duration
-        squared, ratios = (turn.turned - expected) ** 2 / variance, 1.0 + SCATTERS * white / variance
+        squared = (turn.turned - expected) ** 2 / variance
+        ratios = 1.0 + SCATTERS * white / variance
         likelihood = before.likelihood - 0.5 * (squared / ratios + np.log(ratios))
         turn.wander = float(self._drives.chances(likelihood) @ SCATTERS) * white
         self._go_on(turn, self._reached - self._part.duration - left.duration)

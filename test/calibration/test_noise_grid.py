@@ -97,6 +97,15 @@ def test_the_sizes_of_the_noise_are_found():
             name, found.sizes[name])
 
 
+def test_a_size_far_from_the_points_of_the_first_grid_is_found():
+    """The first points are a factor of 18 apart."""
+    white = np.random.default_rng(5).standard_normal(400)
+    for size in np.geomspace(0.03, 0.6, 13):
+        found = noise_grid(size * white, np.ones((400, 1)),
+                           [BandedNoise('size', np.ones(400), None, (1e-4, 10.0))])
+        assert found.size('size') == pytest.approx(size * white.std(ddof=1), rel=0.02)
+
+
 def test_noise_of_the_reference_does_not_make_the_scale_smaller():
     """Where a third of the variance of its increments is noise, plain least squares is off."""
     errors = []
