@@ -10,6 +10,7 @@
 
 """The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
+from gyro_calibration.diagnosis.pipeline import _of_noise
 from gyro_calibration.diagnosis.regression import fitted, FittedValues, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.residuals import (
@@ -17,9 +18,11 @@ from gyro_calibration.diagnosis.residuals import (
     _fit,
     _without_tones,
     curves,
+    NoiseParameters,
     what_is_left,
 )
 from gyro_calibration.logs.log import Log
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -49,18 +52,13 @@ def inside(log, generator):
     return np.count_nonzero(off < 1.96), len(off)
 
 
-@pytest.mark.parametrize('noise', NOISES)
-def test_bands_of_95_percent_hold_about_as_many_bins(noise):
+@pytest.mark.parametrize('noise, interval, runs', [
+    ('white', 0.05, 8), ('flicker', 0.05, 8), ('walk', 0.05, 8),
+    ('flicker', 0.002, 2)])  # samples that are averaged before the search
+def test_bands_of_95_percent_hold_about_as_many_bins(noise, interval, runs):
     generator = np.random.default_rng(1)
-    held, count = np.sum([inside(record(NOISES[noise], generator, 600.0, 0.05), generator)
-                          for _ in range(8)], axis=0)
-    assert 0.9 < held / count < 0.99, held / count
-
-
-def test_bands_hold_where_samples_are_averaged_before_the_search():
-    generator = np.random.default_rng(2)
-    held, count = np.sum([inside(record(NOISES['flicker'], generator, 600.0, 0.002), generator)
-                          for _ in range(2)], axis=0)
+    held, count = np.sum([inside(record(NOISES[noise], generator, 600.0, interval), generator)
+                          for _ in range(runs)], axis=0)
     assert 0.9 < held / count < 0.99, held / count
 
 
@@ -77,3 +75,15 @@ def test_a_vibration_is_not_in_the_angle_random_walk(tone):
     assert len(used.energy) == (60 if tone == 1.0 else 59)
     assert np.exp(0.5 * _fit(used, {})[0][0]) == pytest.approx(2.0, rel=0.03)
     assert tone == 1.0 or np.exp(0.5 * _fit(bands, {})[0][0]) > 2.2
+
+
+FIGURES = NoiseParameters(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3)},
+                          {'angle_random_walk': 1e-9})
+
+
+@pytest.mark.parametrize('bounds, found', [
+    ({}, 1), ({'angle_random_walk': (0.9e-3, 1.06e-3)}, 0),
+    ({'angle_random_walk': (0.9e-3, 1.04e-3)}, 1)], ids=['none', 'wide', 'narrow'])
+def test_noise_within_the_bounds_of_a_model_is_no_finding(bounds, found):
+    model = GyroModel(noise=Noise(1e-3), noise_bounds=bounds)
+    assert len(_of_noise(FIGURES, model, 0.01, ())) == found
