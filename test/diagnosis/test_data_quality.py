@@ -15,6 +15,7 @@ import math
 import re
 
 from chance import fewest, most, seeded
+from diagnosed import log_of
 from gyro_calibration.diagnosis.data_quality import encoder_step, inspect, LEVEL, update_interval
 from gyro_calibration.diagnosis.expected_output import (
     compare,
@@ -25,7 +26,7 @@ from gyro_calibration.diagnosis.expected_output import (
 from gyro_calibration.diagnosis.gates import refuse, rests
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.samples import repeated_samples
-from gyro_calibration.logs.log import COLUMNS, DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import codes_of
 from gyro_calibration.logs.stamps import number_stamps
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
@@ -75,11 +76,6 @@ def found(log, model=None):
 
 def value(finding):
     return finding.parameters[finding.effect].estimate
-
-
-def log_of(hidden):
-    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1]
-                  for name, values in hidden.columns.items()})
 
 
 def printed(values, decimals):

@@ -13,19 +13,19 @@
 import math
 
 from chance import RARE
-from gyro_calibration.heading.integration import integrate, Threshold
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import begin, HEADING, RateIntegral, smoothed
 from gyro_calibration.heading.log_heading import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model import presets
 from gyro_calibration.model.motion import from_rates, turns
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 from scipy.stats import poisson
 
-#: Of an Epson XV-3500 (Hong and Park, section 1).
-XV3500 = Noise(2.5 * DEGREE / 60.0, 18.0 * DEGREE / 3600.0)
+XV3500 = presets.XV3500.noise
 #: Standard deviations of scale factor error and bias after 20 s of it.
 SCALE, BIAS = 3e-4, 2.5 * DEGREE / 60.0 / math.sqrt(20.0)
 KNOWN = np.diag([SCALE ** 2, BIAS ** 2 + XV3500.floor ** 2])
@@ -147,14 +147,6 @@ def test_without_known_noise_it_is_the_trapezoid_rule():
     found = follow(time, rate, noise=Noise())
     assert found.heading == pytest.approx(integrate(time, rate), abs=1e-12)
     assert not found.resting.any() and (found.rate == rate).all()
-
-
-def test_the_threshold_filter_is_a_mode_and_what_it_deletes_is_counted():
-    time = np.arange(0.0, 20.0, 0.01)
-    rate = np.where(time < 10.0, 0.1 * DEGREE, 20.0 * DEGREE)
-    found = follow(time, rate, Settings(0.0, Threshold(0.3 * DEGREE, 0.0)))
-    assert found.deleted == pytest.approx(1.0 * DEGREE, rel=0.01)
-    assert found.heading[-1] == pytest.approx(200.0 * DEGREE, rel=0.01)
 
 
 def test_at_rest_the_rate_is_zero_and_the_heading_stands():
