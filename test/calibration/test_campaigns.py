@@ -9,18 +9,13 @@
 
 """A calibration by one campaign on a rate table holds in a hotter and faster one."""
 
-from pathlib import Path
-import runpy
 
+from campaigns import judge, least_squares_error, simulated
 from gyro_calibration.calibration.dwells import from_table, take
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.logs.log import DEGREE, read_log
 import numpy as np
 import pytest
-
-CAMPAIGNS = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'campaigns.py'))
-judge, simulated, least_squares_error = (
-    CAMPAIGNS[name] for name in ('judge', 'simulated', 'least_squares_error'))
 
 
 @pytest.mark.parametrize('sine', [True, False], ids=['open-loop', 'MEMS'])

@@ -16,10 +16,10 @@ What was put in is found, with true intervals, on simulated logs and on measured
 
 from dataclasses import replace
 import math
-from pathlib import Path
-import runpy
 
 from chance import fewest, rms_bounds
+import efficiency
+from encoder_intervals import run
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.motion import from_rates
@@ -160,14 +160,9 @@ def test_the_residual_heading_is_what_the_calibration_leaves():
         found.after.heading).max()
 
 
-def benchmark(name):
-    return runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / f'{name}.py'))
-
-
 @pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
 def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
     """As benchmarks/encoder_intervals.py does for more noises and 400 runs."""
-    run = benchmark('encoder_intervals')['run']
     found = np.array([run(('white, flicker, rate '
                            'random walk', seed, 300.0)) for seed in range(runs)])
     within = (np.abs(found[:, 0]) < 1.96 * found[:, 1]).sum(axis=0)
@@ -182,10 +177,9 @@ def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
 def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(
         step, noise, runs):
     """By a ratio of 1.1, as benchmarks/efficiency.py does for more cases and runs."""
-    of = benchmark('efficiency')
-    found = np.array([of['errors'](step * DEGREE, noise * DEGREE, seed)[:2]
+    found = np.array([efficiency.errors(step * DEGREE, noise * DEGREE, seed)[:2]
                       for seed in range(runs)])
-    ratios = (found ** 2).mean(axis=0) / of['bound'](step * DEGREE, noise * DEGREE, False)
+    ratios = (found ** 2).mean(axis=0) / efficiency.bound(step * DEGREE, noise * DEGREE, False)
     assert (ratios[0] < 1.1 * rms_bounds(runs)[1] ** 2).all(), ratios
     assert (ratios[1] > 3.0).all(), ratios
 

@@ -12,8 +12,6 @@
 
 from dataclasses import replace
 import math
-from pathlib import Path
-import runpy
 
 from gyro_calibration.calibration.dwells import Dwells, from_table, take
 from gyro_calibration.calibration.rate_table import (
@@ -44,13 +42,12 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 from numpy.polynomial.polynomial import polyval2d
+from polynomial_intervals import table as simulated_table
 import pytest
+from recovery import CUBIC, gyros, LINEAR, run, SINE, Table
 from scipy.stats import binom, chi2
 from scipy.stats import t as student
 
-RECOVERY = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'recovery.py'))
-Table, LINEAR, CUBIC, SINE, run = (RECOVERY[name]
-                                   for name in ('Table', 'LINEAR', 'CUBIC', 'SINE', 'run'))
 #: A test of an estimator fails by chance as rarely as this.
 RARE = 1e-4
 
@@ -93,9 +90,9 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs)
         assert chi2.ppf(RARE, runs) / runs < np.mean(errors ** 2) < chi2.ppf(1 - RARE, runs) / runs
 
 
-@pytest.mark.parametrize('name', [*RECOVERY['gyros']()])
+@pytest.mark.parametrize('name', [*gyros()])
 def test_a_gyro_with_one_effect_is_compensated_to_its_true_rate(name):
-    truth = GyroModel(RECOVERY['gyros']()[name])
+    truth = GyroModel(gyros()[name])
     table = Table(dwell=0.0).measure(truth, np.random.default_rng(0))
     model = fit_effects(table, [term.effect for term in truth.terms]).model
     np.testing.assert_allclose(model.rate(table.output, table.temperature), table.rate, atol=1e-9)
@@ -340,11 +337,9 @@ def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the
 
 
 def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
-    intervals = runpy.run_path(
-        str(Path(__file__).parents[2] / 'benchmarks' / 'polynomial_intervals.py'))
     held = []
     for seed in range(10):
-        table, output = intervals['table'](np.random.default_rng(seed))
+        table, output = simulated_table(np.random.default_rng(seed))
         model = fit_effects(table, [rate_temperature_polynomial(3, 2)]).model
         at = channels_of(table).moving(table.rate, output)
         rows = np.array(model.terms[0].sensitivity(at))

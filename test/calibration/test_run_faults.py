@@ -18,10 +18,9 @@ Self-calibration: bad runs are refused by name, good ones accepted, and rests ch
 from functools import cache
 import json
 import math
-from pathlib import Path
-import runpy
 
 from chance import fewest, most
+from fooled import LEVELS, tried, WAYS
 from gyro_calibration.calibration.likelihood import Fit, fit_likelihood, UNLIKELY
 from gyro_calibration.calibration.run_faults import pieces, unit_error
 from gyro_calibration.calibration.self_calibration import (
@@ -42,27 +41,25 @@ import numpy as np
 from operations import operations
 import pytest
 
-FOOLED = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'fooled.py'))
-WAYS = FOOLED['WAYS']
 GOOD = [name for name, (_, _, word) in WAYS.items() if not word]
 BAD = [name for name in WAYS if name not in GOOD]
 TIME = np.arange(2001) / 100.0
 S, B = 0.03, 0.05 * DEGREE
 
 
-@pytest.mark.parametrize('level', FOOLED['LEVELS'])
+@pytest.mark.parametrize('level', LEVELS)
 @pytest.mark.parametrize('name', BAD)
 def test_a_run_that_went_wrong_is_refused_by_its_name(name, level):
     """Two runs of each; of the 200 of the benchmark all are refused, and nearly all by name."""
-    reasons = [FOOLED['tried']((name, number, level))[0] for number in range(2)]
+    reasons = [tried((name, number, level))[0] for number in range(2)]
     assert all(reasons) and not any('\n' in reason for reason in reasons)
     assert any(WAYS[name][2] in reason for reason in reasons), reasons
 
 
 @pytest.mark.parametrize('runs', [8, pytest.param(20, marks=pytest.mark.evidence)])
-@pytest.mark.parametrize('level', FOOLED['LEVELS'])
+@pytest.mark.parametrize('level', LEVELS)
 def test_good_runs_are_accepted_and_their_intervals_hold_the_truth(level, runs):
-    found = [FOOLED['tried'](('good', number, level)) for number in range(runs)]
+    found = [tried(('good', number, level)) for number in range(runs)]
     accepted = np.array([errors for reason, errors in found if not reason])
     assert len(accepted) >= runs - 1, found
     assert (np.abs(accepted[:, :2]) < 4.0).all()

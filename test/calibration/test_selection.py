@@ -11,8 +11,6 @@
 """The selection of effects: present ones are found, absent ones not, confounded ones reported."""
 
 from dataclasses import replace
-from pathlib import Path
-import runpy
 
 from gyro_calibration.calibration.dwells import join
 from gyro_calibration.calibration.selection import (
@@ -32,13 +30,10 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 import pytest
+import rate_table
+from recovery import CUBIC, LINEAR, SINE, Table, TRUTH
 from scipy.stats import binom
 
-BENCHMARKS = Path(__file__).parents[2] / 'benchmarks'
-RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))
-                        for name in ('recovery', 'rate_table'))
-Table, TRUTH, LINEAR, CUBIC, SINE = (RECOVERY[name]
-                                     for name in ('Table', 'TRUTH', 'LINEAR', 'CUBIC', 'SINE'))
 #: Every gyro has these, and these tables determine them better than a data sheet.
 SLOPES = ('bias_temperature', 'scale_factor_temperature')
 #: A test of the choice fails by chance as rarely as this.
@@ -158,13 +153,13 @@ def test_of_confounders_that_fit_alike_the_bounded_one_is_taken_by_default():
 
 @pytest.mark.parametrize('technology', [None, *TECHNOLOGIES])
 def test_on_the_recorded_table_the_default_predicts_rates_beyond_those_it_saw(data, technology):
-    dwells = RATE_TABLE['table'](data)
-    assert RATE_TABLE['beyond'](RATE_TABLE['chosen'](technology), dwells) < 0.085 * DEGREE
+    dwells = rate_table.table(data)
+    assert rate_table.beyond(rate_table.chosen(technology), dwells) < 0.085 * DEGREE
 
 
 def test_on_the_recorded_table_sine_and_cubic_are_hardly_distinguished_and_a_rate_is_proposed(
         data):
-    dwells = RATE_TABLE['table'](data)
+    dwells = rate_table.table(data)
     selection = select_effects(dwells, 'open_loop_fog')
     assert names(selection) == {'bias', 'scale_factor_error', 'sine_response', *SLOPES}
     pair, = selection.confounders

@@ -95,21 +95,18 @@ def test_without_a_rest_the_slowest_turns_both_ways_stand_for_it():
         'no rest; the static bias is the error between the slowest turns')
 
 
-def test_a_table_with_neither_rest_nor_turns_both_ways_is_refused():
-    found = table([10.0, 20.0, 30.0], [0.0] * 3)
-    with pytest.raises(DataRefused, match='record a rest'):
+@pytest.mark.parametrize('rates, said', [([10.0, 20.0, 30.0], 'record a rest'),
+                                         ([0.0, 0.0, 3.0], 'none of 3 dwells turns at 5 deg/s')],
+                         ids=['neither rest nor both ways', 'rests'])
+def test_a_table_without_turns_or_what_stands_for_a_rest_is_refused(rates, said):
+    found = table(rates, [0.0] * 3)
+    with pytest.raises(DataRefused, match=said):
         turn_errors(found, found.output)
 
 
 def test_a_gyro_that_is_upside_down_is_refused_with_the_way_out():
     with pytest.raises(DataRefused, match='the other way than the reference .* --invert'):
         turn_errors(replace(HAND, output=-HAND.output), -HAND.output)
-
-
-def test_a_table_of_rests_is_refused():
-    found = table([0.0, 0.0, 3.0], [0.0] * 3)
-    with pytest.raises(DataRefused, match='none of 3 dwells turns at 5 deg/s'):
-        turn_errors(found, found.output)
 
 
 # a real turn

@@ -16,9 +16,10 @@ import io
 import json
 import os
 
+from diagnosed import log_of
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.logs.log import COLUMNS, Log, read_log, write_log
+from gyro_calibration.logs.log import read_log, write_log
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration_bench.hidden import hide
 import numpy as np
@@ -26,12 +27,6 @@ import pytest
 
 FILES = {'diagnosis.json', 'report.html', 'model.yaml'}
 SHORT = {'duration': 400.0, 'sample_rate': 20.0}
-
-
-def log_of(hidden):
-    """Return what the program reads of a hidden log."""
-    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1]
-                  for name, values in hidden.columns.items()})
 
 
 @pytest.fixture(scope='module')
@@ -191,29 +186,25 @@ def test_a_wrong_use_is_one_sentence_and_writes_nothing(words, log, diagnose, tm
     assert not (tmp_path / 'found').exists()
 
 
-def test_a_folder_that_cannot_be_written_is_one_sentence(log, run, tmp_path):
-    (tmp_path / 'taken').write_text('mine')
-    code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'taken')
-    assert code != 0 and not text and one_sentence(errors)
-    assert (tmp_path / 'taken').read_text() == 'mine'
-
-
-def test_where_one_file_cannot_be_written_none_is(log, run, tmp_path):
-    (tmp_path / 'found/model.yaml').mkdir(parents=True)
+@pytest.mark.parametrize('taken', ['found', 'found/model.yaml'], ids=['folder', 'file'])
+def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, run, tmp_path):
+    if taken == 'found':
+        (tmp_path / taken).write_text('mine')
+    else:
+        (tmp_path / taken).mkdir(parents=True)
+    before = sorted(tmp_path.rglob('*'))
     code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
     assert code != 0 and not text and one_sentence(errors)
-    assert os.listdir(tmp_path / 'found') == ['model.yaml']
+    assert sorted(tmp_path.rglob('*')) == before
+    assert taken != 'found' or (tmp_path / taken).read_text() == 'mine'
 
 
 # what allows an answer, and not every one
 
 @pytest.fixture
-def say(diagnose, run, tmp_path):
+def say(diagnose):
     """Return a function that diagnoses a log and gives the answer as data."""
-    def say(log, *words):
-        write_log(tmp_path / 'given.csv', log)
-        return answer_of(run('diagnose', tmp_path / 'given.csv', *words, '--json'))
-    return say
+    return lambda log, *words: answer_of(diagnose(log, *words, '--json'))
 
 
 def test_without_motion_what_the_motion_shows_cannot_be_shown(hidden, log, say):

@@ -11,17 +11,13 @@
 """The verb fit, as people and other programs call it."""
 
 import json
-from pathlib import Path
-import runpy
 
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
-
-RECOVERY = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'recovery.py'))
-Table, SINE = RECOVERY['Table'], RECOVERY['SINE']
+from recovery import SINE, Table
 
 
 def write(path, dwells):

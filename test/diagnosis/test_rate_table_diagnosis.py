@@ -12,9 +12,7 @@
 
 from dataclasses import replace
 import json
-from pathlib import Path
 import re
-import runpy
 
 from gyro_calibration.calibration.dwells import join
 from gyro_calibration.calibration.rate_table import fit_effects
@@ -34,14 +32,11 @@ from gyro_calibration.model.gyro_model import GyroModel, same_effects, SelfCalib
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 import pytest
+from rate_table import table as recorded_table
+from recovery import LINEAR, SCATTERS, Table
 from scipy.stats import binom
 from scipy.stats import t as student
 
-BENCHMARKS = Path(__file__).parents[2] / 'benchmarks'
-RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))
-                        for name in ('recovery', 'rate_table'))
-Table, TRUTH, LINEAR, SCATTERS = (RECOVERY[name]
-                                  for name in ('Table', 'TRUTH', 'LINEAR', 'SCATTERS'))
 #: A test fails by chance as rarely as this.
 RARE = 1e-4
 #: Sixteen sweeps tell how much they wander; eight hardly do.
@@ -328,7 +323,7 @@ def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
 # a measured table
 
 def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data):
-    found = diagnose_table(RATE_TABLE['table'](data), None)
+    found = diagnose_table(recorded_table(data), None)
     assert [members(finding) for finding in found.findings] == [
         {'sine_response', 'cubic_nonlinearity'}, {'scale_factor_temperature'}]
     assert (found.gain.rate.before == pytest.approx(0.67 * DEGREE, rel=0.03)
@@ -340,7 +335,7 @@ def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data
 
 
 def test_of_the_recorded_table_a_polynomial_leaves_single_rates_alone(data):
-    dwells = RATE_TABLE['table'](data)
+    dwells = recorded_table(data)
     found = diagnose_table(dwells, fit_effects(dwells, [rate_temperature_polynomial(3, 2)]).model)
     assert not found.findings and [each.along for each in found.unexplained] == ['single_rates']
     assert any('4 values, predict the rates of left-out sweeps to 0.0' in remark

@@ -11,8 +11,6 @@
 """A log that is followed has the heading of single samples and of the node; and how good it is."""
 
 import math
-from pathlib import Path
-import runpy
 
 from gyro_calibration.cli.main import main
 from gyro_calibration.heading.assumptions import Assumptions
@@ -25,12 +23,12 @@ from gyro_calibration.model.compensation import covariance, rate_sensitivity
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
+from heading_oracle import DRIVES, GYROS, score
 import numpy as np
 from operations import operations
 import pytest
 from rig import BEGIN, Rig
 
-ORACLE = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'heading_oracle.py'))
 NOW, INTERVAL = 1.7e9, 0.01
 NOISE = Noise(0.6 * DEGREE / 60.0, 20.0 * DEGREE / 3600.0)
 CALIBRATED = SelfCalibration(0.0, 0.01, ((1e-6, 0.0), (0.0, 1e-8)))
@@ -195,7 +193,7 @@ def test_a_rate_that_jumps_and_stays_is_followed_and_less_sure():
 
 def scores(gyro, kind, minutes, seeds):
     """Return the ratio of the error to the oracle's and the share inside, live and later."""
-    found = [ORACLE['score'](ORACLE['GYROS'][gyro], kind, minutes, np.random.default_rng(seed))
+    found = [score(GYROS[gyro], kind, minutes, np.random.default_rng(seed))
              for seed in range(seeds)]
     mean = {key: float(np.mean([each[key] for each in found])) for key in found[0]}
     return [(mean[way] / mean[f'oracle, {way}'], mean[f'inside, {way}'])
@@ -209,8 +207,8 @@ def test_straight_ways_that_pass_for_rests_do_not_make_a_noisy_gyro_sure_of_a_wr
 
 
 @pytest.mark.evidence
-@pytest.mark.parametrize('kind', ORACLE['DRIVES'])
-@pytest.mark.parametrize('gyro', ORACLE['GYROS'])
+@pytest.mark.parametrize('kind', DRIVES)
+@pytest.mark.parametrize('gyro', GYROS)
 def test_the_heading_is_near_that_by_known_rests(gyro, kind):
     """The aims of 1.25, 1.1 and 90 % are missed where rests are short or rare: 2.3, 1.9, 65 %."""
     (live, inside), (later, inside_later) = scores(gyro, kind, 10.0, 6)

@@ -17,9 +17,8 @@ samples, over many drives.
 """
 
 import math
-from pathlib import Path
-import runpy
 
+from faulty_heading import one
 from gyro_calibration.heading.gaps import Gaps, Intervals
 from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
 from gyro_calibration.heading.log_heading import track
@@ -28,12 +27,11 @@ from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
 
-#: Of an Epson XV-3500 (Hong and Park, section 1).
-XV3500 = Noise(2.5 * DEGREE / 60.0, 18.0 * DEGREE / 3600.0)
-WHITE = Noise(XV3500.angle_random_walk)
+WHITE = Noise(XV3500.noise.angle_random_walk)
 INTERVAL = 0.01
 
 
@@ -235,11 +233,8 @@ def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, run, tmp
     assert deviations[1] > 1.2 * deviations[0]
 
 
-def test_lost_samples_and_bursts_leave_the_heading_of_a_drive_as_it_is(monkeypatch):
+def test_lost_samples_and_bursts_leave_the_heading_of_a_drive_as_it_is():
     """A short run of `benchmarks/faulty_heading.py`, which tells by how much of 30 minutes."""
-    folder = Path(__file__).parents[2] / 'benchmarks'
-    monkeypatch.syspath_prepend(folder)
-    one = runpy.run_path(str(folder / 'faulty_heading.py'))['one']
     faults = 'clean', '1 % lost, bursts', '1 % lost, usual interval for each'
     drives = [one(('RD2100', INTERVAL, 120.0, seed, faults)) for seed in range(2)]
     clean, stamped, bridged = (math.sqrt(np.mean([drive[fault][0] ** 2 for drive in drives]))
