@@ -31,7 +31,7 @@ from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import covariance, rate_sensitivity
-from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, RATE_RAMP
+from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
@@ -303,7 +303,7 @@ def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_know
 
 @pytest.mark.parametrize('terms', [
     (), (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)),),
-    (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)), Term(RATE_RAMP, (1e-9,)))
+    (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)), Term(CATALOGUE['rate_ramp'], (1e-9,)))
 ], ids=['no effect', 'of temperature', 'of temperature and time'])
 def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(terms):
     model = GyroModel(terms, noise=NOISE)
