@@ -139,9 +139,7 @@ def is_unbroken(log):
 def test_an_interrupted_recording_is_done(record, wait_until, tmp_path, name, number):
     with gyro(tmp_path / 'gyro'):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / name, '--json'))
-        wait_until(lambda: (tmp_path / name).exists() and (tmp_path / name).stat().st_size, 60.0,
-                   'a first piece')
-        time.sleep(1.0)
+        wait_until(lambda: holds(tmp_path / name, 300), 60.0, 'samples')
         code, out, _ = recording.end(number)
     answer, log = json.loads(out), read(tmp_path / name)
     assert code == 0

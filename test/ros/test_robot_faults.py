@@ -241,16 +241,3 @@ def test_a_node_that_is_ended_in_mid_run_commands_zero_first(stage):
     assert node.stop(signal.SIGTERM) == 0
     stage.wait_until(lambda: robot.commands[-1][1] == 0.0, what='a zero')
     stage.wait_until(lambda: abs(robot.robot.rate) < 0.01, what='the robot to stand')
-
-
-def test_a_node_that_is_killed_leaves_its_last_command(stage):
-    """A base without a time-out turns on; the documents begin with that."""
-    robot = stage.robot()
-    node = stage.node()
-    stage.drive()
-    node.waited = True
-    node.process.kill()
-    node.process.wait()
-    begin = now()
-    stage.wait_until(lambda: robot.turned_since(begin) > math.radians(60.0), what='it turns on')
-    robot.robot.command(0.0)
