@@ -9,10 +9,10 @@ SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 WORKDIR /workspace
 COPY . src/gyro_calibration
 RUN apt-get update \
-    && rosdep update --rosdistro "$ROS_DISTRO" \
+    && rosdep update --include-eol-distros --rosdistro "$ROS_DISTRO" \
     && rosdep install --from-paths src --ignore-src --default-yes \
     && rm -rf /var/lib/apt/lists/*
 RUN . "/opt/ros/$ROS_DISTRO/setup.bash" && colcon build --packages-select gyro_calibration
 # the entry point of the base image sets up ROS 2 only
-RUN sed -i 's#^exec #source /workspace/install/setup.bash\nexec #' /ros_entrypoint.sh
+RUN sed -i 's#^exec #source /workspace/install/setup.bash --\nexec #' /ros_entrypoint.sh
 CMD ["gyro_calibration", "--help"]

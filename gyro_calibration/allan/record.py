@@ -94,7 +94,7 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
 def refuse_few(count: int, samples: str = 'samples') -> None:
     """Refuse fewer samples than a noise figure needs."""
     if count < FEWEST:
-        raise DataRefused(f'{count} {samples}; an Allan deviation wants at least {FEWEST}: '
+        raise DataRefused(f'{count} {samples}; an Allan deviation needs at least {FEWEST}: '
                           'record longer')
 
 

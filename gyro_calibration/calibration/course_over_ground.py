@@ -276,9 +276,9 @@ def _refuse_other_motion(spans: _Spans) -> None:
     if left > max(FOLLOWED, 0.5 * there):
         raise DataRefused(
             f'within {STRETCH:.0f} s the course varies by {there / DEGREE:.1f} deg, and less the '
-            f'gyro by {left / DEGREE:.1f} deg (medians): the gyro does not follow. See whether '
-            'they belong to one drive, whether axis, sign and units are right, and whether the '
-            'gyro is alive'
+            f'gyro by {left / DEGREE:.1f} deg (medians): the gyro does not follow the '
+            'course. Check that both belong to one drive, and check axis, sign, units, and that '
+            'the gyro responds'
         )
 
 

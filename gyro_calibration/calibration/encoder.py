@@ -228,7 +228,7 @@ def _pair(log: Log) -> tuple[Array, Array, Motion]:
         if known.sum() < max(100, 0.1 * len(log)):
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
                               'at least a tenth and 100 are needed: '
-                              'mend its line and record again')
+                              'repair its line and record again')
     start = log.time[seen][0]
     return (log.time[answered] - start, log.output[answered],
             from_headings(log.time[seen], heading[seen]))
@@ -240,7 +240,7 @@ def _refuse_length(motion: Motion) -> None:
                           'record longer')
     if motion.duration > LONGEST:
         raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
-                          'see whether time_s is in s, or give --rate')
+                          'check that time_s is in s, or give --rate')
 
 
 def _refuse_motion(motion: Motion, limits: Limits) -> None:
@@ -328,7 +328,7 @@ def _drift(motion: Motion, error: Array, bias: float, noise: Noise, technology: 
     known = np.flatnonzero(np.bincount(piece))
     if len(known) < 6:
         raise DataRefused(f'the reference is known in {len(known)} of {piece[-1] + 1} parts of '
-                          'the log; at least 6 are needed: mend its line and record again')
+                          'the log; at least 6 are needed: repair its line and record again')
     middle, heading = ((np.bincount(piece, values) / np.maximum(np.bincount(piece), 1))[known]
                        for values in (motion.time, error))
     apart, ones = np.diff(middle), np.ones(len(middle) - 1)

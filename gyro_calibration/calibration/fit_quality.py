@@ -141,10 +141,10 @@ def allow_asymmetry(fit: Fit, rate: Array) -> Fit:
 def refuse_repeating(fit: Fit, limit: float) -> None:
     """Refuse a run whose heading errs by more than a limit, rad, whatever scale and bias are."""
     if fit.repeating > limit:
-        raise DataRefused(f'the heading is off by {fit.repeating / DEGREE:.1f} deg (rms) again '
-                          f'and again with the motion, at most {limit / DEGREE:g} deg are '
-                          'allowed, and no scale and bias take that away: turn more slowly and '
-                          'gently, fasten the gyro, or sample faster')
+        raise DataRefused(f'the heading error is {fit.repeating / DEGREE:.1f} deg rms and '
+                          f'repeats with the motion, at most {limit / DEGREE:g} deg are allowed; '
+                          'scale and bias do not explain it: turn more slowly and gently, fasten '
+                          'the gyro, or sample faster')
 
 
 def refuse_useless(fit: Fit, limit: float) -> None:

@@ -63,7 +63,7 @@ class Goodness:
                   'gyro measures, or shakes')
         return (f'The residual is {amount} (chi-square {self.chi_square:.1f} with '
                 f'{self.freedom:.0f} degrees of freedom, probability {self.probability:.2g}; '
-                f'noise {self.noise_ratio:.2f} times what is known)')
+                f'noise {self.noise_ratio:.2f} times that of the model)')
 
 
 #: Below this probability the message says that the residual is more than the noise explains.

@@ -103,7 +103,7 @@ def unit_error(scale: float, by_profile: bool = True) -> str:
     gyro, profile = _UNITS[nearest]
     cause = f'either {gyro}, or {profile}' if by_profile else gyro
     return (f'the gyro reports {abs(scale):.4g} times what was turned{turned}: '
-            f'{cause}; mend the unit')
+            f'{cause}; correct the unit')
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ _SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
         f"the robot stopped at about {value[0]:.1f} s of the profile's {motion.duration:.1f} s: "
         'drive the whole profile'),
     'speed': lambda value, motion: (
-        f'the robot drove the profile {value[0]:.2f} times as fast as it says, in '
+        f'the robot drove the profile {value[0]:.2f} times as fast as given, in '
         f'{motion.duration / value[0]:.1f} s instead of {motion.duration:.1f} s: '
         'drive it at its own speed, or give the profile that was driven'),
     'late': lambda value, _: (

@@ -259,21 +259,21 @@ def refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
     """Refuse samples that are too few, no numbers, or too far apart."""
     if len(time) < limits.samples:
         raise DataRefused(f'only {len(time)} samples came; at least {limits.samples} are needed: '
-                          "look at the gyro's line and rate")
+                          "check the gyro's line and rate")
     if not np.isfinite(rate).all():
         raise DataRefused(f'{np.sum(~np.isfinite(rate))} samples are not a finite number: '
-                          'leave them out, or mend the line')
+                          'leave them out, or repair the line')
     gap = float(np.diff(time).max())
     if gap > limits.gap:
         raise DataRefused(f'no samples came for {gap:.2f} s; at most {limits.gap:g} s may be '
-                          'missing: mend the line and run again')
+                          'missing: repair the line and run again')
 
 
 def refuse_scale(s: float, reference: str, remedy: str) -> None:
     """Refuse a gyro that saw almost none of the reference's turns, or all with the other sign."""
     if abs(1.0 + s) < 0.5:
         raise DataRefused(f"the gyro saw {100 * (1 + s):.0f} % of the {reference}'s turns: "
-                          'did the robot move, and is the gyro alive?')
+                          'did the robot move, and does the gyro respond?')
     if s < -1.5:
         raise DataRefused(f'the gyro turns the other way than the {reference} '
                           f'(scale {1 + s:.2f}): {remedy}')
@@ -320,11 +320,11 @@ def _refuse_fit(fit: Fit, run: Pieces, motion: Motion, limits: Limits) -> None:
         raise DataRefused(slip)
     if abs(s) > limits.scale_factor_error + 3.0 * deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
-                          f'{100 * limits.scale_factor_error:.0f} %: look at the sensitivity and '
+                          f'{100 * limits.scale_factor_error:.0f} %: check the sensitivity and '
                           "at the profile's unit")
     if abs(b) > limits.bias:
         raise DataRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.bias / DEGREE:g} deg/s: was the robot turned by hand?')
+                          f'{limits.bias / DEGREE:g} deg/s: do not turn the robot by hand')
     if deviation > limits.scale_standard_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
                           f'wanted {100 * limits.scale_standard_deviation:g} %: turn further, '
@@ -335,8 +335,8 @@ def _refuse_fit(fit: Fit, run: Pieces, motion: Motion, limits: Limits) -> None:
     if (motion.rate is not None and fit.goodness is not None and unexplained > limits.unexplained
             and fit.goodness.noise_ratio > limits.noise_ratio):
         raise DataRefused(f'the run is {fit.goodness.noise_ratio:.1f} times as noisy as the model '
-                          f'says, at most {limits.noise_ratio:g} are allowed: look whether the '
-                          'gyro is fixed and the robot shakes, or measure the noise anew (allan)')
+                          f'states, at most {limits.noise_ratio:g} are allowed: fasten the '
+                          'gyro, stop vibration, or measure the noise again (allan)')
     refuse_repeating(fit, limits.repeating)
     refuse_useless(fit, limits.heading)
 
@@ -400,7 +400,7 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
         raise DataRefused('after the run, at rest, the corrected rate is '
                           f'{check.rate / DEGREE:.4f} deg/s, at most '
                           f'{check.limit / DEGREE:.4f} are explained: the robot still turned, or '
-                          'the run was not what it seemed; run again and leave it at rest')
+                          'the run was disturbed; run again and leave it at rest')
     return check
 
 

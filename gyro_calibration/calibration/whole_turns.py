@@ -141,7 +141,7 @@ def _motion(time: Array, rate: Array, white: float) -> tuple[float, float]:
                 f'{REST:g} s at least: leave it at rest on the mark, and record until after that')
     if sum(lengths) >= time[-1] - time[0] - 2.0 * _SETTLING:
         raise DataRefused('the gyro rests all the time: did the robot turn, '
-                          'and is the gyro alive?')
+                          'and does the gyro respond?')
     return float(time[0] + lengths[0]), float(time[-1] - lengths[1])
 
 
@@ -177,6 +177,6 @@ def _counted(measured: float, turns: int | None, limits: Limits) -> int:
     if abs(measured - count) > (AMBIGUOUS if turns else COUNTED * abs(count)):
         given = f', and {turns} were given' if turns else ''
         raise DataRefused(
-            f'the gyro counts {measured:.2f} turns{given}: that is no whole number that can be '
-            'distinguished from the next; close the turns on the mark, count them, or make fewer')
+            f'the gyro counts {measured:.2f} turns{given}, which is not near '
+            'one whole number; close the turns on the mark, count them, or make fewer')
     return count

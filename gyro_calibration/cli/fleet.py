@@ -232,7 +232,7 @@ def _usable(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             why = 'its unit is unknown; give a table or --pattern'
         elif _noise(each) and is_confused(ratio := _noise(each) / usual[each['type']]):
             why = (f'its white noise is {ratio:.3g} times the median of its type, as by deg/s in '
-                   'place of rad/s; mend the unit of its column, or state its type')
+                   'place of rad/s; correct the unit of its column, or state its type')
         found.append({**each, 'status': NO_EVIDENCE, 'reason': why} if why else each)
     return found
 

@@ -118,8 +118,8 @@ _OTHERS = (
      'make.', 'rad', 'reference', 'time reference', 'rate_change', ''),
     ('reference_quantization', 'The reference counts in steps, and its rate between samples is as '
      'coarse.', 'rad', 'reference', 'time reference_heading', 'heading', ''),
-    ('unit_error', 'The output is in another unit, or of the other sign, than its name says.', '1',
-     'record', 'reference', 'rate',
+    ('unit_error', 'The output is in another unit, or of the other sign, than its name states.',
+     '1', 'record', 'reference', 'rate',
      'look up what the wire carries: the number itself is the evidence'),
     ('angle_random_walk', 'The angle random walk differs from the simulated one.', 'rad/√s',
      'noise', 'time', 'frequency', ''),
@@ -167,14 +167,14 @@ def as_suspected(found: Finding) -> Finding:
     separate_by = CAUSES[found.effect].separate_by
     return replace(found, status='suspected', remedy=(
         f'record again: {separate_by}' if separate_by
-        else 'record longer, and see whether it is found again'))
+        else 'record longer, and check that it is found again'))
 
 
 _REMEDIES = {
     'gyro': 'add it to the model of the gyro',
-    'reference': 'mend or replace the reference, or see that it does not enter a calibration',
-    'record': 'mend the recording',
-    'noise': 'take the figures of the extended model'}
+    'reference': 'repair or replace the reference, or keep it out of calibrations',
+    'record': 'repair the recording',
+    'noise': 'use the figures of the extended model'}
 
 
 def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float],

@@ -127,7 +127,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
             units = [_sized(
                 'unit_error', ratio, 1.96 * deviation,
                 float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
-                f'the output is {ratio:.5g} +- {deviation:.2g} times what the reference says, and '
+                f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
                 f'{name} is {FACTORS[name]:.5g}',
                 () if is_far(ratio) else ('scale_factor_error',))]
     found = DataQuality(tuple(units), notes, known, factor)
@@ -146,7 +146,7 @@ def decided(clean: DataQuality) -> DataQuality:
         return clean
     if is_far(clean.factor):
         note = (f'The output was multiplied by {clean.factor:.6g} first, and a new model is for '
-                'an output so mended: mend the unit or the sign of the log (its column, '
+                'an output so corrected: correct the unit or the sign of the log (its column, '
                 '--sensitivity, --invert) before it is compensated.')
         return replace(clean, remarks=(*clean.remarks, note))
     note = (f'The output was not multiplied by {clean.factor:.6g}, for that may be of the gyro: '

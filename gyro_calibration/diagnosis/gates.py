@@ -174,7 +174,7 @@ def _refuse_table(log: Log, output: Array) -> None:
     if rows > MOST_ROWS:
         raise DataRefused(
             f'the log has no time_s, and {rows} rows, where a rate table has at most {MOST_ROWS}: '
-            'add time_s, or say with --rate how many samples a second it holds')
+            'add time_s, or give the sample rate with --rate')
 
 
 def _refuse_few(time: Array, output: Array) -> None:
@@ -182,13 +182,13 @@ def _refuse_few(time: Array, output: Array) -> None:
     if known < FEWEST or known < LEAST * len(output):
         raise DataRefused(
             f'the gyro has a value in {known} of {len(output)} samples; at least {FEWEST} and a '
-            'tenth are needed: record again, and mend the line if it loses samples')
+            'tenth are needed: record again, and repair the line if it loses samples')
     if time[-1] - time[0] < SHORTEST:
         raise DataRefused(f'the log lasts {time[-1] - time[0]:.1f} s; '
                           f'a diagnosis wants at least {SHORTEST:g} s: record longer')
     if time[-1] - time[0] > LONGEST:
         raise DataRefused(f'the log lasts {time[-1] - time[0]:.3g} s by its stamps; '
-                          'see whether time_s is in s, or give --rate')
+                          'check that time_s is in s, or give --rate')
 
 
 def _refuse_without_reference(log: Log, output: Array) -> None:
@@ -196,7 +196,7 @@ def _refuse_without_reference(log: Log, output: Array) -> None:
     if values is None and not rests(log):
         raise DataRefused(
             'the log has no reference, and the gyro is not at rest: add reference_rate_dps or '
-            'reference_heading_deg, or let it rest, and say so with a column moving of zeros')
+            'reference_heading_deg, or let it rest, and add a column moving of zeros')
     if values is None:
         return
     known = np.isfinite(values)
@@ -205,7 +205,7 @@ def _refuse_without_reference(log: Log, output: Array) -> None:
     if count < FEWEST or covered < LEAST * len(output):
         raise DataRefused(
             f'the reference has a value in {count} of {len(output)} samples; at least {FEWEST} '
-            'and a tenth are needed, or one at even intervals: mend its line and record again')
+            'and a tenth are needed, or one at even intervals: repair its line and record again')
 
 
 def _refuse_constant(output: Array) -> None:
@@ -383,7 +383,7 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
     """Give the gates of sense and unit, by the factor of the output over the reference."""
     assert log.time is not None
     factor, deviation = 1.0 / (found.factor * own), found.deviation / found.factor ** 2 / abs(own)
-    seen = f'the output is {factor:.4g} times what the reference says'
+    seen = f'the output is {factor:.4g} times the reference'
     size = factor, (factor - 1.96 * deviation, factor + 1.96 * deviation)
     if not is_far(factor):
         yield Gate('sense', True, f'{seen}: the same sense')
@@ -404,13 +404,13 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
                    f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
                    + (' (the stamps are in ms)' if power == 3 else ''), size)
         return
-    remedy = ('mend the unit or the range of the gyro (gyro_dps, gyro_rad_s, --sensitivity), or '
-              'that of the reference')
+    remedy = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, --sensitivity), '
+              'or that of the reference')
     if name is not None and '180' in name:
         assert log.output is not None
         fastest = float(np.nanquantile(np.abs(log.output), 0.99)) / DEGREE
         either = log.reference_heading is not None and 0.1 <= fastest <= 4000.0
-        remedy = ('mend the unit of the column of the gyro (gyro_dps or gyro_rad_s)'
+        remedy = ('correct the unit of the column of the gyro (gyro_dps or gyro_rad_s)'
                   + (', or that of the reference heading (deg or rad)' if either else ''))
     yield Gate('unit', False, f'{seen}, and {name} is {FACTORS[name]:.5g}' if name
                else f'{seen}, which is the factor of no gyro', remedy, size)

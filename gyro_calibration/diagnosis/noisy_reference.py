@@ -223,14 +223,14 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
             if not (of_reference or lag) and _may_lag(done, value):
                 confounders = ['bandwidth']
             if own_clock:
-                known = {'remedy': 'synchronize the clocks of gyro and reference; the model has '
-                         'none of it'}
+                known = {'remedy': 'synchronize the clocks of gyro and reference; the model does '
+                         'not contain it'}
                 if of_reference:
-                    known['cause'] = 'Gyro and reference are not of the same time.'
+                    known['cause'] = 'The gyro has a time offset from its reference.'
         yield finding(name, {name: Estimate.about(value, half, CAUSES[name].unit)},
                       max(chance, LEAST_PROBABILITY), confounders,
                       minimum_detectable=SEEN * deviation,
-                      evidence=f'it rests on {effective:.0f} stretches', **known)
+                      evidence=f'evidence from {effective:.0f} stretches', **known)
 
 
 def _may_lag(done: SpanFit, delay: float) -> bool:
@@ -384,12 +384,11 @@ def _cannot_show(plain: SpanFit) -> dict[str, str]:
 
 def _remarks(reference: Reference, plain: SpanFit, of_fleet: bool) -> Iterator[str]:
     if of_fleet:
-        yield ('What the log leaves open of bias and scale factor error is drawn to what is usual '
-               'by the model, which is of a fleet.')
-    yield (f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); say so with '
-           '--reference-kind if it is another. It errs by '
-           f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and by '
-           f'{1000.0 * plain.size("motion"):.2g} ms of the motion.')
+        yield ('The model, which is of a fleet, is the prior of bias and scale factor error.')
+    yield (f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); if '
+           'it is another kind, state it with --reference-kind. Its errors: '
+           f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and '
+           f'{1000.0 * plain.size("motion"):.2g} ms times the rate.')
     if plain.prior[0] < plain.spans.treatment.prior[0]:
         yield ('The scale factor error rests on fewer than three stretches that turn, and is left '
                f'at 0 +- {100.0 * plain.spans.treatment.prior[0]:g} %: turn more often, both '

@@ -426,8 +426,8 @@ def _of_noise(figures: NoiseParameters, model: GyroModel, rate: float,
             unit, value = CAUSES[name].unit, getattr(figures.noise, name)
             found.append(finding(
                 name, {name: Estimate(value, figures.interval[name], unit)}, figures.chance[name],
-                evidence=f'the model says {amount(getattr(expected, name), unit, name)}, the log '
-                f'{amount(value, unit, name)}'))
+                evidence=f'the model states {amount(getattr(expected, name), unit, name)}, '
+                f'the log {amount(value, unit, name)}'))
     return found
 
 
@@ -476,14 +476,13 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
                   {term.effect.name for term in ([] if model is None else model.terms)})
     if implausible_scale(found):
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
-               f'{100.0 * scale.deviation:.1g} % is in no model: there is too little motion '
-               'against the noise of gyro and reference for it to be believed; turn faster, and '
-               'both ways.')
+               f'{100.0 * scale.deviation:.1g} % is in no model: there is too little '
+               'motion for the noise of gyro and reference; turn faster, and both ways.')
     for name in dict.fromkeys(each.candidate.cause for each in out):
         remedy = ('; take that out of the model that is given, and diagnose again' if name in own
                   else '')
-        yield (f'A further {name.replace("_", " ")} is not in the extended model, because that '
-               f'has one already and the two do not make one{remedy}.')
+        yield (f'A further {name.replace("_", " ")} is not in the extended model, which has '
+               f'one already that cannot be merged with it{remedy}.')
     for name in dict.fromkeys(each.candidate.cause for each in found.named if happens_once(each)):
         yield (f'The {name.replace("_", " ")} happens once: it is not in the extended model, '
                'whose bias is the mean over the logs.')

@@ -88,14 +88,13 @@ _LEFT, _OUTLYING = 0.2, 0.05
 #: An effect of the smallest size that is stated is found with this probability.
 _POWER = 0.95
 _METHOD = (
-    'The rates and temperatures of the dwells were put through the simulation, and what the '
-    'measured outputs differ by was compared with the effects of rate and temperature. How dwells '
-    'and sweeps scatter was found by restricted likelihood about a smooth surface. An effect was '
-    'taken where it predicts left-out sweeps better, and chance alone, averaged over what the '
-    'scatter may be, hardly shows as much: of tables without any cause, {share:.2g} % give an '
-    'alarm. Then curves over rate, temperature and the order of the dwells were tried on what is '
-    'left. The reduction of the error was measured on sweeps that took no part in choice or fit; '
-    'intervals are of 95 %.')
+    'The rates and temperatures of the dwells were simulated, and the difference of measured and '
+    'simulated outputs was compared with the effects of rate and temperature. The scatter of '
+    'dwells and sweeps was estimated by restricted likelihood about a smooth surface. An effect '
+    'was taken if it predicts left-out sweeps better and is improbable by chance: of tables '
+    'without any cause, {share:.2g} % give an alarm. Then curves over rate, temperature and the '
+    'order of the dwells were tested on the residual. The reduction of the error was measured on '
+    'sweeps that took no part in choice or fit; intervals are of 95 %.')
 #: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
 _MOST_GROUPS = 8
 #: Bins of a curve at most, and dwells in each at least.
@@ -224,7 +223,7 @@ def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Findin
         yield finding('outliers', {'outliers': Estimate.about(float(len(outlying)), 0.0, '1')},
                       chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
                       evidence=f'{len(outlying)} of {len(dwells)} dwells are up to '
-                      f'{far.max():.0f} standard deviations off what the others say: {places}',
+                      f'{far.max():.0f} standard deviations off the others: {places}',
                       along=RATE)
 
 
@@ -328,8 +327,8 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Sequen
              withdrawn: frozenset[str], gain: Gain | None, offered: bool) -> Iterator[str]:
     fit = named.fit
     if withdrawn:
-        yield (f'No name is given to {", ".join(sorted(withdrawn))}, for along the same '
-               'variable much is left that has none.')
+        yield (f'Not named: {", ".join(sorted(withdrawn))}: along the same '
+               'variable, much structure is left without a name.')
     if named.causes and not offered:
         yield ('The extension predicts left-out dwells worse than the simulation, so that it is '
                'not offered.')
@@ -384,7 +383,7 @@ def _against_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
 # what cannot be shown
 
 _AVERAGED = 'a dwell is a mean at a steady rate; record samples with their time'
-_NO_TIME = 'a table without time does not tell what changes with it; record a log in time'
+_NO_TIME = 'a table without time does not show what changes with time; record a log in time'
 _REASONS = {
     **dict.fromkeys(('bandwidth', 'time_offset', 'clock_rate', 'reference_slip'),
                     'at steady rates nothing changes that could come late; record fast reversals '

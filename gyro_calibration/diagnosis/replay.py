@@ -345,7 +345,7 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     if count < FEWEST:
         raise DataRefused(f'{count} of {len(kept)} samples can be used, at least {FEWEST} are '
                           'needed; the others are lost, repeated, outliers or near a limit: turn '
-                          'more slowly, or mend the line, and record again')
+                          'more slowly, or repair the line, and record again')
     place, interval = numbered(time, kept)
     _refuse_gaps(log.time[kept], place)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))

@@ -277,8 +277,10 @@ def _gained(diagnosis: Diagnosis) -> str:
     if not offered(diagnosis) and (gain is None or gain.models.get('given')
                                    == gain.models.get('extended')):
         return 'No extended model is offered: the model is unchanged.'
-    model = ('The extended model' if offered(diagnosis)
-             else 'The model, of bias and scale factor error alone,')
+    plain = {term.effect.name: term.values[0] for term in diagnosis.model.terms}
+    model = ('The extended model' if offered(diagnosis) else 'The model, '
+             f'bias {amount(plain.get("bias", 0.0), "rad/s", "bias")} and scale factor error '
+             f'{amount(plain.get("scale_factor_error", 0.0), "1", "scale_factor_error")} alone,')
     if gain is None:
         return 'An extended model is offered; its gain was not measured.'
     if gain.heading is None:

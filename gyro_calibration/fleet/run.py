@@ -103,7 +103,7 @@ def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
     """
     from distributed import Client
     if '://' not in address:  # a client of no scheduler waits for it when it is deleted
-        raise ValueError(f'{address} names no protocol')
+        raise ValueError(f'{address} has no protocol')
     with Client(address, timeout='10s', set_as_default=False) as client:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
 
@@ -165,7 +165,7 @@ def _one_by_one(work: Work[Task, Found], tasks: Iterable[Task],
 
 def _killed(error: Exception) -> str:
     if isinstance(error, BrokenExecutor) or type(error).__name__ == 'KilledWorker':
-        return ('its worker was killed, as where memory runs out; look at the log, '
+        return ('its worker was killed, perhaps since memory ran out; check the log, '
                 'or give --workers 1')
     return f'its worker failed ({type(error).__name__}: {str(error)[:200]})'
 

@@ -204,7 +204,7 @@ def calibrate(log: Log, technology: str = 'mems'
         return 'rest', _at_rest(log), {}
     of_table = None if log.time is not None else inspect(log)
     if of_table is not None and is_far(of_table.factor):
-        raise DataRefused(f'{of_table.findings[0].evidence}: mend the unit or the sign of the '
+        raise DataRefused(f'{of_table.findings[0].evidence}: correct the unit or the sign of the '
                           'column of the gyro')
     return 'dwells', select_effects(dwells(log), technology).calibration.model, {}
 

@@ -226,9 +226,9 @@ class BiasTable:
                f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
         if len(self._held) < IN_A_ROW:
             self.held_back += 1
-            return f'a bias that is {off} was held back: was the robot turned slowly?'
+            return f'a bias that is {off} is not used: check whether the robot turned slowly'
         self._jump((bias - before) ** 2)
-        return f'the bias jumped: {IN_A_ROW} rests in a row are {off}; what was known is shifted'
+        return f'the bias jumped: {IN_A_ROW} rests in a row are {off}; earlier entries are shifted'
 
     def _agree(self, held: Entry, given: Entry) -> bool:
         variance = (held.variance + given.variance + self._wander(given.time - held.time)
@@ -558,7 +558,7 @@ VERSION = 1
 _BYTES = 200_000
 _HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest and before '
            'any self-calibration; times are UTC.\n'
-           '# Written by the compensation node. It may be deleted: then it is learned anew.\n')
+           '# Written by the compensation node. If it is deleted, estimation begins again.\n')
 
 
 def model_digest(model: GyroModel) -> str:
@@ -584,12 +584,13 @@ def read_bias_table(path: str | Path, model: GyroModel,
     except FileNotFoundError:
         return BiasTable(model, prior), ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
-        message = (f'{path} cannot be read as a bias table ({reason(error)}): it is learned anew, '
-                   'and the file is kept')
+        message = (f'{path} cannot be read as a bias table ({reason(error)}): estimation '
+                   'begins again, and the file is kept')
         return BiasTable(model, prior), plain(message)
     if digest != model_digest(model):
-        return BiasTable(model, prior), plain(f'the bias table in {path} belongs to another '
-                                              'model: it is learned anew, and the file is kept')
+        return BiasTable(model, prior), plain(
+            f'the bias table in {path} belongs to another model: estimation begins again, and the '
+            'file is kept')
     return BiasTable(model, prior, entries, jumps), ''
 
 
@@ -633,7 +634,7 @@ def _read(path: Path) -> tuple[str, list[Entry], list[Jump]]:
     """Return digest, entries and jumps of a file."""
     content = read_settings(path, _BYTES)
     if not isinstance(content, dict) or content.get('format') != FORMAT:
-        raise ValueError(f'it does not say format: {FORMAT}')
+        raise ValueError(f'it has no line format: {FORMAT}')
     if content.get('version') != VERSION:
         raise ValueError(f'its version is {content.get("version")!r:.40}, wanted {VERSION}')
     entries = [_entry(row, float(row['temperature']), float(row['bias']))

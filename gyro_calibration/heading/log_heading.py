@@ -75,7 +75,7 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     if not hindsight:
         return live
     if not np.isfinite(found).all():
-        raise OverflowError('the variance of the heading is beyond all numbers')
+        raise OverflowError('the variance of the heading is not finite')
     later, with_hindsight, rested = in_hindsight(tracker, time, rate)
     return replace(live, heading=later, variance=with_hindsight, resting=rested)
 

@@ -175,5 +175,5 @@ def _numbers(path: str | Path, rows: Iterable[list[str]],
                 value = math.inf
             if not (abs(value) <= LARGEST or math.isnan(value) and name.startswith('reference_')):
                 raise MotionError(f'{path}: column {name} holds something that is not a finite '
-                                  'number; mend or remove the row')
+                                  'number; correct or remove the row')
             yield value

@@ -540,8 +540,8 @@ class CalibrationSession:
         if self.run is None:
             return False, 'no calibration is in progress'
         if self.run.reason is not None:
-            return False, ('the calibration has just ended; its own answer says whether it is in '
-                           'use')
+            return False, ('the calibration has just ended; its own answer states whether it is '
+                           'in use')
         self.end('cancelled')
         return True, 'cancelled; the previous calibration is in use'
 

@@ -20,7 +20,7 @@ from types import SimpleNamespace
 
 _WORDS: dict[type, str] = {
     bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text',
-    list: 'a list of texts'}
+    list: 'a list of strings'}
 
 
 @dataclass(frozen=True)

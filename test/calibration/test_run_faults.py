@@ -85,7 +85,7 @@ def test_noise_beyond_the_models_is_reported_and_more_of_it_refused():
     goodness = self_calibrate(TIME, output(level=3.0), CALIBRATION, noise=XV3500.noise).goodness
     assert goodness.probability < UNLIKELY and goodness.noise_ratio == pytest.approx(3.0, rel=0.4)
     assert 'more than the noise explains' in str(goodness)
-    with pytest.raises(DataRefused, match='times as noisy as the model says|a slip or a bump'):
+    with pytest.raises(DataRefused, match='times as noisy as the model states|a slip or a bump'):
         self_calibrate(TIME, output(level=15.0), CALIBRATION, noise=XV3500.noise,
                        limits=Limits(scale_standard_deviation=1.0))
 
@@ -320,7 +320,7 @@ NO_TURNS = {
     'not at all': (turned(2), 0, 'turn once at least'),
     'no rest before': (turned(2, before=0.6), 2, 's before the turns'),
     'no rest after': (turned(2, after=0.2), 2, 's after the turns'),
-    'scale and count': (turned(5, s=0.1), 5, 'no whole number'),
+    'scale and count': (turned(5, s=0.1), 5, 'one whole number'),
     'a large scale': (turned(1, s=0.33), 1, 'beyond 30 %'),
 }
 

@@ -254,7 +254,7 @@ REFUSED = {
     'half of the scale': (TIME, run(s=-0.4), CALIBRATION,
                           'a scale factor error of -40 % is beyond 30 %'),
     'carried round': (TIME, run() + 0.3, CALIBRATION,
-                      'is beyond 10 deg/s: was the robot turned by hand?'),
+                      'is beyond 10 deg/s: do not turn the robot by hand'),
 }
 
 

@@ -148,7 +148,7 @@ def test_one_axis_that_tilts_has_another_bias_about_the_vertical_than_at_rest(da
 def test_a_heading_that_is_off_again_and_again_is_refused():
     fit = Fit(0.0, 0.0, np.zeros((2, 2)), repeating=1.6 * DEGREE)
     with pytest.raises(DataRefused,
-                       match=r'off by 1\.6 deg \(rms\) again and again.*at most 1 deg.*slowly'):
+                       match=r'heading error is 1\.6 deg rms and repeats.*at most 1 deg.*slowly'):
         refuse_repeating(fit, 1.0 * DEGREE)
     refuse_repeating(fit, 2.0 * DEGREE)
 

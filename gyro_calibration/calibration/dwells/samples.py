@@ -60,7 +60,7 @@ def usable(log: Log) -> tuple[Samples, list[str]]:
                           & known & np.isfinite(output))
     if len(good) < FEWEST:
         raise DataRefused(f'{len(good)} of {len(time)} samples hold both a gyro output and '
-                          'a reference; look at the columns')
+                          'a reference; check the columns')
     rate, heading, temperature = (
         None if values is None else values[good]
         for values in (log.reference_rate, log.reference_heading, log.temperature))

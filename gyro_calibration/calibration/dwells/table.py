@@ -131,7 +131,7 @@ def from_table(log: Log) -> Dwells:
     good = np.isfinite(output) & np.isfinite(log.reference_rate)
     if not good.any():
         raise DataRefused(f'none of the {len(output)} rows holds both a gyro output and '
-                          'a reference rate; look at the columns')
+                          'a reference rate; check the columns')
     rows = np.flatnonzero(good)
     rate, names = log.reference_rate[rows], log.others.get('sweep')
     sweep = sweeps(rate) if names is None else numbered([names[row] for row in rows])
