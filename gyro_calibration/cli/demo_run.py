@@ -85,7 +85,7 @@ class Robot:
 
     Attributes
     ----------
-    noise : of each phase (start, calibration, drive), rad/s
+    noise : of each phase (start, each attempt to calibrate, drive), rad/s
     phase : number of the phase
     commands : those to come into force, with the time when they came, s, and the rate, rad/s
     truth : of each sample the time by the clock of this machine, s, and the true heading, rad
@@ -235,8 +235,8 @@ def run_demo(out: Path, seed: int) -> Demonstration:
     model = read_model(_share('config', 'xv3500.yaml'))
     write_model(model_file, GyroModel(noise=model.noise))  # only the noise of the gyro is known
     generator = np.random.default_rng(seed)
-    robot = Robot(model, [simulate_noise(model.noise, length, INTERVAL, generator)
-                          for length in (6000, 10000, 6000)])  # three calibrations at most
+    start, run, drive = (simulate_noise(model.noise, 6000, INTERVAL, generator) for _ in range(3))
+    robot = Robot(model, [start, *[run] * ATTEMPTS, drive])
     with ExitStack() as stack:
         stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))
@@ -270,17 +270,16 @@ def _perform(client: Client, robot: Robot) -> float:
         bar.set_description('starting driver and compensation')
         _until(client.is_ready, 60.0)
         bar.set_description('calibrating on the motion profile')
-        robot.phase = 1
-        calibrate(client, bar)
+        calibrate(client, robot, bar)
         client.call('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
-        robot.phase = 2
+        robot.phase = len(robot.noise) - 1
         begin = time.time()
         _drive(client, DRIVE, bar)
     return begin
 
 
-def calibrate(client: Client, bar: tqdm) -> None:
+def calibrate(client: Client, robot: Robot, bar: tqdm) -> None:
     """
     Calibrate; a refused run is repeated, since this robot turns late on a busy machine.
 
@@ -290,6 +289,7 @@ def calibrate(client: Client, bar: tqdm) -> None:
 
     """
     for attempt in range(1, ATTEMPTS + 1):
+        robot.phase = attempt
         try:
             client.call('compensation_node/calibrate', 60.0, lambda: _pass(bar, 0.2))
             return
