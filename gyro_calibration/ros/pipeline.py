@@ -375,7 +375,7 @@ class Pipeline:
             self.estimator.begin_run(self._clock.date())
         self._last = time
         journal.channels = set() if specific_force is None else {'specific_force'}
-        return self._use(stamp, time, interval, output, specific_force, now, receivers)
+        return self._use(stamp, time, (interval, silence), output, specific_force, now, receivers)
 
     def _add_unseen_turn(self, now: float) -> None:
         """Add to the variance what the gyro may have turned while its stamps stood still."""
@@ -400,13 +400,14 @@ class Pipeline:
         silent = now - self.journal.received > POWER_OFF
         return silent and since < math.inf and not 0.0 < since < POWER_OFF
 
-    def _use(self, stamp: int, time: float, interval: float, output: float, force: float | None,
-             now: float, receivers: int) -> Output | None:
+    def _use(self, stamp: int, time: float, since: tuple[float, float], output: float,
+             force: float | None, now: float, receivers: int) -> Output | None:
+        """Compensate and integrate a sample; `since` the last one by stamps and arrivals, s."""
         estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
         moving = self.wheels.moving(now, self._sources) if self._sources else None
+        (interval, silence), received = since, self.journal.received
         lost, unseen = estimator.tracker.intervals.lost, not 0.0 < interval <= BLIND
-        since = self.journal.received
-        if unseen and not moving and not self.wheels.stood(since, now, self._sources):
+        if unseen and not moving and not self.wheels.stood(received, now, self._sources):
             moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused > refused:
@@ -422,6 +423,8 @@ class Pipeline:
             self._note_restart(restarted)
         elif unseen and moving is not False and tracker.intervals.lost > lost:
             turned = 0.25 * _ACCELERATION * interval ** 2
+            if silence < 0.5 * interval:  # or no samples are lost, and the stamps leapt
+                turned += abs(estimator.rate) * interval
             estimator.rewind(tracker.heading, tracker.variance + turned ** 2)
         self._stamps.add(time)
         self._look_for_repeats(time, output, now)
