@@ -603,11 +603,11 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
     """
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
     if run.kind == REST:
+        bias, deviation = calibrate_bias(time - time[0], rate, rules.limits, noise, output)
         if abs(turned := _turned(run.odometry)) > _TURNED:
             raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
                               f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap '
                               'odom to an odometry of the wheels')
-        bias, deviation = calibrate_bias(time - time[0], rate, rules.limits, noise, output)
         return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), when,
                                run.temperature, 'rest'), ''
     if run.kind == TURNS:
