@@ -356,8 +356,9 @@ def _with_process(best: Description, kept: tuple[int, ...], misfit: float) -> De
     Return the likeliest description by some parts and a Gauss-Markov process, None without one.
 
     The peak of its Allan deviation, at 1.9 correlation times, is in the chart: a process with a
-    longer correlation time is a random walk. To find the time, the covariance of the best is
-    taken, scaled by the Allan deviations.
+    longer correlation time is a random walk. It makes less than half of the first Allan variance:
+    white noise behind a lag of first order is such a process too. To find the time, the covariance
+    of the best is taken, scaled by the Allan deviations.
 
     """
     octaves, places = best.octaves, (*kept, _PROCESS)
@@ -377,7 +378,8 @@ def _with_process(best: Description, kept: tuple[int, ...], misfit: float) -> De
     process = min((GaussMarkov(math.sqrt(2.0 / constant), constant) for constant in np.geomspace(
         octaves.size[0], longest, 4 * len(octaves.size)).tolist()), key=roughly)
     found = describe(octaves.with_process(process), places, misfit)
-    return found if _PROCESS in found.held else None
+    first = found.squares * found.octaves.columns[0]
+    return found if 0.0 < first[_PROCESS] < 0.5 * first.sum() else None
 
 
 @dataclass(frozen=True)

@@ -512,6 +512,7 @@ class HeadingTracker:
         self._open += part
         if self.resting:
             self._blocks.append(part)
+            self._sure = wheels is False
             if quiet is False:
                 self._notice(WINDOW)
             elif self._open.duration >= _STEP - CLOSE:
@@ -636,6 +637,7 @@ class HeadingTracker:
     def _rest(self) -> None:
         """Take the robot for standing from here on."""
         self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
+        self._sure = False
         self._blocks = deque[RateIntegral](maxlen=_BLOCKS)
         self._snapshots = [Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
 
@@ -662,7 +664,7 @@ class HeadingTracker:
         if sudden:
             before, turn = self._until_motion(before, turn)
         self._slow = (self._slow_turn(before, turn) if lag >= LAGS[0] and not scattered else None)
-        if self._snapshots[-1].means:
+        if self._snapshots[-1].means and not self._sure:
             self._drives.learn(self._snapshots[-1])
         self._drift, self.deleted, self._open = before.drift, before.deleted, turn
         del self.steps[before.steps:]
@@ -763,7 +765,8 @@ class HeadingTracker:
         squared = (turn.turned - expected) ** 2 / variance
         ratios = 1.0 + SCATTERS * white / variance
         likelihood = before.likelihood - 0.5 * (squared / ratios + np.log(ratios))
-        turn.wander = float(self._drives.chances(likelihood) @ SCATTERS) * white
+        turn.wander = (0.0 if self._sure
+                       else float(self._drives.chances(likelihood) @ SCATTERS) * white)
         self._go_on(turn, self._reached - self._part.duration - left.duration)
         self._rested += turn
         self._snapshots.append(Snapshot(

@@ -12,7 +12,7 @@
 
 import math
 
-from chance import RARE
+from chance import RARE, rms_bounds
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import begin, HEADING, RateIntegral, smoothed
 from gyro_calibration.heading.log_heading import track
@@ -181,6 +181,25 @@ def test_a_rest_determines_the_bias_as_well_as_stated():
         assert deviation < 0.7 * BIAS
         errors.append((found - bias) / deviation)
     assert np.mean(np.square(errors)) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 40))
+
+
+def test_rests_of_less_than_two_seconds_between_turns_show_the_bias():
+    """After ten rests of 1.6 s it is known to a third of before, and as well as stated."""
+    errors, deviations, wide = [], [], np.diag([SCALE ** 2, (0.2 * DEGREE) ** 2])
+    for seed in range(10):
+        generator = np.random.default_rng([6, seed])
+        bias = 0.2 * DEGREE * generator.standard_normal()
+        time, _, _, rate = gyro(turns([(1.6, 0), (2, 45)] * 10), generator,
+                                Noise(XV3500.angle_random_walk), bias=-bias)
+        tracker = HeadingTracker(Noise(XV3500.angle_random_walk), wide, Settings())
+        for at, value in zip(time, rate):
+            tracker.add(at, value, np.array([-value, -1.0]))
+        found, deviation = tracker.bias_by(np.array([0.0, -1.0]))
+        deviations.append(deviation)
+        errors.append((found - bias) / deviation)
+    assert np.median(deviations) < 0.2 * DEGREE / 3.0
+    low, high = rms_bounds(10)
+    assert low < math.sqrt(np.mean(np.square(errors))) < high, errors
 
 
 def test_a_rest_that_was_too_short_to_learn_from_still_ends_in_time():
