@@ -54,7 +54,7 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 
 PROTOCOL = 'kvh_dsp3000'
-NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
+_NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
 INTERVAL = 0.01  # s between samples
 ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
 ATTEMPTS = 3  # to calibrate
@@ -140,9 +140,12 @@ class Client:
         """Subscribe; the robot receives ``cmd_vel`` from now on."""
         self.raw: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
-        self._node = rclpy.create_node('demonstration', namespace=NAMESPACE)
-        self._node.create_subscription(Imu, 'imu/data_raw', self._add_raw, SENSOR_QOS)
-        self._node.create_subscription(Imu, 'imu/data', self._add_heading, SENSOR_QOS)
+        self._node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
+        self._node.create_subscription(Imu, 'imu/data_raw', lambda message: self.raw.append(
+            (_seconds(message), message.angular_velocity.z)), SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data', lambda message: self.headings.append(
+            (_seconds(message),
+             2.0 * math.atan2(message.orientation.z, message.orientation.w))), SENSOR_QOS)
         self._node.create_subscription(Twist, 'cmd_vel', robot.set_rate, 10)
         self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
         self._executor = SingleThreadedExecutor()
@@ -150,12 +153,6 @@ class Client:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
-
-    def _add_raw(self, message: Imu) -> None:
-        self.raw.append((_seconds(message), message.angular_velocity.z))
-
-    def _add_heading(self, message: Imu) -> None:
-        self.headings.append((_seconds(message), _yaw(message)))
 
     def _spin(self) -> None:
         while not self._stop.is_set():
@@ -197,15 +194,11 @@ def _seconds(message: Imu) -> float:
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
-def _yaw(message: Imu) -> float:
-    return 2.0 * float(np.arctan2(message.orientation.z, message.orientation.w))
-
-
 @contextmanager
 def _process(module: str, **parameters: object) -> Iterator[None]:
     """Run a node in a process of its own."""
     arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    quiet = ['-r', f'__ns:=/{NAMESPACE}', '--log-level', 'error']
+    quiet = ['-r', f'__ns:=/{_NAMESPACE}', '--log-level', 'error']
     process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}',
                                 '--ros-args', *arguments, *quiet])
     try:

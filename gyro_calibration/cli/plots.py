@@ -12,7 +12,8 @@
 Pictures for people: PNG or SVG, units on the axes, readable in black and white.
 
 Each function returns its figure, and writes it where a path is given; the ending of the path,
-.png or .svg, says in which format. The line below a picture says what to see in it.
+.png or .svg, says in which format. The line below a picture says what to see in it. Arrays are in
+SI, with one value a sample or dwell, shape (n,).
 
 """
 
@@ -34,24 +35,15 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
-_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)))
+#: Lines that are told apart without colour.
+_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
 #: Of values with a sign, symmetric about zero, and of others; both are read by the colour-blind.
 _DIVERGING, _SEQUENTIAL = 'RdBu_r', 'cividis'
 
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
                   headings: Mapping[str, Array]) -> Any:
-    """
-    Draw headings against the truth, and their errors below (as figure 10 of Hong and Park).
-
-    Parameters
-    ----------
-    path : of the file; None writes none
-    time : s, shape (n,)
-    true : rad, shape (n,)
-    headings : by name, rad, shape (n,) each
-
-    """
+    """Draw headings, rad, against the truth, and their errors (figure 10 of Hong and Park)."""
     figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1.3))
     above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='truth')
     for (name, heading), style in zip(headings.items(), _STYLES * len(headings)):
@@ -68,16 +60,10 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
 def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
                    after: Array, name: str = 'encoder') -> Any:
     """
-    Draw the heading of a reference and that of a gyro, and what lies between them.
+    Draw the heading of a reference, rad, and that of a gyro, and what lies between them.
 
-    Parameters
-    ----------
-    path : of the file; None writes none
-    time : s, shape (n,)
-    reference : rad, shape (n,)
-    before, after : heading of the gyro less the reference, without calibration and with it, rad,
-        shape (n,)
-    name : of the reference
+    `before` and `after` are the heading of the gyro less the reference, without calibration and
+    with it.
 
     """
     figure, ((above,), (middle,), (below,)) = _panels(3, 1, (9, 9), (1.3, 1, 1))
@@ -98,17 +84,7 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
 
 def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array,
              motion: Motion) -> Any:
-    """
-    Draw a run of self-calibration: its motion, and the error of the heading before and after.
-
-    Parameters
-    ----------
-    path : of the file; None writes none
-    time : of the samples, on the clock of the motion, s, shape (n,)
-    rate, corrected : of the gyro before and after the self-calibration, rad/s, shape (n,)
-    motion : that was driven
-
-    """
+    """Draw a self-calibration on the clock of its motion: rates, rad/s, and heading errors."""
     figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1))
     above.plot(time, rate / DEGREE, color='0.6', linewidth=0.8, label='gyro')
     above.plot(time, motion.rate_at(time) / DEGREE, color='black', linewidth=1.5,
@@ -127,16 +103,7 @@ def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array
 
 
 def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
-    """
-    Draw a motion profile with the rate limit of the robot.
-
-    Parameters
-    ----------
-    path : of the file; None writes none
-    motion : the profile
-    limit : largest rate of the robot, rad/s
-
-    """
+    """Draw a motion profile with the rate limit of the robot, rad/s."""
     figure, ((above,), (below,)) = _panels(2, 1, (9, 6.5), (1, 1))
     time = np.union1d(np.linspace(0.0, motion.duration, 1000), motion.time)
     above.plot(time, motion.rate_at(time) / DEGREE, color='black')
@@ -152,16 +119,9 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
                names: Mapping[str, str]) -> Any:
     """
-    Draw an Allan chart: deviation with confidence, parts of the noise and their sum.
+    Draw an Allan chart: deviation, parts of the noise and their sum (figure 2 of Hong and Park).
 
-    It is drawn as figure 2 of Hong and Park.
-
-    Parameters
-    ----------
-    path : of the file; None writes none
-    chart : Allan deviations
-    fit : the noise figures in them
-    names : of the parts that are seen, by symbol, such as 'angle random walk N = 2.3 deg/√h'
+    The names of the parts are by symbol, such as 'angle random walk N = 2.3 deg/√h'.
 
     """
     hour = 3600.0 / DEGREE
@@ -174,35 +134,24 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
     axes.loglog(times, fit.deviation(times) * hour, '-', color='black', linewidth=1,
                 label='sum of the parts')
     lowest, highest = 0.4 * float(chart.lower.min()), 2.5 * float(chart.upper.max())
-    for each, style in zip((each for each in fit.figures.values() if each.value), _PART_STYLES):
+    for each, style in zip((each for each in fit.figures.values() if each.value), _STYLES[1:]):
         line = each.value * np.sqrt(each.part.variance(times))
         shown = (line > lowest) & (line < highest)
         axes.loglog(times[shown], line[shown] * hour, linestyle=style, linewidth=1.2,
                     color='0.25', label=names[each.part.symbol])
-        _mark(axes, each.part.symbol, times[shown], line[shown] * hour)
+        symbol, along, up = each.part.symbol, times[shown], line[shown] * hour
+        # IEEE Std 952 reads angle random walk at 1 s; the others are named along their line
+        at = (int(np.argmin(np.abs(along - 1.0))) if symbol == 'N'
+              else len(along) * (1 if symbol in 'BQ' else 2) // 3)
+        # below what rises, above what falls: away from the sum
+        axes.annotate(symbol, (along[at], up[at]), xytext=(10, -14) if symbol in 'KR' else (0, 6),
+                      textcoords='offset points', fontsize=13, weight='bold', ha='center')
     axes.set(xlabel='averaging time [s]', ylabel='Allan deviation [deg/h]',
              ylim=(lowest * hour, highest * hour), title='Allan deviation of the gyro at rest')
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
     return _save(figure, path, 'Slope -1/2: white noise, N at 1 s. Lowest part: bias instability. '
                  'Slope +1/2: the bias walks.')
-
-
-#: Of the parts of the noise; a dot and dashes of other lengths tell them apart without colour.
-_PART_STYLES = ('--', '-.', ':', (0, (8, 2)), (0, (3, 1, 1, 1, 1, 1)))
-
-
-#: Where IEEE Std 952 reads angle random walk, s; the others are named along their line.
-_READ_AT = 1.0
-
-
-def _mark(axes: Any, symbol: str, times: Array, line: Array) -> None:
-    at = (int(np.argmin(np.abs(times - _READ_AT))) if symbol == 'N'
-          else len(times) * (1 if symbol in 'BQ' else 2) // 3)
-    # below what rises, above what falls: away from the sum
-    offset = (10, -14) if symbol in 'KR' else (0, 6)
-    axes.annotate(symbol, (times[at], line[at]), xytext=offset, textcoords='offset points',
-                  fontsize=13, weight='bold', ha='center')
 
 
 # rate tables
@@ -213,14 +162,8 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
     """
     Draw the error that a model removes, over output and temperature (figure 6 of Ojeda et al.).
 
-    Parameters
-    ----------
-    path : of the file; None writes none
-    model : of the gyro
-    rate_range : of the output, rad/s
-    temperature_range : degC; where it is not finite, a single curve is drawn at the model's
-        reference temperature
-    dwells : those that were fitted, drawn as dots
+    Without a finite range of temperatures, a single curve is drawn at the reference temperature.
+    Dwells that were fitted are dots.
 
     """
     output = np.linspace(*rate_range, 161)
@@ -248,9 +191,12 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
 
 def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Array,
                    dwells: Dwells | None) -> None:
+    from matplotlib.ticker import MaxNLocator
     across, up = np.meshgrid(output, temperature)
     error = (across - model.rate(across.ravel(), up.ravel()).reshape(across.shape)) / DEGREE
-    levels = _levels(error)
+    low, high = float(error.min()), float(error.max())
+    levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(
+        low, high if high > low else low + 1e-6)
     largest = float(np.abs(levels).max())
     axes.grid(False)
     axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING, alpha=0.8,
@@ -265,14 +211,6 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
              else 'Error of the model [deg/s]')
 
 
-def _levels(error: Array) -> Array:
-    """Return about ten round levels."""
-    from matplotlib.ticker import MaxNLocator
-    low, high = float(error.min()), float(error.max())
-    return np.asarray(MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(
-        low, high if high > low else low + 1e-6))
-
-
 def _label_places(levels: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
     """Return a place on each contour line, away from its ends and from those of its neighbours."""
     places = []
@@ -284,17 +222,7 @@ def _label_places(levels: Sequence[Sequence[Array]]) -> list[tuple[float, float]
 
 
 def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
-    """
-    Draw the errors of dwells before and after a model, by rate and by temperature.
-
-    They are drawn as figures 5 and 7 of Ojeda et al.
-
-    Parameters
-    ----------
-    path : of the file; None writes none
-    calibration : with the dwells, what the model leaves of their errors, and which are outlying
-
-    """
+    """Draw the errors of dwells before and after a model (figures 5 and 7 of Ojeda et al.)."""
     dwells, kept = calibration.dwells, calibration.scatter.kept
     rate = dwells.rate / DEGREE
     columns = [(rate, 'rate [deg/s]', dwells.temperature, 'temperature [°C]')]
@@ -344,13 +272,8 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float
     """
     Draw the errors of full turns with a static bias only and with the model.
 
-    Each has its own scale (figures 8 and 9 of Ojeda et al.).
-
-    Parameters
-    ----------
-    path : of the file; None writes none
-    errors : of turns
-    slowest : of the turns, rad/s
+    Each has its own scale (figures 8 and 9 of Ojeda et al.); slower turns than `slowest`, rad/s,
+    are left out.
 
     """
     figure, panels = _panels(2, 1, (8.5, 8))

@@ -27,8 +27,6 @@ from tqdm import tqdm
 
 #: Nothing is shown of what takes less, s.
 DELAY = 2.0
-#: The time is shown anew so often, s.
-_INTERVAL = 0.5
 
 
 @contextmanager
@@ -50,7 +48,7 @@ def under_way(words: str) -> Iterator[Callable[[float | None, str], None]]:
             text = f'{state[0]}  {time.monotonic() - begin:.0f} s'
             width = shutil.get_terminal_size().columns - 1
             print(f'\r\033[K{text[:width]}', end='', file=sys.stderr, flush=True)
-            wait = _INTERVAL
+            wait = 0.5
         if wait != DELAY:
             print('\r\033[K', end='', file=sys.stderr, flush=True)
 

@@ -29,9 +29,6 @@ import numpy as np
 
 #: Fewer units or drives do not show what is usual.
 FEWEST = 4
-#: Where there are at least as many, more than one can stand out, but no more than a fifth of them
-#: or the most: Rosner's levels hold from 15 on.
-_MANY, _PART, _MOST = 15, 5, 10
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,8 @@ def outliers(observed: Observed, kind: str, level: float, pooled: Pooled | None 
     groups = np.unique(number[number >= 0])
     if len(groups) < FEWEST or len(observed) < FEWEST + 1:
         return []
-    most = min(len(groups) // _PART, _MOST) if len(groups) >= _MANY else 1
+    # Rosner's levels hold from 15 on
+    most = min(len(groups) // 5, 10) if len(groups) >= 15 else 1
     found: list[Outlier] = []
     without: Observed = observed
     pooled = pooled or Pooled(observed)

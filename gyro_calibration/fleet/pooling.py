@@ -60,13 +60,8 @@ SLOPES = ('slopes_0', 'slopes_1')
 _FEWEST = 3
 #: Points of the sequence over the variances, and of a slice through the likeliest.
 POINTS, _SLICE = 512, 41
-#: Numbers that the equations take at a time.
-_AT_A_TIME = 2_000_000
 #: Largest standard deviation that is possible, in those of the values about their median.
 _LARGEST = 30.0
-#: Twice the gain in log likelihood beyond which a variance of zero is rejected at 2.5 %, one-sided
-#: (Self and Liang 1987: half of the chance is at zero).
-_REJECTED = 3.841
 
 
 @dataclass(frozen=True)
@@ -163,7 +158,7 @@ class _Equations:
         """Return parts of the points that are solved for at a time, so that memory is bounded."""
         size = (self.units * self.columns * (1 + self.of.slopes) + self.columns ** 2
                 + len(self.of))
-        step = max(_AT_A_TIME // size, 1)
+        step = max(2_000_000 // size, 1)
         return [slice(begin, begin + step) for begin in range(0, points, step)]
 
     def solve(self, sizes: Mapping[str, Array]) -> _Solved:
@@ -387,7 +382,9 @@ class Pooled:
             values = np.array([likeliest[name][0], *bounds])
             if name != OWN:
                 without = self._log_likelihood(np.vstack([self._best, self._search(name)]))
-                values = np.sqrt(values) * [1.0, 2.0 * (without[0] - without[1]) > _REJECTED, 1.0]
+                # a variance of zero is rejected at 2.5 %, one-sided, with half of the chance at
+                # zero (Self and Liang 1987)
+                values = np.sqrt(values) * [1.0, 2.0 * (without[0] - without[1]) > 3.841, 1.0]
             size = (1.0 if name == OWN else self._size / self._scales[1 + SLOPES.index(name)]
                     if name in SLOPES else self._size)
             found[name] = Component(*(size * values).tolist())

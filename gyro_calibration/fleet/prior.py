@@ -59,8 +59,10 @@ def _model(found: TypeFound, unit: int | None) -> GyroModel:
     gyro = {'name': found.name, 'serial_number': '' if unit is None else found.units[unit]}
     logs = (len(found.records) if unit is None
             else sum(each['unit'] == found.units[unit] for each in found.records))
+    noise = {name: float(np.median([each['noise'].get(name, 0.0) for each in found.records]))
+             for name in Noise.__dataclass_fields__}
     return GyroModel(
-        tuple(terms), np.diag(variances), noise=_noise(found),
+        tuple(terms), np.diag(variances), noise=Noise(**noise),
         gyro={name: text for name, text in gyro.items() if text},
         origin={'fleet': {'units': len(found.units) if unit is None else 1, 'logs': logs}},
         tolerance=Tolerance(**spread))
@@ -70,10 +72,3 @@ def _known(of: Interval, place: int) -> tuple[float, float]:
     """Return the middle of an interval, and the deviation of as wide a normal distribution."""
     return (0.5 * float(of.high[place] + of.low[place]),
             0.5 * float(of.high[place] - of.low[place]) / _BAND)
-
-
-def _noise(found: TypeFound) -> Noise:
-    """Return the median of each noise figure over the logs."""
-    names = Noise.__dataclass_fields__
-    return Noise(**{name: float(np.median([each['noise'].get(name, 0.0)
-                                           for each in found.records])) for name in names})

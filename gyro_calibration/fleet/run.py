@@ -39,7 +39,7 @@ from typing import Any, TypeVar
 
 Task = TypeVar('Task')
 Found = TypeVar('Found')
-Work = Callable[[Task], Found]
+_Work = Callable[[Task], Found]
 #: Tasks handed out for each worker.
 _AHEAD = 2
 
@@ -108,7 +108,7 @@ def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
 
 
-def finished(work: Work[Task, Found], tasks: Iterable[Task], workers: int,
+def finished(work: _Work[Task, Found], tasks: Iterable[Task], workers: int,
              create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | Lost]]:
     """
     Give each task with its result as it is finished, or with `Lost` where its worker was killed.
@@ -150,7 +150,7 @@ def finished(work: Work[Task, Found], tasks: Iterable[Task], workers: int,
             executor = create(workers)
 
 
-def _one_by_one(work: Work[Task, Found], tasks: Iterable[Task],
+def _one_by_one(work: _Work[Task, Found], tasks: Iterable[Task],
                 create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | Lost]]:
     executor = create(1)
     for task in tasks:

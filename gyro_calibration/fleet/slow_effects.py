@@ -29,8 +29,6 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, Log
 import numpy as np
 
-#: Time constants of a warm-up that are tried, s: the same for all logs, as they are pooled.
-WARM_UPS = (60.0, 300.0)
 #: Spans a log, and the shortest, s.
 _SPANS, _SHORTEST = 60, 2.0
 #: A log that lasts for less, s, shows nothing slow.
@@ -124,7 +122,7 @@ def _effects(log: Log, at: Array) -> dict[str, tuple[str, Array]]:
     since = at - log.time[0]
     middle = 0.5 * since[-1]
     found = {'rate_ramp': ('rad/s²', np.diff(0.5 * (since - middle) ** 2))}
-    for constant in WARM_UPS:
+    for constant in (60.0, 300.0):  # s; the same for all logs, as they are pooled
         found[f'warm_up_{constant:.0f}s'] = (
             'rad/s', np.diff(-constant * np.exp(-since / constant)))
     if log.temperature is not None and np.isfinite(log.temperature).all():

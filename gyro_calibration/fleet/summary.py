@@ -41,10 +41,6 @@ from scipy.stats import binom
 
 #: Chance that a fleet in which nothing stands out, changes or is missing gives any alarm.
 FALSE_ALARMS = 0.01
-#: Kinds of alarms of a value: a unit, a drive, a change, and an effect of the type; and of the
-#: effects of diagnoses: the type's, a unit's and a drive's.
-_KINDS, _COUNTED = 4, 3
-_YEAR = 365.25
 Record = Mapping[str, Any]
 
 
@@ -133,7 +129,9 @@ def summarized(records: Sequence[Record], false_alarms: float = FALSE_ALARMS) ->
     types = sorted({str(each['type']) for each in records})
     named = {kind: [[each for each in records if each['type'] == kind]] for kind in types}
     values = {kind: _names(logs[0]) for kind, logs in named.items()}
-    tests = _KINDS * sum(map(len, values.values())) + _COUNTED * len(types)
+    # of a value a unit, a drive, a change, and an effect of the type; and of the effects of
+    # diagnoses the type's, a unit's and a drive's
+    tests = 4 * sum(map(len, values.values())) + 3 * len(types)
     return [_of_type(kind, named[kind][0], values[kind], false_alarms / tests) for kind in types]
 
 
@@ -216,7 +214,7 @@ def _ages(records: Sequence[Record]) -> Array | None:
     """Return the dates of logs in years; None where one has none."""
     if not all(each['date'] for each in records):
         return None
-    return np.array([date.fromisoformat(each['date']).toordinal() / _YEAR for each in records])
+    return np.array([date.fromisoformat(each['date']).toordinal() / 365.25 for each in records])
 
 
 def _temperatures(records: Sequence[Record]) -> Array | None:

@@ -62,8 +62,6 @@ _QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
     'moving': ('moving', {'1': 1.0}),
 }
-#: Unit -> what is added after its factor, in SI.
-_OFFSETS = {'K': -273.15, 'degF': -160.0 / 9.0}
 #: Name of a quantity in options -> names that other programs give its column, without case, marks
 #: and the unit.
 _USUAL = {
@@ -145,7 +143,8 @@ def _column(header: Sequence[str], name: str, text: str, units: Mapping[str, flo
     if column not in header:
         raise InputError(f'{name}={text}: there is no column {column} among '
                          f'{_short(",".join(header))}{_nearest(column, header)}')
-    return Column(header.index(column), units[unit], _OFFSETS.get(unit, 0.0))
+    offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
+    return Column(header.index(column), units[unit], offset)
 
 
 def _without_axis(name: str, axis: str) -> str:

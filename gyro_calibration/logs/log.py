@@ -67,17 +67,12 @@ CACHED = 1 << 14
 ROWS = 1 << 16
 #: No gyro gives samples closer than this, s.
 SHORTEST = 1e-9
-#: A heading is wrapped if it changes by full turns, to this part of one, and faster than any
-#: vehicle turns, rad/s.
-_FULL, _FASTEST = 0.1, 35.0
 #: Characters of a line, of what is before the rows, and of a block of lines, or of one row that
 #: goes over several.
 _LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
-#: Numbers of a log that is held whole, 4 GB; a text takes as much as so many numbers.
-_WHOLE, _TEXT = 1 << 29, 10
+#: Numbers of a log that is held whole, 4 GB; a text takes as much as ten.
+_WHOLE = 1 << 29
 
-#: Of a temperature, degC; a value of any other quantity is at most `LARGEST`, in its unit.
-_HOTTEST = 1e5
 _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
 #: Quantities of which an empty cell is a lost value, as motion capture writes lost markers.
 _REFERENCES = ('reference_rate', 'reference_heading')
@@ -85,7 +80,7 @@ _REFERENCES = ('reference_rate', 'reference_heading')
 
 #: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns
 #: that are not ours as text.
-Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
+_Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
 
 class LogError(InputError):
@@ -180,7 +175,7 @@ def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
     numbers = 0
     for block in blocks:
         numbers += len(block) * (sum(getattr(block, quantity) is not None
-                                     for quantity in QUANTITIES) + _TEXT * len(block.others))
+                                     for quantity in QUANTITIES) + 10 * len(block.others))
         if numbers > _WHOLE:
             raise LogError(f'{path}: has more than {_WHOLE} numbers, which is above the limit of '
                            'memory; split it')
@@ -341,7 +336,7 @@ def _distinct(header: list[str]) -> list[str]:
     return names
 
 
-def _quickly(lines: list[str], first_line: int, table: _Table) -> Parsed | None:
+def _quickly(lines: list[str], first_line: int, table: _Table) -> _Parsed | None:
     """Parse rows of numbers by numpy; None where they hold anything else."""
     if table.others:
         return None
@@ -364,7 +359,7 @@ def _quickly(lines: list[str], first_line: int, table: _Table) -> Parsed | None:
 
 
 def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int,
-               table: _Table) -> Parsed:
+               table: _Table) -> _Parsed:
     """
     Parse rows one by one, with the texts of columns that are not ours, and name what is wrong.
 
@@ -420,7 +415,7 @@ def _wrong(values: Array, quantity: str) -> Mask:
 
 
 def _most(quantity: str) -> float:
-    return _HOTTEST if quantity == 'temperature' else LARGEST
+    return 1e5 if quantity == 'temperature' else LARGEST  # degC, or the unit of the quantity
 
 
 def shown(text: str) -> str:
@@ -533,8 +528,9 @@ def refuse_wrapped(log: Log) -> None:
         return
     known = np.isfinite(log.reference_heading)
     time, change = log.time[known], np.diff(log.reference_heading[known])
-    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL
-    jumps = np.flatnonzero(turns & (np.abs(change) > _FASTEST * np.diff(time)))
+    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < 0.1
+    # no vehicle turns faster than 35 rad/s
+    jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time)))
     if len(jumps):
         raise DataRefused(
             f'the reference heading jumps by a full turn from one sample to the next, the first '

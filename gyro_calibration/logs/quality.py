@@ -19,9 +19,6 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 import numpy as np
 from scipy.special import ndtri
 
-#: A gyro that gives one value in more than this part of its samples is dead, even if its last bit
-#: toggles.
-_DEAD = 0.9
 #: Least length of the mean phase of codes on a lattice: 1 for exact codes, 0 for any values.
 _ALIGNED = 0.7
 
@@ -197,7 +194,7 @@ def refuse_dead(output: Array) -> None:
     if len(values) == 1:
         raise DataRefused(f'all {len(output)} samples have the same value, {value:g} rad/s: '
                           'the gyro is dead or not powered')
-    if share > _DEAD:
+    if share > 0.9:  # even if its last bit toggles
         raise DataRefused(f'{100 * share:.1f} % of the samples have the same value, {value:g} '
                           'rad/s: the gyro is dead, not powered, or did not move')
 

@@ -45,11 +45,11 @@ from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_me
 import numpy as np
 from numpy.typing import NDArray
 
-Nanoseconds = NDArray[np.int64]
+_Nanoseconds = NDArray[np.int64]
 
 REFERENCES = (ODOMETRY, IMU, POSE, TWIST)
 #: Role of a topic -> the option that names it, and the kinds of messages that it may have.
-ROLES = {
+_ROLES = {
     'gyro': ('--topic', (IMU,)),
     'temperature': ('--temperature-topic', (TEMPERATURE,)),
     'reference': ('--reference-topic', REFERENCES),
@@ -58,10 +58,6 @@ ROLES = {
 #: s; a stamp so much before an earlier one shows that a clock was set; a smaller step shows that
 #: messages overtook each other.
 _LARGEST_STEP_BACK = 1.0
-#: Share of samples that may have the stamp of another one and be left out.
-_DOUBLED = 0.01
-#: A reference is lost between values further apart than so many of its intervals and so many s.
-_LOST_INTERVALS, _LOST_TIME = 5.0, 0.1
 #: Topics that a sentence names at most.
 _MOST_LISTED = 20
 #: s without a temperature, beyond which a note says so; gyros take minutes to warm up.
@@ -89,7 +85,7 @@ class Topics:
 
 def wrong_kind(role: str, topic: str, kind: str) -> str:
     """Return what is wrong with the kind of a topic for its role; empty where nothing is."""
-    option, kinds = ROLES[role]
+    option, kinds = _ROLES[role]
     return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_listed(kinds, "or")}'
 
 
@@ -138,8 +134,8 @@ class _Course:
 
     topic: str
     kind: str
-    stamps: Nanoseconds
-    received: Nanoseconds
+    stamps: _Nanoseconds
+    received: _Nanoseconds
     numbers: Array
     quantities: tuple[str, ...]
 
@@ -297,7 +293,7 @@ class _Reader:
                       if _same(topic, wanted)), None)
         if topic is None:
             raise LogError(f'{self._path}: no topic {wanted}{self._what_there_is()}; '
-                           f'name one of them by {ROLES[role][0]}')
+                           f'name one of them by {_ROLES[role][0]}')
         kind = self._contents.topics[topic]
         definition = self._contents.definitions.get(kind)
         found = layout_of(definition).quantities if definition else {}
@@ -356,7 +352,7 @@ class _Reader:
         rate = gyro.values('rate')
         same[1:] &= rate[1:] == rate[:-1]
         other = int(np.count_nonzero(doubled & ~same))
-        if other > 1 + _DOUBLED * len(gyro):
+        if other > 1 + 0.01 * len(gyro):
             raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
                            'the stamp of another sample, so their times are unknown; '
                            'give the sample rate with --rate')
@@ -415,8 +411,10 @@ class _Reader:
             raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; '
                            'name another by --reference-topic')
         course = _rising(course)
-        at, wrapped, rate = ((course.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _headings(course),
-                             _rates(course))
+        at, wrapped = (course.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _headings(course)
+        rate = course.values('rate') if course.reports('rate') else None
+        if rate is not None:
+            rate = np.where(np.isfinite(rate), rate, np.nan)
         heading = None if wrapped is None else self._continuous(at, wrapped, time, output)
         if (rate is not None and heading is not None and not rate.any()
                 and np.nanmax(heading) - np.nanmin(heading) > 0.1):
@@ -464,19 +462,17 @@ def _headings(course: _Course) -> Array | None:
     return heading
 
 
-def _rates(course: _Course) -> Array | None:
-    if not course.reports('rate'):
-        return None
-    rate = course.values('rate')
-    return np.where(np.isfinite(rate), rate, np.nan)
-
-
 def interpolated(time: Array, at: Array, values: Array) -> Array:
-    """Return values interpolated at other times; nan where two values are too far apart."""
+    """
+    Return values interpolated at other times; nan where two values are too far apart.
+
+    That is more than 5 of their intervals, and more than 0.1 s.
+
+    """
     at, values = at[np.isfinite(values)], values[np.isfinite(values)]
     if len(at) < 2:
         return np.full(len(time), np.nan)
-    longest = max(_LOST_INTERVALS * float(np.median(np.diff(at))), _LOST_TIME)
+    longest = max(5.0 * float(np.median(np.diff(at))), 0.1)
     place = np.clip(np.searchsorted(at, time, 'right') - 1, 0, len(at) - 2)
     inside = (time >= at[0]) & (time <= at[-1])
     close = (at[place + 1] - at[place] <= longest) | (time == at[place]) | (time == at[place + 1])

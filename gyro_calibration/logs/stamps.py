@@ -31,19 +31,6 @@ Integers = NDArray[np.integer]
 #: on, stamps are taken to come in bursts.
 _WAITING, _BURSTS = 0.5, 0.02
 
-#: Share of intervals that are alike from which on stamps are not taken to come in bursts.
-_STEADY = 0.9
-
-#: Share of steps that are whole multiples of the middle one, to this part of it, from which on
-#: samples are lost where steps are longer.
-_WHOLE, _EXACT = 0.9, 0.3
-
-#: Samples over which delayed stamps catch up again: single late ones, and bursts of packets.
-_CATCH_UP, _CATCH_UP_BURSTS = 10, 300
-
-#: Lost samples that can be distinguished from the wander of delayed stamps.
-_SURELY_LOST = 10
-
 #: A gap of more than 1 / LONG of the record is crossed by no window; a longer window is too long
 #: to show a motion.
 LONG = 50
@@ -112,7 +99,10 @@ def number_stamps(time: Array) -> Stamps:
     usual = _usual_interval(time, steps)
     bursts = float((steps < _WAITING * usual).mean()) > _BURSTS
     lost = _lost_samples(time, steps, usual, bursts)
-    interval, wander = _line(time, _numbers(lost))
+    number = _numbers(lost)
+    interval = float(np.polyfit(number, time - time[0], 1)[0])
+    off = time - time[0] - interval * number
+    wander = float(np.abs(off - np.median(off)).max())
     uneven = not bursts and float(
         (np.abs(steps / usual - np.round(steps / usual)) > 0.4).mean()) > 0.2
     if uneven or wander > 0.05 * len(time) * interval:
@@ -153,14 +143,15 @@ def _usual_interval(time: Array, steps: Array) -> float:
     interval = float(np.median(time[lag:] - time[:-lag])) / lag
     usual = float(np.median(steps))
     alike = 0.8 < interval / usual < 1.25
-    if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > _STEADY:
+    if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > 0.9:
         raise DataRefused(
             f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
             f'{100 * interval:.4g} s: either most samples are lost, or they come in long bursts; '
             'give the sample rate with --rate, or record again')
-    whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < _EXACT
+    whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
+    # samples are lost where nine of ten steps are whole multiples of the middle one
     return (float(steps[whole & (steps < 1.5 * usual)].mean())
-            if alike and float(whole.mean()) > _WHOLE else interval)
+            if alike and float(whole.mean()) > 0.9 else interval)
 
 
 def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> Integers:
@@ -173,7 +164,8 @@ def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> I
     """
     lost: Integers = np.zeros(len(steps), dtype=np.int64)
     shift, done = 0, 0
-    span, least = (_CATCH_UP_BURSTS, _SURELY_LOST) if bursts else (_CATCH_UP, 1)
+    # samples over which delayed stamps catch up, and how many lost ones their wander cannot be
+    span, least = (300, 10) if bursts else (10, 1)
     late = (time - time[0]) / interval - np.arange(len(time))
     due = np.append(np.flatnonzero(steps >= _WAITING * interval), len(steps))
     for step in np.nonzero(steps > (least + 0.5) * interval)[0].tolist():
@@ -191,10 +183,3 @@ def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> I
 def _numbers(lost: Integers) -> Integers:
     """Return the number of each sample, if so many are lost before each but the first."""
     return np.arange(len(lost) + 1) + np.cumsum(np.concatenate([[0], lost]))
-
-
-def _line(time: Array, number: Integers) -> tuple[float, float]:
-    """Return the slope of a straight line through the stamps, and their largest residual, s."""
-    slope = float(np.polyfit(number, time - time[0], 1)[0])
-    off = time - time[0] - slope * number
-    return slope, float(np.abs(off - np.median(off)).max())

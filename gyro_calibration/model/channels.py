@@ -32,9 +32,6 @@ from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.effects.lag import lag_ahead
 import numpy as np
 
-#: Vibration is what deviates from the mean over so many seconds.
-VIBRATION_TIME = 1.0
-
 #: What the next sample needs to know, by (channel, time constant) of a lag and ('heating', filter
 #: time, threshold) of a branch.
 Known = dict[tuple[Any, ...], float]
@@ -111,7 +108,7 @@ class _Piece:
     def signal(self, channel: str) -> Number:
         """Return a channel."""
         if channel == 'vibration' and channel not in self._known:
-            ahead = self.ahead('specific_force', VIBRATION_TIME)
+            ahead = self.ahead('specific_force', 1.0)  # s: off its mean over that time
             self._known[channel] = ahead * ahead
         return self._known.get(channel, 0.0)
 

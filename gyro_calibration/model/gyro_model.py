@@ -25,14 +25,8 @@ from gyro_calibration.model.effects import Channels, Effect
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: Largest plausible output, rad/s, where no valid range of rates is stated. Where one is: so many
-#: times its farther end, but at least what robots reach, for a model may have been fitted at rest.
-_FASTEST, _MARGIN, _REACHED = 100.0, 2.0, 10.0
 #: Plausible temperatures, degC, where no valid range is stated.
 _TEMPERATURES = (-100.0, 200.0)
-#: A correction is extrapolated over the width of the valid temperatures, K, and at least over so
-#: much, which is what a robot warms up by after a cold start; from there on it is held.
-_EXTRAPOLATED = 20.0
 #: The response is inverted where the output grows by at least so much with the rate, 1.
 _FLATTEST = 0.1
 #: Numbers of Python overflow without a word, and to say so for each sample would take time.
@@ -217,9 +211,15 @@ class GyroModel:
 
     @cached_property
     def rate_limit(self) -> float:
-        """Return the largest plausible output, rad/s; this gyro reports no sample beyond it."""
+        """
+        Return the largest plausible output, rad/s; this gyro reports no sample beyond it.
+
+        It is twice the farther end of the valid range of rates, but at least what robots reach,
+        for a model may have been fitted at rest.
+
+        """
         farther = max(map(abs, self.rate_range))
-        return max(_MARGIN * farther, _REACHED) if farther < math.inf else _FASTEST
+        return max(2.0 * farther, 10.0) if farther < math.inf else 100.0
 
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
@@ -238,7 +238,8 @@ class GyroModel:
     def used_temperatures(self) -> tuple[float, float]:
         """Return the temperatures, degC, up to which the correction is extrapolated."""
         (low, high), (coldest, hottest) = self.valid_temperatures, self.temperature_limits
-        reach = max(high - low, _EXTRAPOLATED)
+        # the width of the valid ones, but at least what a robot warms up by after a cold start
+        reach = max(high - low, 20.0)
         return max(low - reach, coldest), min(high + reach, hottest)
 
     @cached_property
@@ -396,19 +397,19 @@ class GyroModel:
         return time
 
     @cached_property
-    def _terms_by_output(self) -> Split:
+    def _terms_by_output(self) -> _Split:
         return _split(self.terms, 'output')
 
     @cached_property
-    def _terms_by_rate(self) -> Split:
+    def _terms_by_rate(self) -> _Split:
         return _split([term for term in self.terms if not term.effect.undone], 'rate')
 
 
 #: Effects that do not look at what is sought, which need no repetition to solve for it; others.
-Split = tuple[list[Term], list[Term]]
+_Split = tuple[list[Term], list[Term]]
 
 
-def _split(terms: Sequence[Term], channel: str) -> Split:
+def _split(terms: Sequence[Term], channel: str) -> _Split:
     known = [term for term in terms if channel not in term.effect.looks_at]
     return known, [term for term in terms if channel in term.effect.looks_at]
 

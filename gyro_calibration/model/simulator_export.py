@@ -31,9 +31,6 @@ from gyro_calibration.model.noise import GaussMarkov, Noise
 import numpy as np
 from scipy.optimize import minimize
 
-#: Below this step, rad/s, Gazebo does not quantize.
-_FINEST_STEP = 1e-6
-
 
 def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:
     """
@@ -142,7 +139,7 @@ def _sdf(held: Figures) -> tuple[str, set[str]]:
     is the mean of the noise. `dynamic_bias_stddev` is the density of a Gauss-Markov process.
 
     """
-    quantized = held.quantization >= _FINEST_STEP
+    quantized = held.quantization >= 1e-6  # rad/s; Gazebo makes no smaller steps
     values = {'mean': held.bias, 'stddev': held.white_noise, 'bias_mean': 0.0,
               'bias_stddev': held.bias_deviation}
     if held.wander.density:

@@ -24,8 +24,6 @@ import math
 from gyro_calibration.logs.log import Array, Number
 import numpy as np
 
-_SMALLEST = 1e-300  # intervals of no length leave the formulas a number
-
 
 def lag_ahead(interval: Number, change: Number, time_constant: float,
               ahead: float = 0.0) -> Number:
@@ -43,7 +41,8 @@ def lag_ahead(interval: Number, change: Number, time_constant: float,
     if not isinstance(interval, np.ndarray):
         x = interval / time_constant
         return math.exp(-x) * ahead + change * (math.expm1(-x) / x if x else -1.0)
-    x = np.maximum(interval / time_constant, _SMALLEST)
+    # intervals of no length leave the formulas a number
+    x = np.maximum(interval / time_constant, 1e-300)
     fallen = np.expm1(-x)
     return _recurrence(fallen + 1.0, change * (fallen / x), ahead)
 
