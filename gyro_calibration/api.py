@@ -22,9 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
 from html import escape
-import json
 from pathlib import Path
 from typing import Any
 
@@ -34,27 +32,17 @@ from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalib
 from gyro_calibration.calibration.likelihood import Fit as RunFit
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.selection import select_effects, Selection
-from gyro_calibration.calibration.self_calibration import (
-    record,
-    Reference,
-    usual_reference,
-)
-from gyro_calibration.calibration.self_calibration import (
-    self_calibrate as calibrate_run,
-)
+from gyro_calibration.calibration.self_calibration import Reference, usual_reference
 from gyro_calibration.cli import allan as allan_answer
-from gyro_calibration.cli import fit_answer, plots
+from gyro_calibration.cli import plots
 from gyro_calibration.cli.compensate import followed, Piece, pieces
-from gyro_calibration.cli.fit import headings
-from gyro_calibration.diagnosis.extended_model import calibrated
+from gyro_calibration.cli.diagnose import diagnosed, write_diagnosis
+from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
+from gyro_calibration.cli.self_calibrate import calibrated_run, CalibratedRun, recorded
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.pipeline import diagnose as diagnose_logs
-from gyro_calibration.diagnosis.rate_table import diagnose_table
-from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.words import lines, offered
-from gyro_calibration.files import InputError, write_atomically
+from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
-from gyro_calibration.heading.log_compensation import compensate_log, plausible
 from gyro_calibration.logs import log as logs
 from gyro_calibration.logs.log import Array, DEGREE, Log, log_from_table, unwrapped, write_log
 from gyro_calibration.logs.recording import read_recording, Topics
@@ -62,14 +50,8 @@ from gyro_calibration.logs.ros_bag import is_recording
 from gyro_calibration.model import model_file
 from gyro_calibration.model.effects import STEADY
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
-from gyro_calibration.model.model_file import model_of, model_text, write_model
-from gyro_calibration.model.motion import (
-    from_headings,
-    from_rates,
-    Motion,
-    NAMED,
-    read_motion,
-)
+from gyro_calibration.model.model_file import model_of, write_model
+from gyro_calibration.model.motion import from_rates, Motion, motion_by_name, motion_of
 from gyro_calibration.model.simulation import simulate as simulate_motion
 import numpy as np
 
@@ -265,7 +247,7 @@ class Run(_Answer):
     scale_factor_error_std: float
     bias_std: float
     fit: RunFit = field(repr=False)
-    _shown: tuple[Array, Array, Motion] = field(repr=False)
+    _run: CalibratedRun = field(repr=False)
 
     def __str__(self) -> str:
         text = str(self.model.self_calibration)
@@ -273,9 +255,7 @@ class Run(_Answer):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the run and of its heading error before and after."""
-        time, rate, motion = self._shown
-        return plots.draw_run(path, time, rate, (rate - self.bias)
-                              / (1.0 + self.scale_factor_error), motion)
+        return self._run.draw(path)
 
 
 def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel | None = None, *,
@@ -297,19 +277,14 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
     """
     model = model or GyroModel()
     time, _ = _in_time(log)
-    driven, begin = _motion(log if motion is None else motion)
-    time = time - (begin if motion is None else time[0])
-    run = plausible(model, log) & (time >= -1.0) & (time <= driven.duration + 1.0)
-    rate = compensate_log(with_self_calibration(model, None), log)[run]
-    reference = Reference() if motion is None else usual_reference(driven)
-    found = calibrate_run(time[run], rate, driven, method, noise=model.noise, reference=reference,
-                          output=np.asarray(log.output)[run])
-    temperature = None if log.temperature is None else float(log.temperature[run].mean())
-    now = datetime.now(timezone.utc).isoformat(timespec='seconds')
-    calibration = record(found, method, now, temperature)
-    late = found.time_offset if np.isfinite(found.time_offset) else 0.0
-    return Run(with_self_calibration(model, calibration), found.scale_factor_error, found.bias,
-               *calibration.standard_deviations, found, (time[run] - late, rate, driven))
+    if motion is None:
+        run = calibrated_run(log, model, *_motion(log), method, Reference())
+    else:
+        driven, _ = _motion(motion)
+        run = calibrated_run(log, model, driven, time[0], method, usual_reference(driven))
+    calibration = recorded(run.fit, method, log, run.used)
+    return Run(with_self_calibration(model, calibration), run.fit.scale_factor_error,
+               run.fit.bias, *calibration.standard_deviations, run.fit, run)
 
 
 @dataclass(frozen=True)
@@ -331,21 +306,17 @@ class Fitted(_Answer):
     _log: Log | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
-        lines = list(fit_answer.value_lines(self.model))
         if self.selection is not None:
-            found = self.selection.calibration
-            lines = [*fit_answer.dwell_lines(found), '', *lines, '',
-                     *fit_answer.quality_lines(found), *fit_answer.choice_lines(self.selection)]
-        if self.encoder is not None:
-            lines += ['', *fit_answer.heading_lines(self.encoder)]
-        return '\n'.join(lines)
+            return '\n'.join(dwell_lines(self.model, self.selection))
+        assert self.encoder is not None
+        return '\n'.join(heading_lines(self.model, self.encoder, self.encoder.remarks))
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the errors before and after the fit."""
         if self.selection is not None:
             return plots.draw_residuals(path, self.selection.calibration)
         assert self._log is not None and self.encoder is not None
-        return plots.draw_reference(path, *headings(self._log, self.encoder))
+        return draw_headings(path, self._log, self.encoder)
 
 
 def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,
@@ -456,10 +427,7 @@ class Diagnosed(_Answer):
 
     def write(self, folder: str | Path) -> None:
         """Write diagnosis.json, report.html and model.yaml into a folder."""
-        answer = json.dumps(self.found.figures(), indent=2, allow_nan=False) + '\n'
-        for name, text in (('diagnosis.json', answer), ('report.html', report(self.found)),
-                           ('model.yaml', model_text(self.model))):
-            write_atomically(Path(folder) / name, text.encode())
+        write_diagnosis(folder, self.found)
 
 
 def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
@@ -480,11 +448,8 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
     ValueError : the logs allow no diagnosis
 
     """
-    if len(logs) == 1 and logs[0].time is None:
-        found = diagnose_table(logs[0], None if model is None else calibrated(model))
-    else:
-        found = diagnose_logs(logs, np.random.default_rng(seed), model, kind=kind)
-    return Diagnosed(model if model is not None and not offered(found) else found.model, found)
+    found = diagnosed(logs, model, seed, kind)
+    return Diagnosed(found.model, found)
 
 
 def _in_time(log: Log) -> tuple[Array, Array]:
@@ -501,11 +466,4 @@ def _motion(motion: MotionLike) -> tuple[Motion, float]:
     if isinstance(motion, tuple):
         time, rate = (np.asarray(values, float) for values in motion)
         return from_rates(time, rate), 0.0
-    if not isinstance(motion, Log):
-        return NAMED.get(str(motion)) or read_motion(motion), 0.0
-    for values, made in ((motion.reference_heading, from_headings),
-                         (motion.reference_rate, from_rates)):
-        if values is not None and motion.time is not None:
-            known = np.isfinite(values)
-            return made(motion.time[known], values[known]), float(motion.time[known][0])
-    raise InputError('the log has no reference over time; give the motion')
+    return motion_of(motion) if isinstance(motion, Log) else (motion_by_name(motion), 0.0)

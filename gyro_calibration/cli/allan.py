@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-import math
 from typing import Any
 
 from gyro_calibration.allan import (
@@ -38,7 +37,6 @@ from gyro_calibration.cli.verb import (
     UsageError,
     verb,
     with_origin,
-    written,
 )
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
@@ -83,9 +81,8 @@ def _allan(given: argparse.Namespace) -> Answer:
                                        noise_bounds=fit.noise_bounds))
     of_model = ['The bias instability of the model is that of the fit of all parts, '
                 'since the model adds N and K to it.'] if given.out else []
-    return Answer('\n'.join([*lines(record, chart, fit), *of_model,
-                             *written(given.picture, given.out)]),
-                  _data(given, record, chart, fit))
+    return Answer([*lines(record, chart, fit), *of_model], _data(given, record, chart, fit),
+                  (given.picture, given.out))
 
 
 def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
@@ -157,8 +154,7 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart,
     figures = {figure.part.name: {
         'symbol': symbol, 'unit': figure.part.unit, 'value': figure.value, 'lower': figure.lower,
         'upper': figure.upper, 'seen': bool(figure.value),
-        'standard_deviation': None if math.isnan(figure.standard_deviation)
-        else figure.standard_deviation} for symbol, figure in fit.figures.items()}
+        'standard_deviation': figure.standard_deviation} for symbol, figure in fit.figures.items()}
     columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower,
                'upper': chart.upper, 'degrees_of_freedom': chart.degrees_of_freedom,
                'differences': chart.differences, 'fit': fit.deviation(chart.time)}

@@ -140,7 +140,10 @@ class Piece:
 
     def rows(self) -> dict[str, Array]:
         """Return the new columns of all rows; nan where the row is not plausible."""
-        return {name: _at(self.known, values) for name, values in self.columns.items()}
+        found = {name: np.full(len(self.known), np.nan) for name in self.columns}
+        for name, values in self.columns.items():
+            found[name][self.known] = values
+        return found
 
 
 def _compensated(given: argparse.Namespace, model: GyroModel,
@@ -165,27 +168,26 @@ def _chosen(given: argparse.Namespace, model: GyroModel) -> Iterator[Piece]:
                   model, threshold, given.log)
 
 
-def _refuse_infinite(file: str, piece: Piece) -> None:
+def _checked(pieces: Iterator[Piece], model: GyroModel, file: str) -> Iterator[Piece]:
     """Refuse a sample for which the model gives no finite rate or heading."""
-    for name, values in piece.columns.items():
-        # a standard deviation may be unknown, nan
-        finite = ~np.isinf(values) if '_std_' in name else np.isfinite(values)
-        if not finite.all():
-            row = int(np.argmin(finite))
-            output = float(np.asarray(piece.log.output)[piece.known][row])
-            at = '' if piece.log.time is None else f' at {piece.log.time[piece.known][row]:g} s'
-            raise DataRefused(
-                f'{file}: {name} is not finite for an output of {output:g} rad/s{at}; '
-                'remove the sample, or check columns, units and the model')
+    for piece in _on_stamps(pieces) if model.moves_stamps else pieces:
+        for name, values in piece.columns.items():
+            # a standard deviation may be unknown, nan
+            finite = ~np.isinf(values) if '_std_' in name else np.isfinite(values)
+            if not finite.all():
+                row, log = int(np.argmin(finite)), piece.log
+                output = float(np.asarray(log.output)[piece.known][row])
+                at = '' if log.time is None else f' at {log.time[piece.known][row]:g} s'
+                raise DataRefused(
+                    f'{file}: {name} is not finite for an output of {output:g} rad/s{at}; '
+                    'remove the sample, or check columns, units and the model')
+        yield piece
 
 
 def pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold,
            name: str) -> Iterator[Piece]:
     """Give the blocks of a log, each with its rates and, where it has a time, its heading."""
-    found = _pieces(logs, model, threshold)
-    for piece in _on_stamps(found) if model.moves_stamps else found:
-        _refuse_infinite(name, piece)
-        yield piece
+    yield from _checked(_pieces(logs, model, threshold), model, name)
 
 
 def _pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold) -> Iterator[Piece]:
@@ -196,25 +198,18 @@ def _pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold) -> Iter
         known = plausible(model, log)
         if variance is None:
             # The noise of a rate depends on the interval between samples. All rates have the
-            # interval of the first block, since a lost sample makes no gyro less noisy.
-            variance = (0.0 if log.time is None
-                        else model.noise.rate_variance(_interval(log.time, known)))
+            # interval of the first block, since a lost sample makes no gyro less noisy. Rows
+            # without output may stand between samples.
+            variance = 0.0 if log.time is None else model.noise.rate_variance(float(np.median(
+                np.diff(log.time[known] if known.sum() > 1 else log.time))))
         yield Piece(
             log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)),
             integrator.intervals)
 
 
-def _interval(time: Array, known: Mask) -> float:
-    """Return the time between samples, s; rows without output may stand between them."""
-    return float(np.median(np.diff(time[known] if known.sum() > 1 else time)))
-
-
 def followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Iterator[Piece]:
     """Give the whole log as one piece, followed as the node follows its samples."""
-    piece = _followed(log, model, hindsight, name)
-    for each in _on_stamps(iter([piece])) if model.moves_stamps else [piece]:
-        _refuse_infinite(name, each)
-        yield each
+    yield from _checked(iter([_followed(log, model, hindsight, name)]), model, name)
 
 
 def _followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Piece:
@@ -243,10 +238,6 @@ def _followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Piece:
         'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals)
 
 
-#: Stamps beyond this are s since 1970.
-_DATED = 1e9
-
-
 def _begun(model: GyroModel, log: Log, keep: bool) -> tuple[HeadingEstimator, float]:
     """
     Return what follows the log, and the date of time 0, s since 1970.
@@ -255,8 +246,9 @@ def _begun(model: GyroModel, log: Log, keep: bool) -> tuple[HeadingEstimator, fl
 
     """
     assert log.time is not None
-    dated, calibration = log.time[0] > _DATED, model.self_calibration
-    begun = 0.0 if dated else _DATED
+    # stamps beyond 1e9 are s since 1970
+    dated, calibration = log.time[0] > 1e9, model.self_calibration
+    begun = 0.0 if dated else 1e9
     now = begun + float(log.time[0])
     if not dated and calibration is not None and calibration.temperature is None:
         known = (np.zeros(0) if log.temperature is None
@@ -317,13 +309,6 @@ def _brought(piece: Piece, around: list[dict[str, Array]]) -> Piece:
     return replace(piece, columns=columns)
 
 
-def _at(known: Mask, values: Array) -> Array:
-    """Return the values at the rows where the output is known, and nan at the others."""
-    whole = np.full(len(known), np.nan)
-    whole[known] = values
-    return whole
-
-
 def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answer:
     data: dict[str, Any] = {'out': given.out, **asdict(found)}
     heading, deviation, *_ = (data.pop(name) for name in (
@@ -362,4 +347,4 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
              'extrapolated, or held where the model has no rate for the output.')):
         if data[name]:
             lines.append(f'{data[name]} {words}')
-    return Answer('\n'.join(lines), data)
+    return Answer(lines, data)

@@ -31,10 +31,10 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any
 
 from geometry_msgs.msg import Twist
 from gyro_calibration.cli.plots import draw_headings
+from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find, Sample
 from gyro_calibration.files import write_atomically
@@ -60,14 +60,6 @@ ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
 ATTEMPTS = 3  # to calibrate
 DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20),
                (4, 0), (1, 0)])
-
-
-@dataclass(frozen=True)
-class Demonstration:
-    """What the demonstration found, in words and as data."""
-
-    text: str
-    data: dict[str, Any]
 
 
 class Refused(OSError):
@@ -141,11 +133,8 @@ class Client:
         self.raw: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
         self._node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
-        self._node.create_subscription(Imu, 'imu/data_raw', lambda message: self.raw.append(
-            (_seconds(message), message.angular_velocity.z)), SENSOR_QOS)
-        self._node.create_subscription(Imu, 'imu/data', lambda message: self.headings.append(
-            (_seconds(message),
-             2.0 * math.atan2(message.orientation.z, message.orientation.w))), SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data_raw', self._add_raw, SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data', self._add_heading, SENSOR_QOS)
         self._node.create_subscription(Twist, 'cmd_vel', robot.set_rate, 10)
         self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
         self._executor = SingleThreadedExecutor()
@@ -153,6 +142,13 @@ class Client:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
+
+    def _add_raw(self, message: Imu) -> None:
+        self.raw.append((_seconds(message), message.angular_velocity.z))
+
+    def _add_heading(self, message: Imu) -> None:
+        yaw = 2.0 * math.atan2(message.orientation.z, message.orientation.w)
+        self.headings.append((_seconds(message), yaw))
 
     def _spin(self) -> None:
         while not self._stop.is_set():
@@ -208,7 +204,7 @@ def _process(module: str, **parameters: object) -> Iterator[None]:
         process.wait(20.0)
 
 
-def run_demo(out: Path, seed: int) -> Demonstration:
+def run_demo(out: Path, seed: int) -> Answer:
     """
     Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
 
@@ -317,7 +313,7 @@ def _drive(client: Client, motion: Motion, bar: tqdm) -> None:
     _pass(bar, 0.5)
 
 
-def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) -> Demonstration:
+def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) -> Answer:
     """Compare five headings of the drive with the truth."""
     clock, truth = np.array(robot.truth).T
     time_, raw = np.array([pair for pair in client.raw if pair[0] >= begin]).T
@@ -342,7 +338,7 @@ def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) 
     text = (f'{table}\nSelf-calibration: {calibration}.\n'
             f'Seed {seed}. Picture, table and log are in {out}.')
     means = {name: float(error.mean()) for name, error in errors.items()}
-    return Demonstration(text, {'seed': seed, **calibration.figures(), 'mean_error_deg': means})
+    return Answer([text], {'seed': seed, **calibration.figures(), 'mean_error_deg': means})
 
 
 def _table(errors: dict[str, Array]) -> str:

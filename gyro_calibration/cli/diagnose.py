@@ -35,6 +35,7 @@ from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.steps import OnProgress
 from gyro_calibration.diagnosis.words import lines, offered
 from gyro_calibration.files import write_atomically
 from gyro_calibration.logs.log import Log
@@ -62,34 +63,33 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _diagnose(given: argparse.Namespace) -> Answer:
     logs = list(read_each(given))
     model = None if given.model is None else read_model(given.model)
-    found = _found(given, logs, model)
-    written = _written(given.out, found) if given.out else []
-    return Answer('\n'.join([*lines(found), *written]), found.figures())
+    with under_way('diagnosis') as on_progress:
+        found = diagnosed(logs, model, given.seed, given.reference_kind, given.log, on_progress)
+    found = replace(found, logs=tuple(given.log))
+    if found.model is not model:
+        found = replace(found, model=replace(
+            found.model, origin={**found.model.origin, **origin_of(found.logs)}))
+    written = write_diagnosis(given.out, found) if given.out else []
+    return Answer([*lines(found), *written], found.figures())
 
 
-def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | None) -> Diagnosis:
-    """Diagnose logs in time, or a rate table; the extended model gets its origin."""
+def diagnosed(logs: Sequence[Log], model: GyroModel | None, seed: int, kind: str | None = None,
+              names: Sequence[str] = (), on_progress: OnProgress = lambda share, words: None
+              ) -> Diagnosis:
+    """Diagnose logs in time, or a rate table; a given model that is not extended stays itself."""
     table = any(log.time is None for log in logs)
     if table and len(logs) > 1:
         raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
                          'alone, or give the sample rate in Hz with --rate')
-    with under_way('diagnosis') as on_progress:
-        found = (diagnose_table(logs[0], None if model is None else calibrated(model),
-                                on_progress=on_progress) if table
-                 else diagnose(logs, np.random.default_rng(given.seed), model, names=given.log,
-                               on_progress=on_progress, kind=given.reference_kind))
-    return _with_origin(replace(found, logs=tuple(given.log)), model)
+    found = (diagnose_table(logs[0], None if model is None else calibrated(model),
+                            on_progress=on_progress) if table
+             else diagnose(logs, np.random.default_rng(seed), model, names=names,
+                           on_progress=on_progress, kind=kind))
+    return (found if model is None or offered(found)
+            else replace(found, before=model, model=model))
 
 
-def _with_origin(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
-    """Return a diagnosis whose model has an origin; a given model not extended keeps its own."""
-    if model is not None and not offered(found):
-        return replace(found, before=model, model=model)
-    return replace(found, model=replace(
-        found.model, origin={**found.model.origin, **origin_of(found.logs)}))
-
-
-def _written(folder: str, found: Diagnosis) -> list[str]:
+def write_diagnosis(folder: str | Path, found: Diagnosis) -> list[str]:
     """Write all files; what they hold is made before the first of them is touched."""
     content = {'diagnosis.json': json.dumps(found.figures(), indent=2, allow_nan=False) + '\n',
                'report.html': report(found), 'model.yaml': model_text(found.model)}

@@ -51,7 +51,7 @@ def _export(given: argparse.Namespace) -> Answer:
     data = {'to': given.to, 'out': given.out, 'text': text, 'left_out': left_out,
             'figures': asdict(held), 'allan_deviation_error': error}
     if given.out is None:
-        return Answer(text.rstrip('\n'), data)
+        return Answer([text.rstrip('\n')], data)
     write_atomically(given.out, text.encode())
     lines = [f'written to {given.out}.']
     if held.wander.density and given.to == 'sdf':
@@ -59,4 +59,4 @@ def _export(given: argparse.Namespace) -> Answer:
                      f'deviation is accurate to {100.0 * error:.0f} % up to {given.span:g} s.')
     if left_out:
         lines += [f'{given.to} does not hold:', *(f'  {each}' for each in left_out)]
-    return Answer('\n'.join(lines), data)
+    return Answer(lines, data)

@@ -13,36 +13,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwells import dwells, join, take
+from gyro_calibration.calibration.dwells import dwells, join, listed, take
 from gyro_calibration.calibration.encoder import (
     calibrate_encoder,
     EncoderCalibration,
     FEWEST_DWELLS,
     is_motion,
 )
-from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.rate_table import Bin, binned, Calibration, fit_effects
+from gyro_calibration.calibration.scatter import FEWEST_SWEEPS
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGIES
 from gyro_calibration.cli import plots
-from gyro_calibration.cli.fit_answer import (
-    bin_lines,
-    choice_lines,
-    dwell_data,
-    dwell_lines,
-    heading_data,
-    heading_lines,
-    matrix_lines,
-    matrix_of,
-    model_data,
-    quality_lines,
-    sentences,
-    value_data,
-    value_lines,
-)
 from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
@@ -52,14 +39,24 @@ from gyro_calibration.cli.verb import (
     read_each,
     UsageError,
     verb,
-    written,
+    wrapped,
 )
-from gyro_calibration.logs.log import Log
-from gyro_calibration.model.effects import Effect, rate_temperature_polynomial, STEADY
+from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.model.effects import (
+    Effect,
+    Parameter,
+    polynomial_to_matrix,
+    rate_temperature_polynomial,
+    STEADY,
+)
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.model_file import write_model
+from gyro_calibration.model.model_file import POLYNOMIAL, write_model
+import numpy as np
 
-METHODS = ('dwells', 'likelihood', 'course', 'rate')
+#: What people read instead of the unit of the file, and the factor to it.
+_UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
+          'rad/s/K²': ('deg/s/K²', 1 / DEGREE), 's/rad': ('s/deg', DEGREE),
+          's²/rad²': ('s²/deg²', DEGREE ** 2)}
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -68,7 +65,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                   'table.csv --out model.yaml')
     add_log(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
-    parser.add_argument('--method', choices=METHODS, help='dwells: means at constant rates; '
+    parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
+                        help='dwells: means at constant rates; '
                         'likelihood: maximum likelihood from the reference heading; '
                         'course: a course over ground, as from satellite navigation; '
                         'rate: the rate of the reference heading, sample by sample. '
@@ -140,8 +138,6 @@ def _stored(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     return model
 
 
-# dwells
-
 def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.matrix and not given.polynomial:
         raise UsageError('--matrix needs --polynomial: other effects have no matrix')
@@ -161,23 +157,23 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.surface:
         plots.draw_error_surface(given.surface, model, model.rate_range,
                                  model.temperature_range, take(table, fit.scatter.kept))
-    matrix = matrix_of(model)
-    data = {'out': given.out, 'method': 'dwells', **dwell_data(selection),
-            'effects': value_data(model), **model_data(model), 'matrix_dps': matrix,
-            'remarks': list(table.remarks)}
-    lines = [*dwell_lines(fit), '', *value_lines(model), '', *quality_lines(fit), '',
-             *bin_lines(fit), *choice_lines(selection)]
+    matrix = next((polynomial_to_matrix(term.effect, term.values).tolist() for term in model.terms
+                   if term.effect.name == POLYNOMIAL), None)
+    lines = list(dwell_lines(model, selection))
     if effects and given.technology:
         lines.append(f'--technology {given.technology} is stored in the model; it had no '
                      'influence, since the effects were given.')
     if given.matrix and matrix is not None:
-        lines += ['', *matrix_lines(matrix)]
-    return Answer('\n'.join([*lines, *written(given.out)]), data)
+        lines += ['', 'C of eq. 11 for deg/s and degC, highest powers of temperature above, '
+                  'of the output to the left:',
+                  *(' '.join(f'{value: .8e}' for value in row) for row in matrix)]
+    return Answer(lines, {'out': given.out, 'method': 'dwells', **_dwell_data(selection),
+                          **_model_data(model), 'matrix_dps': matrix,
+                          'remarks': list(table.remarks)}, (given.out,))
 
-
-# a reference heading, or a reference rate without dwells
 
 def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
+    """Fit a reference heading, or a reference rate without dwells."""
     if len(logs) > 1:
         raise UsageError(f'--method {given.method or "likelihood"} takes one log; '
                          'give one log, or use --method dwells')
@@ -188,29 +184,224 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     (path, log), = logs.items()
     with under_way('fit of scale factor error, bias and delay'):
         found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
-    model = _stored(given, found.model)
+    model, fit = _stored(given, found.model), found.fit
     if given.picture:
-        plots.draw_reference(given.picture, *headings(log, found))
-    remarks = (*_of_motion(log), *found.remarks)
-    data = {'out': given.out, 'method': found.method, 'effects': value_data(model),
-            **model_data(model), **heading_data(found), 'remarks': list(remarks)}
-    lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.', *value_lines(model), '',
-             *heading_lines(found), *sentences(remarks)]
-    return Answer('\n'.join([*lines, *written(given.out)]), data)
-
-
-def _of_motion(log: Log) -> Iterator[str]:
-    """Give the remark on a reference without headings."""
+        draw_headings(given.picture, log, found)
+    remarks = list(found.remarks)
     if log.reference_heading is None:
-        yield (f'the log has a reference rate, and fewer than {FEWEST_DWELLS} stretches of '
-               'constant rate; so the rate is integrated, and headings are compared. For other '
-               'effects than bias and scale factor error, hold each rate for some seconds')
+        remarks.insert(
+            0, f'the log has a reference rate, and fewer than {FEWEST_DWELLS} stretches of '
+            'constant rate; so the rate is integrated, and headings are compared. For other '
+            'effects than bias and scale factor error, hold each rate for some seconds')
+    return Answer(
+        [f'{len(log)} samples of {path}, {found.lost_samples} lost.',
+         *heading_lines(model, found, remarks)],
+        {'out': given.out, 'method': found.method, **_model_data(model),
+         'time_offset_s': fit.time_offset,
+         'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
+         'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
+         'rms_heading_before_rad': found.before.rms, 'rms_heading_after_rad': found.after.rms,
+         'largest_heading_before_rad': found.before.largest,
+         'largest_heading_after_rad': found.after.largest, 'remarks': remarks}, (given.out,))
 
 
-def headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, Any, Any, str]:
-    """Return what `plots.draw_reference` takes."""
+def draw_headings(path: str | Path | None, log: Log, found: EncoderCalibration) -> Any:
+    """Draw the headings of a reference and of the gyro, and return the figure."""
     name = ('course over ground' if found.method == 'course' else
             'reference' if log.reference_heading is None else 'encoder')
     motion = found.reference
-    return (motion.time, motion.heading - motion.heading[0], found.before.heading,
-            found.after.heading, name)
+    return plots.draw_reference(path, motion.time, motion.heading - motion.heading[0],
+                                found.before.heading, found.after.heading, name)
+
+
+# as data, in SI
+
+def _model_data(model: GyroModel) -> dict[str, Any]:
+    """Return the fitted values with their intervals, covariance, ranges and technology."""
+    values: dict[str, dict[str, Any]] = {}
+    for effect, parameter, value, deviation in _fitted(model):
+        values.setdefault(effect, {})[parameter.name] = {
+            'estimate': value, 'standard_deviation': deviation,
+            'ci95': [value - 1.96 * deviation, value + 1.96 * deviation]
+            if math.isfinite(deviation) else None, 'unit': parameter.unit}
+    return {'effects': values,
+            'covariance': None if model.covariance is None else model.covariance.tolist(),
+            'rate_range_rad_s': model.rate_range,
+            'temperature_range_degc': model.temperature_range,
+            'reference_temperature_degc': model.reference_temperature,
+            'technology': model.gyro.get('technology')}
+
+
+def _fitted(model: GyroModel) -> Iterator[tuple[str, Parameter, float, float]]:
+    """Give effect name, parameter, value and standard deviation of each fitted value."""
+    count = sum(len(term.fitted) for term in model.terms)
+    deviations = iter([math.nan] * count if model.covariance is None
+                      else np.sqrt(np.diag(model.covariance)).tolist())
+    for term in model.terms:
+        for place in term.fitted:
+            yield (term.effect.name, term.effect.parameters[place], term.values[place],
+                   next(deviations))
+
+
+def _dwell_data(selection: Selection) -> dict[str, Any]:
+    """Return how good a calibration from dwells is, and why it has these effects."""
+    fit = selection.calibration
+    table, scatter = fit.dwells, fit.scatter
+    return {
+        'dwells': len(table), 'sweeps': len(np.unique(table.sweep)),
+        'outlying': [table.place[row] for row in np.flatnonzero(~scatter.kept)],
+        'condition': fit.condition, 'folded_beyond_rad_s': fit.folded_beyond,
+        'rms_before_rad_s': fit.before_rms, 'rms_residual_rad_s': fit.residual_rms,
+        'rms_left_out_rad_s': fit.left_out_rms,
+        'scatter': {'dwell_rad_s': scatter.dwell, 'dwell_scale': scatter.dwell_scale,
+                    'sweep_bias_rad_s': scatter.sweep_bias, 'sweep_scale': scatter.sweep_scale},
+        'choices': [{
+            'effect': choice.effect, 'taken': choice.taken,
+            'left_out_without_rad_s': choice.without, 'left_out_with_rad_s': choice.with_it,
+            'chance': choice.chance, 'reason': choice.reason} for choice in selection.choices],
+        'look_alikes': [{
+            'taken': pair.taken, 'other': pair.other, 'sigmas': pair.sigmas,
+            'parted': pair.distinguishable, 'parting_rate_rad_s': pair.rate,
+            'reason': pair.reason} for pair in selection.confounders],
+        'by_rate': [_bin_data(part, 'rad_s') for part in binned(fit, table.rate)],
+        'by_temperature': [] if table.temperature is None
+        else [_bin_data(part, 'degc') for part in binned(fit, table.temperature)],
+    }
+
+
+def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
+    return {f'from_{unit}': part.low, f'to_{unit}': part.high, 'dwells': part.count,
+            'mean_before_rad_s': part.before, 'mean_residual_rad_s': part.residual,
+            'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
+
+
+# in words, in units that people use
+
+def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
+    """Give what was fitted to dwells, how good it is, and why it has these effects."""
+    fit = selection.calibration
+    yield from (*_measured_lines(fit), '', *_value_lines(model), '', *_quality_lines(fit), '',
+                *_bin_lines(fit), *_choice_lines(selection))
+
+
+def heading_lines(model: GyroModel, found: EncoderCalibration,
+                  remarks: Iterable[str]) -> Iterator[str]:
+    """Give what was fitted to a heading, and the errors before and after."""
+    yield from (*_value_lines(model), '')
+    if math.isfinite(found.fit.time_offset):
+        yield (f'Delay of the gyro behind the reference: {1000.0 * found.fit.time_offset:.1f} ms; '
+               'the errors are corrected for it.')
+    for name, residual in (('before', found.before), ('after', found.after)):
+        yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '
+               f'{residual.largest / DEGREE:.3f} deg at most.')
+    if found.after.rms > 5.0 * DEGREE:
+        yield wrapped('The error is above 5 deg rms. If the gyro is nonlinear or depends on '
+                      'temperature, use --method dwells; it needs stretches of constant rate in '
+                      'the log.')
+    yield from _sentences(remarks)
+
+
+def _sentences(remarks: Iterable[str]) -> Iterator[str]:
+    yield from (wrapped(f'{remark[0].upper()}{remark[1:]}.') for remark in remarks)
+
+
+def _value_lines(model: GyroModel) -> Iterator[str]:
+    """Give the table of fitted values."""
+    yield f'{"value":38s} {"estimate":>12s} {"std. dev.":>10s}   {"95 % interval":27s} unit'
+    for effect, parameter, value, deviation in _fitted(model):
+        unit, factor = _UNITS.get(parameter.unit, (parameter.unit, 1.0))
+        name = effect if parameter.name == effect else f'{effect} {parameter.name}'
+        low, high = ((value + sign * 1.96 * deviation) * factor for sign in (-1, 1))
+        sure = (f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}'
+                if math.isfinite(deviation) else f'{"-":>10s}   {"-":27s}')
+        yield f'{name:38s} {value * factor:12.5g} {sure} {unit}'
+    for temperature in {term.values[0] for term in model.terms
+                        if term.effect.parameters[0].name == 'reference_temperature'}:
+        yield f'Temperatures are counted from {temperature:g} degC.'
+
+
+def _measured_lines(fit: Calibration) -> Iterator[str]:
+    """Give the dwells that were measured, and those that were not fitted."""
+    table = fit.dwells
+    slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
+    temperatures = ('' if table.temperature is None else
+                    f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC')
+    sweeps = len(np.unique(table.sweep))
+    yield (f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, '
+           f'{slowest:.1f} to {fastest:.1f} deg/s{temperatures}.')
+    outlying = np.flatnonzero(~fit.scatter.kept)
+    if len(outlying):
+        named = listed([f'{table.place[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
+                        for row in outlying])
+        yield wrapped(f'{len(outlying)} outlying, not fitted: {named}.')
+    yield from _sentences(table.remarks)
+
+
+def _quality_lines(fit: Calibration) -> Iterator[str]:
+    """Give the size of the errors, and warnings."""
+    scatter, several = fit.scatter, len(np.unique(fit.dwells.sweep)) >= FEWEST_SWEEPS
+    part = 'sweeps' if several else 'blocks of time'
+    yield (f'Error {fit.before_rms / DEGREE:.4f} deg/s rms before, '
+           f'{fit.residual_rms / DEGREE:.4f} after; '
+           + (f'{fit.left_out_rms / DEGREE:.4f} in {part} left out of the fit.'
+              if math.isfinite(fit.left_out_rms)
+              else f'no cross-validation, since some values depend on one of the {part} only.'))
+    wander = (f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s '
+              f'and {100.0 * scatter.sweep_scale:.3f} %' if several
+              else f'the scatter of sweeps needs at least {FEWEST_SWEEPS} sweeps')
+    yield wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s '
+                  f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {wander}. '
+                  f'Condition number {fit.condition:.1f}.')
+    excess = math.sqrt(fit.misfit / fit.freedom) if fit.freedom else 1.0
+    if excess > 1.2:
+        yield wrapped(f'The residual is {excess:.1f} times the scatter of the dwells about a '
+                      'smooth surface: the model lacks an effect. The intervals are widened by '
+                      'this factor.')
+    if fit.folded_beyond is not None:
+        yield wrapped(f'Above {fit.folded_beyond / DEGREE:.0f} deg/s the modelled output does '
+                      'not increase with the rate, so one output has two rates: do not use the '
+                      'model there.')
+    if not fit.freedom:
+        yield wrapped('There are as many values as dwells, so their standard deviations are '
+                      'unknown: add dwells.')
+
+
+def _bin_lines(fit: Calibration) -> Iterator[str]:
+    """Give the tables of residuals by rate and by temperature."""
+    table = fit.dwells
+    for name, unit, factor, values in (('rate', 'deg/s', 1 / DEGREE, table.rate),
+                                       ('temperature', 'degC', 1.0, table.temperature)):
+        if values is None or np.ptp(values) == 0.0:
+            continue
+        yield (f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} '
+               f'{"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s')
+        for part in binned(fit, values):
+            place = f'{part.low * factor:.1f} to {part.high * factor:.1f}'
+            before, residual, deviation, rms = (
+                value / DEGREE for value in (part.before, part.residual, part.deviation, part.rms))
+            yield (f'{place:22s} {part.count:6d} {before:18.4f} {residual:10.4f} '
+                   f'{deviation:8.4f} {rms:8.4f}')
+        yield ''
+
+
+def _choice_lines(selection: Selection) -> Iterator[str]:
+    """Give the reason why each effect was taken or not, and effects not distinguished."""
+    if selection.choices:
+        yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"chance":>7s}'
+    for choice in selection.choices:
+        without, with_it = (f'{_shown(value / DEGREE, ".4f"):>8s}'
+                            for value in (choice.without, choice.with_it))
+        numbers = f'{without} {with_it} {_shown(choice.chance, ".1g"):>7s}'
+        yield wrapped(f'{choice.effect:26s} {numbers}  '
+                      f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
+    for pair in selection.confounders:
+        remedy = ('no rate up to three times the fastest' if pair.rate is None
+                  else f'two dwells each way at {pair.rate / DEGREE:.0f} deg/s')
+        if not pair.distinguishable:
+            yield wrapped(f'These data do not distinguish {pair.taken} from {pair.other}: '
+                          f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
+                          'would distinguish them.')
+
+
+def _shown(value: float, form: str) -> str:
+    return format(value, form) if math.isfinite(value) else '-'

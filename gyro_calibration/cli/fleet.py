@@ -20,18 +20,17 @@ import json
 import os
 from pathlib import Path
 import re
-import textwrap
 from typing import Any
 
 from gyro_calibration.calibration.course_over_ground import PRIORS
 from gyro_calibration.cli.progress import bar
-from gyro_calibration.cli.verb import Answer, origin_of, positive, UsageError, verb, whole
+from gyro_calibration.cli.verb import Answer, origin_of, positive, UsageError, verb, whole, wrapped
 from gyro_calibration.diagnosis.gates import is_confused
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.files import plain, write_atomically
 from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
 from gyro_calibration.fleet.prior import models
-from gyro_calibration.fleet.report import report
+from gyro_calibration.fleet.report import report, tables
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes, usual_workers
 from gyro_calibration.fleet.summary import (
     data as type_data,
@@ -45,14 +44,11 @@ from gyro_calibration.fleet.summary import (
     TypeFound,
 )
 from gyro_calibration.fleet.table import entries, pattern
-from gyro_calibration.fleet.tabular import tables
 from gyro_calibration.fleet.work import DONE, done, NO_EVIDENCE, refused, Task
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import model_text
 import numpy as np
 
-#: Lines for people are not longer.
-_WIDTH = 120
 _SPOKEN = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
            (DRIVES, 'between drives'))
 
@@ -120,14 +116,15 @@ def _fleet(given: argparse.Namespace) -> Answer:
     lines += [f'{each["log"]}: no evidence, {each["reason"]}.' for each in left]
     types = summarized(used)
     for found in types:
-        lines += ['', *(_wrapped(each) for each in _lines(found))]
+        lines += ['', *(wrapped(each, 2 + len(each) - len(each.lstrip()))
+                        for each in _lines(found))]
     data = {'schema': 'gyro_calibration/fleet/1', 'out': given.out, 'logs': len(records),
             'false_alarm_rate': FALSE_ALARMS,
             'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in left],
             'types': [type_data(found) for found in types]}
     written = _written(given, types, records, data)
     lines += ['', f'Written to {given.out}: {", ".join(written)}.']
-    return Answer('\n'.join(lines), data)
+    return Answer(lines, data)
 
 
 def _written(given: argparse.Namespace, types: Sequence[TypeFound],
@@ -172,11 +169,6 @@ def _spread(each: Found, of: Component) -> str:
     if of.low > 0.0:
         return amount(of.estimate, each.unit, each.name)
     return f'less than {amount(of.high, each.unit, each.name)}'
-
-
-def _wrapped(line: str) -> str:
-    indent = ' ' * (len(line) - len(line.lstrip()))
-    return textwrap.fill(line, _WIDTH, subsequent_indent=f'{indent}  ')
 
 
 def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str, Any]]:

@@ -15,9 +15,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 import json
 import math
 import os
+from pathlib import Path
 import sys
 from typing import Any, NoReturn
 
@@ -28,13 +30,14 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 # ruff: noqa: E402
 from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
-from gyro_calibration.cli.catalogue import load_effects
-from gyro_calibration.cli.verb import Answer, say, UsageError
+from gyro_calibration.cli.verb import say, UsageError
+from gyro_calibration.diagnosis.causes import add_causes
 from gyro_calibration.files import explained, InputError, plain, reason
 from gyro_calibration.logs.log import DataRefused
+from gyro_calibration.model.effects import add_effects
 import numpy as np
 
-DONE, NO_ANSWER, WRONG_USE = 0, 1, 2
+_DONE, _NO_ANSWER, _WRONG_USE = 0, 1, 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,29 +47,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _refuse_empty(given)
         for path in given.catalogue:
-            load_effects(path)
+            _load_effects(path)
         answer = given.verb(given)
-        text = None if answer is None else _text(answer, given.json)
+        text = (None if answer is None else answer.text if not given.json
+                else json.dumps(_numbers(answer.data), allow_nan=False))
     except DataRefused as error:
         say(error)
-        return NO_ANSWER
+        return _NO_ANSWER
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
         say(f'the values exceed the range of computation ({reason(error)}); '
             'check columns and units')
-        return NO_ANSWER
+        return _NO_ANSWER
     except InputError as error:
         say(error)
-        return WRONG_USE
+        return _WRONG_USE
     except OSError as error:
         say(explained(error))
-        return WRONG_USE
+        return _WRONG_USE
     if text is not None:
         _show(text)
-    return DONE
+    return _DONE
 
 
-def _text(answer: Answer, as_json: bool) -> str:
-    return json.dumps(_numbers(answer.data), allow_nan=False) if as_json else answer.text
+def _load_effects(path: str) -> None:
+    """
+    Run a Python file and add the effects of its list EFFECTS to the catalogue.
+
+    Only the command line names such a file; models and logs cannot.
+
+    Raises
+    ------
+    UsageError : if the file cannot be run, or its effects cannot be used
+
+    """
+    spec = spec_from_file_location('effects_of_the_user', path)
+    if spec is None or spec.loader is None or not Path(path).is_file():
+        raise UsageError(f'{path} is not a Python file; wanted one, .py, with a list EFFECTS')
+    module = module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+        add_effects(module.EFFECTS)
+        add_causes(module.EFFECTS)
+    except Exception as error:
+        raise UsageError(f'{path} cannot be used as a catalogue ({type(error).__name__}: '
+                         f'{error}); wanted EFFECTS, a list of gyro_calibration.model.effects.'
+                         'Effect') from None
 
 
 def _numbers(value: Any) -> Any:

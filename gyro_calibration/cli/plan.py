@@ -34,12 +34,11 @@ from gyro_calibration.cli.verb import (
     UsageError,
     verb,
     whole,
-    written,
 )
 from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import CALIBRATION, Motion, NAMED, read_motion
+from gyro_calibration.model.motion import CALIBRATION, Motion, motion_by_name, NAMED
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration.model.settings_file import checked, number, read_settings, WrongValue
@@ -55,7 +54,6 @@ LIMITS = {
     'maximum_heading_deg': ('highest', DEGREE, 0.0, 1e6),
     'rest_s': ('rest', 1.0, 0.1, 100.0),
 }
-NEEDED = ('maximum_rate_dps', 'maximum_acceleration_dps2')
 #: Lengths for which the answer predicts the accuracy, s, and the longest that is planned.
 LENGTHS, LONGEST = (20.0, 30.0, 60.0, 120.0), 300.0
 
@@ -87,8 +85,7 @@ def _plan(given: argparse.Namespace) -> Answer:
         raise UsageError(f'--seconds {given.seconds:g} is above {LONGEST:g}; '
                          'plan a shorter motion and repeat it')
     ability, noise = read_limits(given.limits), _noise(given)
-
-    drive = named(given.motion)
+    drive = motion_by_name(given.motion)
     given.drive = given.drive or drive.duration
 
     def planned(seconds: float, generations: int = 30) -> tuple[Plan, Forecast]:
@@ -110,11 +107,8 @@ def _plan(given: argparse.Namespace) -> Answer:
     if given.picture:
         draw_motion(given.picture, plan.motion, ability.rate)
     fits = able(ability, CALIBRATION)
-    return Answer(_text(given, plan, rows, more, fits), _data(given, plan, rows, more, fits))
-
-
-def named(motion: str) -> Motion:
-    return NAMED[motion] if motion in NAMED else read_motion(motion)
+    return Answer(_lines(given, plan, rows, more, fits), _data(given, plan, rows, more, fits),
+                  (given.picture, given.out))
 
 
 def read_limits(path: str) -> Ability:
@@ -136,7 +130,8 @@ def read_limits(path: str) -> Ability:
         given = checked('the file', content, dict.fromkeys(LIMITS, _limit))
     except WrongValue as error:
         raise UsageError(f'{path}: {error}; config/limits.yaml is an example') from None
-    missing = [name for name in NEEDED if name not in given]
+    missing = [name for name in ('maximum_rate_dps', 'maximum_acceleration_dps2')
+               if name not in given]
     if missing:
         raise UsageError(f'{path}: {missing[0]} is missing; add the limit of the robot')
     ability = Ability(**{LIMITS[name][0]: value * LIMITS[name][1]
@@ -172,8 +167,8 @@ _NAMES = {'planned': 'planned', 'plain': 'one turn there and back',
           'built_in': 'built-in profile, 20 s'}
 
 
-def _text(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
-          more: dict[float, Prediction], fits: bool) -> str:
+def _lines(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
+           more: dict[float, Prediction], fits: bool) -> list[str]:
     rate, angle = plan.motion.rate_at(plan.motion.time) / DEGREE, plan.motion.heading / DEGREE
     lines = [
         f'A motion of {given.seconds:g} s with rates of {rate.min():.1f} to {rate.max():.1f} '
@@ -183,14 +178,13 @@ def _text(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
                    row) for name, row in rows.items()]
     lines += [_row(f'planned, {seconds:g} s', row) for seconds, row in more.items()]
     scale, less = _gains(rows)
-    lines += [
+    return lines + [
         '', 'Compared with one turn there and back, the scale factor is '
         f'{scale:.2f} times as accurate, and the mean heading error is {100 * less:.2f} % '
         'smaller.',
         f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the error, '
         'independent of the calibration.',
         'The accuracy of the bias depends on the length of the motion only.']
-    return '\n'.join([*lines, *written(given.picture, given.out)])
 
 
 def _row(name: str, row: Prediction) -> str:

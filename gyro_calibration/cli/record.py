@@ -211,7 +211,7 @@ class _Session:
                 'seconds': seconds, **self._details()}
         lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, '
                  f'written to {self._given.out}.', *self._remarks()]
-        return Answer('\n'.join(lines), {**data, 'remarks': self._remarks()})
+        return Answer(lines, {**data, 'remarks': self._remarks()})
 
     def _why(self) -> str:
         return ''

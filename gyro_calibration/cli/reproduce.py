@@ -46,7 +46,7 @@ def _reproduce(given: argparse.Namespace) -> Answer:
     found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=_bars(name))
              for name in names}
     text = '\n\n'.join(page(reproduction) for reproduction in found.values())
-    return Answer(text, {'seed': given.seed, 'sources': {
+    return Answer([text], {'seed': given.seed, 'sources': {
         name: reproduction.data() for name, reproduction in found.items()}})
 
 

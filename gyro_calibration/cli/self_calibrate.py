@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import datetime, timezone
 import math
+from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.likelihood import Fit
@@ -43,17 +45,21 @@ from gyro_calibration.cli.verb import (
     UsageError,
     verb,
     with_origin,
-    written,
 )
+from gyro_calibration.files import InputError
 from gyro_calibration.heading.log_compensation import compensate_log, none_plausible, plausible
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
-from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
+from gyro_calibration.model.gyro_model import (
+    GyroModel,
+    SelfCalibration,
+    with_self_calibration,
+)
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import from_headings, from_rates, Motion, read_motion
+from gyro_calibration.model.motion import Motion, motion_of, read_motion
 import numpy as np
 
 #: What --turns takes for a count that the gyro itself is to find.
-NEAREST = 'nearest'
+_NEAREST = 'nearest'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -65,7 +71,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'rate_dps; default: the reference of the log')
     parser.add_argument('--turns', type=_turns, metavar='N', help='number of full turns from a '
                         'mark to the same mark with standstill at both ends, counter-clockwise '
-                        f'positive; {NEAREST}: the number nearest to the gyro')
+                        f'positive; {_NEAREST}: the number nearest to the gyro')
     parser.add_argument('--marking', type=not_negative, metavar='DEG', help='standard deviation '
                         'of the angle between both standstills on the mark, deg; '
                         f'default: {MARKING / DEGREE:g}')
@@ -86,7 +92,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _turns(text: str) -> int | str:
-    if text == NEAREST:
+    if text == _NEAREST:
         return text
     try:
         value = int(text)
@@ -94,7 +100,7 @@ def _turns(text: str) -> int | str:
         value = 0
     if not value:
         raise argparse.ArgumentTypeError(f'{text} is no number of turns; give an integer other '
-                                         f'than 0, or {NEAREST}')
+                                         f'than 0, or {_NEAREST}')
     return value
 
 
@@ -115,35 +121,71 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
 
 
 def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, output = time_of(given, log), output_of(given, log)
+    time, _ = time_of(given, log), output_of(given, log)
     motion, begin = ((read_motion(given.profile), time[0]) if given.profile
-                     else _reference(given, log, time))
-    time, known = time - begin, _plausible(given, model, log)
-    run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
-    rates = compensate_log(with_self_calibration(model, None), log)
+                     else _reference(given, log))
+    _refuse_implausible(given, model, log)
     with under_way('fit of scale factor error, bias and delay'):
-        fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise,
-                             reference=_goodness(given, motion), output=output[run],
-                             prior=model.prior)
+        run = calibrated_run(log, model, motion, begin, given.method, _goodness(given, motion))
     if given.picture:
+        run.draw(given.picture)
+    return _answer(given, model, log, run.fit, run.used, given.method,
+                   _figures(run.fit, run.check),
+                   list(_sentences(run.fit, run.check, given.method)))
+
+
+@dataclass(frozen=True)
+class CalibratedRun:
+    """
+    A run on a known motion, fitted and checked by the rest after it.
+
+    Attributes
+    ----------
+    fit, check : with the rest, and None where there is none
+    used : which rows of the log
+    time, rate : of these rows, on the clock of the motion, s and rad/s
+    motion : that was driven
+
+    """
+
+    fit: Fit
+    check: RestCheck | None
+    used: Mask
+    time: Array
+    rate: Array
+    motion: Motion
+
+    def draw(self, path: str | Path | None) -> Any:
+        """Draw the run with its errors before and after, and return the figure."""
+        fit = self.fit
         late = 0.0 if math.isnan(fit.time_offset) else fit.time_offset
-        draw_run(given.picture, time[run] - late, rates[run],
-                 (rates[run] - fit.bias) / (1.0 + fit.scale_factor_error), motion)
-    rest = rest_after(time[known], rates[known], fit, motion)
+        return draw_run(path, self.time - late, self.rate,
+                        (self.rate - fit.bias) / (1.0 + fit.scale_factor_error), self.motion)
+
+
+def calibrated_run(log: Log, model: GyroModel, motion: Motion, begin: float, method: str,
+                   reference: Reference) -> CalibratedRun:
+    """Calibrate by the motion that began at a time of the log, s, and by the rest after it."""
+    time, known = np.asarray(log.time) - begin, plausible(model, log)
+    run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
+    rate = compensate_log(with_self_calibration(model, None), log)
+    fit = self_calibrate(time[run], rate[run], motion, method, noise=model.noise,
+                         reference=reference, output=np.asarray(log.output)[run],
+                         prior=model.prior)
+    rest = rest_after(time[known], rate[known], fit, motion)
     check = (None if rest is None
-             else check_rest(time[known][rest], rates[known][rest], fit, model.noise))
-    fit = fit if check is None else check.fit
-    return _answer(given, model, log, fit, run, given.method, _figures(fit, check),
-                   list(_sentences(fit, check, given.method)))
+             else check_rest(time[known][rest], rate[known][rest], fit, model.noise))
+    return CalibratedRun(fit if check is None else check.fit, check, run, time[run], rate[run],
+                         motion)
 
 
 def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time, output = time_of(given, log), output_of(given, log)
-    known, rates = (_plausible(given, model, log),
+    known, rates = (_refuse_implausible(given, model, log),
                     compensate_log(with_self_calibration(model, None), log))
     marking = MARKING if given.marking is None else given.marking * DEGREE
     found = calibrate_turns(time[known], rates[known],
-                            None if given.turns == NEAREST else given.turns, noise=model.noise,
+                            None if given.turns == _NEAREST else given.turns, noise=model.noise,
                             marking=marking, output=output[known])
     way = 'counter-clockwise' if found.turns > 0 else 'clockwise'
     before, after = found.rests
@@ -155,7 +197,7 @@ def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
         f'{marking / DEGREE:g} deg.'])
 
 
-def _plausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
+def _refuse_implausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
     """Return which rows are used."""
     found = plausible(model, log)
     if not found.any() and np.isfinite(np.asarray(log.output)).any():
@@ -175,34 +217,39 @@ def _goodness(given: argparse.Namespace, motion: Motion) -> Reference:
 def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, used: Mask,
             method: str, data: dict[str, Any], lines: list[str]) -> Answer:
     """Write the calibration, and return the answer."""
-    temperature = None if log.temperature is None else float(log.temperature[used].mean())
-    calibration = record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
-                         temperature)
+    calibration = recorded(fit, method, log, used)
     if given.out:
         write_model(given.out, with_self_calibration(with_origin(given, model), calibration))
     refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
     remarks = ([f'{refused} rows have an implausible rate or temperature and are not used.']
                if refused else [])
     first = f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {used.sum()} samples.'
-    return Answer('\n'.join([first, *lines, *remarks, *written(given.picture, given.out)]),
+    return Answer([first, *lines, *remarks],
                   {**calibration.figures(), 'samples': int(used.sum()),
-                   'refused_samples': refused, **data, 'out': given.out})
+                   'refused_samples': refused, **data, 'out': given.out},
+                  (given.picture, given.out))
+
+
+def recorded(fit: Fit, method: str, log: Log, used: Mask) -> SelfCalibration:
+    """Return a fit as the calibration of now, at the mean temperature of the rows used."""
+    temperature = None if log.temperature is None else float(log.temperature[used].mean())
+    return record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
+                  temperature)
 
 
 def _figures(fit: Fit, check: RestCheck | None) -> dict[str, Any]:
-    """Return what else the fit found, in SI; None for what is not known."""
+    """Return what else the fit found, in SI; nan for what is not known."""
     good = fit.goodness
-    values = {'time_offset_s': fit.time_offset,
-              'time_offset_standard_deviation_s': fit.time_offset_deviation,
-              'start_heading_rad': fit.start_heading,
-              'start_heading_standard_deviation_rad': fit.start_heading_deviation,
-              'chi_square': good.chi_square if good else math.nan,
-              'degrees_of_freedom': good.freedom if good else math.nan,
-              'probability': good.probability if good else math.nan,
-              'noise_ratio': good.noise_ratio if good else math.nan,
-              'rest_rate_rad_s': check.rate if check else math.nan,
-              'rest_limit_rad_s': check.limit if check else math.nan}
-    return {name: None if math.isnan(value) else value for name, value in values.items()}
+    return {'time_offset_s': fit.time_offset,
+            'time_offset_standard_deviation_s': fit.time_offset_deviation,
+            'start_heading_rad': fit.start_heading,
+            'start_heading_standard_deviation_rad': fit.start_heading_deviation,
+            'chi_square': good.chi_square if good else math.nan,
+            'degrees_of_freedom': good.freedom if good else math.nan,
+            'probability': good.probability if good else math.nan,
+            'noise_ratio': good.noise_ratio if good else math.nan,
+            'rest_rate_rad_s': check.rate if check else math.nan,
+            'rest_limit_rad_s': check.limit if check else math.nan}
 
 
 def _sentences(fit: Fit, check: RestCheck | None, method: str) -> Iterator[str]:
@@ -220,14 +267,10 @@ def _sentences(fit: Fit, check: RestCheck | None, method: str) -> Iterator[str]:
                f'limit: {check.limit / DEGREE:.4f} deg/s.')
 
 
-def _reference(given: argparse.Namespace, log: Log, time: Array) -> tuple[Motion, float]:
-    """Return the motion of the reference of a log, and the time at which it begins, s."""
-    for values, motion in ((log.reference_heading, from_headings),
-                           (log.reference_rate, from_rates)):
-        if values is not None:
-            known = np.isfinite(values)
-            if known.sum() < 2:
-                raise DataRefused(f'{given.log}: the reference has {known.sum()} values; at '
-                                  'least 2 are needed: give the motion with --profile')
-            return motion(time[known], values[known]), float(time[known][0])
-    raise UsageError(f'{given.log}: has no reference; give the motion with --profile')
+def _reference(given: argparse.Namespace, log: Log) -> tuple[Motion, float]:
+    try:
+        return motion_of(log)
+    except DataRefused as error:
+        raise DataRefused(f'{given.log}: {error} with --profile') from None
+    except InputError as error:
+        raise UsageError(f'{given.log}: {error} with --profile') from None

@@ -29,7 +29,7 @@ from gyro_calibration.cli.verb import (
 )
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import NAMED, read_motion
+from gyro_calibration.model.motion import motion_by_name, NAMED
 from gyro_calibration.model.simulation import simulate
 import numpy as np
 
@@ -62,8 +62,8 @@ def _simulate(given: argparse.Namespace) -> Answer:
     write_log(given.out, replace(
         log, notes=(f'simulated with {given.model}, motion {given.motion}, seed {seed}',)))
     data = {'out': given.out, 'rows': len(log), 'duration_s': duration, 'seed': seed}
-    return Answer(f'{len(log)} samples over {duration:g} s, seed {seed}, written to {given.out}.',
-                  data)
+    return Answer(
+        [f'{len(log)} samples over {duration:g} s, seed {seed}, written to {given.out}.'], data)
 
 
 def simulated(given: argparse.Namespace) -> tuple[Log, int]:
@@ -71,7 +71,7 @@ def simulated(given: argparse.Namespace) -> tuple[Log, int]:
     if given.motion not in NAMED and not os.path.exists(given.motion):
         raise UsageError(f'{given.motion}: there is no such motion; '
                          f'give a file, or one of {", ".join(NAMED)}')
-    motion = NAMED[given.motion] if given.motion in NAMED else read_motion(given.motion)
+    motion = motion_by_name(given.motion)
     if motion.duration * given.sample_rate > MOST:
         raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
                          f'{MOST:g} samples; give a lower rate or a shorter motion')

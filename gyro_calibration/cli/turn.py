@@ -41,7 +41,6 @@ from gyro_calibration.cli.verb import (
     read,
     UsageError,
     verb,
-    written,
 )
 from gyro_calibration.files import digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
@@ -52,8 +51,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 
-#: Temperatures go into this many bins at most.
-_TEMPERATURE_BINS = 8
 #: Limits of each bin, and which errors lie in it.
 Bins: TypeAlias = 'list[tuple[float, float, Mask]]'
 
@@ -95,9 +92,8 @@ def _turn(given: argparse.Namespace) -> Answer:
     remarks = [*found.remarks, *errors.remarks, *remarks]
     if places := [place for place, good in zip(found.place, kept) if not good]:
         remarks.append(f'{len(places)} outlying dwells are left out: {listed(places)}')
-    return Answer('\n'.join([*_text(given, errors, remarks),
-                             *written(given.out, given.picture)]),
-                  {**_data(given, errors, remarks), **data})
+    return Answer(_lines(given, errors, remarks), {**_data(given, errors, remarks), **data},
+                  (given.out, given.picture))
 
 
 # rates by the model
@@ -170,13 +166,12 @@ def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
 
 
 def _temperature_bins(errors: TurnErrors) -> Bins:
-    """Return limits of a round width, degC, and which errors lie between them."""
+    """Return limits of a round width, degC, of at most 8 bins, and which errors lie in them."""
     if errors.temperature is None:
         return []
     low, high = float(errors.temperature.min()), float(errors.temperature.max())
     widths = [factor * 10.0 ** power for power in range(4) for factor in (1, 2, 5)]
-    width = next((width for width in widths if high - low <= (_TEMPERATURE_BINS - 1) * width),
-                 widths[-1])
+    width = next((width for width in widths if high - low <= 7 * width), widths[-1])
     edges = np.arange(math.floor(low / width), math.floor(high / width) + 2) * width
     number = _numbers(edges, errors.temperature)
     bins = [(low, high, number == place)
@@ -191,7 +186,7 @@ def _numbers(edges: Array, values: Array) -> Any:
 
 # the answer
 
-def _text(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> Iterator[str]:
+def _lines(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> Iterator[str]:
     before, after = size(errors.static), size(errors.modelled)
     yield (f'Error of a turn of 360 deg: largest {_degrees(before.largest)} with the static bias '
            f'only, {_degrees(after.largest)} with the model, '

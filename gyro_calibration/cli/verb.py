@@ -20,6 +20,7 @@ import importlib.util
 import math
 import os
 import sys
+import textwrap
 from typing import Any
 
 from gyro_calibration import __version__
@@ -47,10 +48,22 @@ class UsageError(InputError):
 
 @dataclass(frozen=True)
 class Answer:
-    """The result of a verb, as text and as data."""
+    """The result of a verb: lines for people, data in SI, and the files that were written."""
 
-    text: str
+    lines: Iterable[str]
     data: dict[str, Any]
+    files: Iterable[str | None] = ()
+
+    @property
+    def text(self) -> str:
+        """Return the lines, and a sentence for each file."""
+        return '\n'.join([*self.lines, *(f'Written to {each}.' for each in self.files if each)])
+
+
+def wrapped(text: str, indent: int = 0) -> str:
+    """Return a line for people with 120 characters at most, and then others."""
+    return textwrap.fill(text, 120, subsequent_indent=' ' * indent, break_long_words=False,
+                         break_on_hyphens=False)
 
 
 def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None],
@@ -63,13 +76,8 @@ def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer 
 
 
 def add_picture(parser: argparse.ArgumentParser, what: str, option: str = '--picture') -> None:
-    parser.add_argument(option, type=picture_file, metavar='FILE',
+    parser.add_argument(option, type=_picture_file, metavar='FILE',
                         help=f'draw {what}, .png or .svg')
-
-
-def written(*files: str | None) -> list[str]:
-    """Return a sentence for each file that was written."""
-    return [f'Written to {each}.' for each in files if each]
 
 
 def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
@@ -149,7 +157,7 @@ def whole(text: str) -> int:
     return value
 
 
-def picture_file(text: str) -> str:
+def _picture_file(text: str) -> str:
     """Return the name of a picture to draw, if one can be drawn."""
     if not text.endswith(('.png', '.svg')):
         raise argparse.ArgumentTypeError(f'{text} is no picture file; give a name that ends in '

@@ -14,7 +14,6 @@ A fleet: many logs of many gyros, and what is the unit's, the type's and the ref
 Reading order, each imports only from those before it: `table` (which log is of which unit),
 `slow_effects` (of a log), `work` (on one log), `run` (of many tasks), `pooling` (of one value over
 the logs of a type), `outliers` (among units and drives), `summary` (of a type),
-`prior` (models for units), `report` (the page),
-`tabular` (for other programs).
+`prior` (models for units), `report` (the page, and tables for other programs).
 
 """

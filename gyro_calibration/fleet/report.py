@@ -8,11 +8,13 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A fleet as one page that needs nothing else, with links to the pages of its logs."""
+"""A fleet as one page that needs nothing else, and as tables in CSV and Parquet."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+import csv
+import io
 from typing import Any
 
 from gyro_calibration.diagnosis.charts import Chart, draw, element, joined, Line, Markup
@@ -31,6 +33,8 @@ _PER = {'age': 'year', 'temperature': 'K'}
 _LONG = 12
 #: Of a normal distribution, as charts draw it.
 _BAND = 1.96
+_COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
+            'samples', 'duration_s', 'sha256', 'page')
 #: Sorts a table by the column that is clicked, and shows the rows that hold a text.
 _SCRIPT = Markup("""<script>
 'use strict';
@@ -217,3 +221,70 @@ def _dates_chart(found: TypeFound, each: Found, name: str) -> Chart:
     return Chart(name, f'{spoken(each.name)} less that of the unit',
                  f'dates: {", ".join(found.dates)}', 'date', '', place, spoken(each.name), unit,
                  [Line('log', 'measured', factor * value, dots=True)], names=found.dates)
+
+
+# for other programs
+
+def tables(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
+    """
+    Return the content of files by name: values of logs, and of units, one row each, in SI.
+
+    Parameters
+    ----------
+    types : as `summary.summarized` returns them
+    records : of all logs
+
+    """
+    found = {}
+    for name, rows in (('logs', list(map(_log_row, records))), ('units', list(_unit_rows(types)))):
+        columns = list(dict.fromkeys(key for row in rows for key in row))
+        if not columns:
+            continue
+        text = io.StringIO()
+        writer = csv.DictWriter(text, columns, lineterminator='\n')
+        writer.writeheader()
+        writer.writerows(rows)
+        found[f'{name}.csv'] = text.getvalue().encode()
+        packed = _parquet(columns, rows)
+        if packed is not None:
+            found[f'{name}.parquet'] = packed
+    return found
+
+
+def _log_row(record: Mapping[str, Any]) -> dict[str, Any]:
+    row = {key: record.get(key) for key in _COLUMNS}
+    for kind in ('values', 'slow'):
+        for name, value in record.get(kind, {}).items():
+            row[name], row[f'{name}_deviation'] = value['value'], value['deviation']
+    return row
+
+
+def _unit_rows(types: Sequence[TypeFound]) -> Iterator[dict[str, Any]]:
+    for found in types:
+        for place, unit in enumerate(found.units):
+            for name, each in found.values.items():
+                outlying = {one.number for one in each.outlying_units}
+                yield {'type': found.name, 'unit': unit, 'value': name, 'si_unit': each.unit,
+                       'estimate': float(each.units.value[place]),
+                       'standard_deviation': float(each.units.deviation[place]),
+                       'low': float(each.units.low[place]), 'high': float(each.units.high[place]),
+                       'from_type': float(each.from_type.value[place]),
+                       'next_low': float(each.next_log.low[place]),
+                       'next_high': float(each.next_log.high[place]),
+                       'stands_out': place in outlying,
+                       **{f'{over}_slope{end}': float(value[place])
+                          for over, slope in each.unit_slopes.items() for end, value in (
+                              ('', slope.value), ('_low', slope.low), ('_high', slope.high))}}
+
+
+def _parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> bytes | None:
+    """Return a table in Parquet; None where pyarrow is not installed."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        return None
+    stream = io.BytesIO()
+    parquet.write_table(pyarrow.table({
+        name: [row.get(name) for row in rows] for name in columns}), stream)
+    return stream.getvalue()

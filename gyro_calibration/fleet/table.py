@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 import csv
 from dataclasses import dataclass, replace
 from datetime import date
@@ -22,17 +23,17 @@ import math
 import os
 from pathlib import Path
 import re
-import struct
-from typing import Any, BinaryIO
+from typing import Any
 
 from gyro_calibration.files import InputError, opened, plain, read_bytes
+from gyro_calibration.logs.ros_bag import metadata_of
 from gyro_calibration.model.settings_file import read_settings
 
 #: What is known of a log, apart from its path.
 KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 LOGS = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
-#: Bytes of a table, of the notes of a log, and of the metadata of a recording that are read.
+#: Bytes of a table, and of the notes of a log, that are read.
 _MOST, _NOTES = 50_000_000, 4096
 #: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
 _KEYED = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)', re.IGNORECASE)
@@ -40,7 +41,6 @@ _SPOKEN = re.compile(r'\b(unit|drive) (\w*\d\w*|[a-z](?=[,;.)]|$))', re.IGNORECA
 _NAMED = {'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
           'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
           'drive': re.compile(r'(?:^|[_.-])drive[_-]?([A-Za-z0-9]+)', re.IGNORECASE)}
-_MAGIC, _CHUNK_HEAD, _METADATA = b'\x89MCAP0\r\n', 9, 0x0C
 
 
 @dataclass(frozen=True)
@@ -270,11 +270,7 @@ def _notes(path: str) -> dict[str, str]:
         if not line.startswith('#'):
             break
         lines.append(line)
-    return said_in('\n'.join(lines))
-
-
-def said_in(text: str) -> dict[str, str]:
-    """Return what a text says of a log, such as "unit: 7" or "unit 7, drive h"."""
+    text = '\n'.join(lines)  # such as "unit: 7" or "unit 7, drive h"
     found = {name.lower(): value for name, value in reversed(_SPOKEN.findall(text))}
     return {**found, **{name.lower(): value for name, value in reversed(_KEYED.findall(text))}}
 
@@ -292,35 +288,9 @@ def _custom(folder: Path) -> dict[str, str]:
 def _of_recordings(paths: Sequence[Path]) -> dict[str, str]:
     stated: dict[str, str] = {}
     for path in paths:
-        try:
-            with opened(path) as file:
-                stated |= dict(_metadata(file))
-        except (OSError, struct.error):  # reported where the log is read
-            continue
+        with suppress(OSError):  # reported where the log is read
+            stated |= {name.lower(): value for name, value in metadata_of(path).items()}
     return stated
-
-
-def _metadata(file: BinaryIO) -> Iterator[tuple[str, str]]:
-    """Give names and values of the metadata records of an MCAP file."""
-    if file.read(len(_MAGIC)) != _MAGIC:
-        return
-    while len(head := file.read(_CHUNK_HEAD)) == _CHUNK_HEAD:
-        code, length = struct.unpack('<BQ', head)
-        if code != _METADATA or length > _MOST:
-            file.seek(length, os.SEEK_CUR)
-            continue
-        texts = list(_texts(file.read(length)))
-        yield from ((name.lower(), value) for name, value in zip(texts[1::2], texts[2::2]))
-
-
-def _texts(body: bytes) -> Iterator[str]:
-    """Give the name of a metadata record, then its names and values in turn."""
-    place, first = 0, True
-    while place < len(body):
-        (length,) = struct.unpack_from('<I', body, place)
-        yield body[place + 4:place + 4 + length].decode(errors='replace')
-        place += 4 + length + (4 if first else 0)
-        first = False
 
 
 def _temperature(log: str, text: str) -> float:

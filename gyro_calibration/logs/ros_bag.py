@@ -54,8 +54,8 @@ _PIECE = 1 << 20
 
 _MAGIC = b'\x89MCAP0\r\n'
 _ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
-#: Name of the metadata of a recorder of this program, and the most characters shown of a text.
-ABOUT, _MOST_CHARACTERS = 'gyro_calibration', 200
+#: Name of the metadata of a recorder of this program.
+ABOUT = 'gyro_calibration'
 
 _TABLES = {'topics', 'messages', 'message_definitions'}
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
@@ -114,7 +114,7 @@ class Contents:
 
 def _printable(text: object) -> str:
     """Return a text of a file for a sentence: one line, not too long, no control characters."""
-    return plain(' '.join(str(text).split()))[:_MOST_CHARACTERS]
+    return plain(' '.join(str(text).split()))[:200]
 
 
 def is_recording(path: str | Path) -> bool:
@@ -278,21 +278,22 @@ def _from_mcap(source: Path, path: Path, contents: Contents,
                               'and was read up to there')
 
 
-def _records(stream: BinaryIO, end: int, contents: Contents) -> Iterator[tuple[int, bytes]]:
-    """Give code and content of each record of a file or a chunk; a torn chunk is cut short."""
+def _records(stream: BinaryIO, end: int, contents: Contents,
+             wanted: tuple[_Code, ...] = _READ) -> Iterator[tuple[int, bytes]]:
+    """Give code and content of the records of a file or a chunk; a torn chunk is cut short."""
     while len(head := stream.read(9)) == 9:
         code, length = struct.unpack('<BQ', head)
         left = end - stream.tell()
-        if code == _Code.CHUNK and left < length <= LARGEST:
+        if code == _Code.CHUNK in wanted and left < length <= LARGEST:
             yield code, stream.read()
             return
         if length > left or code == 0:
             stream.seek(-9, io.SEEK_CUR)
             return
-        if code in _READ and length <= LARGEST:
+        if code in wanted and length <= LARGEST:
             yield code, stream.read(length)
             continue
-        contents.left_out += code in _READ
+        contents.left_out += code in wanted
         stream.seek(length, io.SEEK_CUR)
         if code == _Code.DATA_END:
             yield code, b''
@@ -323,7 +324,10 @@ class _McapReader:
             elif code == _Code.CHANNEL:
                 self._add_channel(body)
             elif code == _Code.METADATA:
-                self._contents.about += _about(body)
+                name, pairs = _metadata(body)
+                if name == ABOUT:  # of a recorder of this program
+                    self._contents.about += [_printable(f'{key}: {value}')
+                                             for key, value in pairs.items()]
         except (_Damaged, struct.error):
             self._contents.left_out += 1
 
@@ -355,15 +359,33 @@ def _text(body: bytes, place: int) -> tuple[str, int]:
     return body[place + 4:end].decode(errors='replace'), end
 
 
-def _about(body: bytes) -> list[str]:
-    """Return what a recorder of this program says of a recording, as notes."""
+def _metadata(body: bytes) -> tuple[str, dict[str, str]]:
+    """Return the name of a record of metadata, and its pairs."""
     name, place = _text(body, 0)
-    notes, place = [], place + 4
-    while name == ABOUT and place < len(body):
+    pairs, place = {}, place + 4
+    while place < len(body):
         key, place = _text(body, place)
-        value, place = _text(body, place)
-        notes.append(_printable(f'{key}: {value}'))
-    return notes
+        pairs[key], place = _text(body, place)
+    return name, pairs
+
+
+def metadata_of(path: str | Path) -> dict[str, str]:
+    """
+    Return all metadata of an MCAP file, without those that are damaged.
+
+    Raises
+    ------
+    OSError : it cannot be opened
+
+    """
+    found: dict[str, str] = {}
+    with opened(path) as file:
+        if file.read(len(_MAGIC)) == _MAGIC:
+            for code, body in _records(file, os.fstat(file.fileno()).st_size, Contents(),
+                                       (_Code.METADATA,)):
+                with suppress(_Damaged, struct.error):
+                    found |= _metadata(body)[1] if code == _Code.METADATA else {}
+    return found
 
 
 def _chunk_data(body: bytes, torn: bool, budget: _Budget) -> bytes:

@@ -20,7 +20,7 @@ import math
 from pathlib import Path
 
 from gyro_calibration.files import InputError, LARGEST, read_bytes, reason
-from gyro_calibration.logs.log import Array, DEGREE, SHORTEST, shown
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, SHORTEST, shown
 import numpy as np
 
 #: Bytes of a motion profile: an hour at 100 Hz has half of it.
@@ -83,6 +83,27 @@ def from_headings(time: Array, heading: Array) -> Motion:
     return Motion(np.asarray(time, float) - time[0], np.asarray(heading, float) - heading[0])
 
 
+def motion_of(log: Log) -> tuple[Motion, float]:
+    """
+    Return the motion of the reference of a log with a time, and the time of its beginning, s.
+
+    Raises
+    ------
+    DataRefused : the reference is lost everywhere
+    InputError : there is none
+
+    """
+    for values, motion in ((log.reference_heading, from_headings),
+                           (log.reference_rate, from_rates)):
+        if values is not None and log.time is not None:
+            known = np.isfinite(values)
+            if known.sum() < 2:
+                raise DataRefused(f'the reference has {known.sum()} values; at least 2 are '
+                                  'needed: give the motion')
+            return motion(log.time[known], values[known]), float(log.time[known][0])
+    raise InputError('no reference over time; give the motion')
+
+
 def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
     """
     Return a motion of constant rates.
@@ -114,6 +135,12 @@ NAMED = {
     'robot': ROBOT,
     'rest': from_rates(np.array([0.0, 60.0]), np.zeros(2)),
 }
+
+
+def motion_by_name(motion: str | Path) -> Motion:
+    """Return a motion of `NAMED`, or that of a profile; raise as `read_motion`."""
+    return NAMED.get(str(motion)) or read_motion(motion)
+
 
 _WORDS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE,
           'reference_heading_rad': 1.0, 'rate_dps': DEGREE, 'rate_rad_s': 1.0,

@@ -31,6 +31,7 @@ from gyro_calibration import (
     write_log,
     write_model,
 )
+from gyro_calibration.model.motion import CALIBRATION
 import numpy as np
 import pytest
 
@@ -41,10 +42,16 @@ GYRO = read_model({'effects': {'bias': {'bias': 0.002}, 'scale_factor_error':
 NOISE = read_model({'effects': {}, 'noise': {'angle_random_walk': 3e-4}})
 
 
+def run_and_rest():
+    """Return the log of the built-in motion and of 10 s of rest after it."""
+    return simulate(GYRO, (np.append(CALIBRATION.time, 30.0), np.append(CALIBRATION.rate, 0.0)),
+                    seed=1)
+
+
 @pytest.fixture(scope='module')
 def run_model():
     """Return the model of a self-calibration by the built-in motion."""
-    return self_calibrate(simulate(GYRO, 'calibration', seed=1), 'calibration', NOISE)
+    return self_calibrate(run_and_rest(), 'calibration', NOISE)
 
 
 @pytest.mark.parametrize('order', ['import gyro_calibration.allan.deviation; {}',
@@ -89,13 +96,14 @@ def test_a_model_of_a_mapping_is_that_of_its_file(tmp_path):
 
 
 def test_a_run_gives_what_the_command_line_gives(run_model, run, tmp_path):
-    write_log(tmp_path / 'run.csv', simulate(GYRO, 'calibration', seed=1))
+    write_log(tmp_path / 'run.csv', run_and_rest())
     write_model(tmp_path / 'noise.yaml', NOISE)
     _, text, _ = run('self-calibrate', tmp_path / 'run.csv', '--model', tmp_path / 'noise.yaml',
                      '--profile', ROOT / 'config/motion_profile.csv', '--json')
     said = json.loads(text)
     assert run_model.scale_factor_error == pytest.approx(said['scale_factor_error'])
     assert run_model.bias == pytest.approx(said['bias'])
+    assert run_model.bias_std == pytest.approx(said['bias_standard_deviation'])
     assert abs(run_model.scale_factor_error - 0.03) < 4.0 * run_model.scale_factor_error_std
     assert 'Scale factor error' in run_model._repr_html_()
 

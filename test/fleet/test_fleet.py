@@ -30,11 +30,10 @@ from gyro_calibration.files import InputError
 from gyro_calibration.fleet.outliers import changes, outliers
 from gyro_calibration.fleet.pooling import Observed, Pooled
 from gyro_calibration.fleet.prior import models
-from gyro_calibration.fleet.report import report
+from gyro_calibration.fleet.report import report, tables
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes
 from gyro_calibration.fleet.summary import counted, data, sentences, summarized
 from gyro_calibration.fleet.table import described, entries, Entry, pattern
-from gyro_calibration.fleet.tabular import tables
 from gyro_calibration.fleet.work import done, Task
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
