@@ -25,19 +25,10 @@ from gyro_calibration.allan import (
     NoiseFit,
     Record,
 )
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
 from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import (
-    add_log,
-    add_picture,
-    Answer,
-    output_of,
-    read,
-    time_of,
-    UsageError,
-    verb,
-    with_origin,
-)
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
@@ -50,11 +41,12 @@ UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE),
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'allan', _allan,
-                  'find the noise figures of a gyro in a record at rest, by its Allan deviation',
-                  'rest.csv --rate 100 --picture allan.png --model model.yaml --out model.yaml')
-    add_log(parser)
-    add_picture(parser, 'the chart')
+    parser = verb.add(verbs, 'allan', _allan,
+                      'find the noise figures of a gyro in a record at rest, by its Allan '
+                      'deviation', 'rest.csv --rate 100 --picture allan.png --model model.yaml '
+                      '--out model.yaml')
+    verb.add_log(parser)
+    verb.add_picture(parser, 'the chart')
     parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model to add the '
                         'noise figures to; default: a new one')
     parser.add_argument('--out', metavar='MODEL.yaml',
@@ -65,10 +57,10 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _allan(given: argparse.Namespace) -> Answer:
     if given.model and not given.out:
         raise UsageError('--model was given without --out; give the file to write with --out')
-    model, log = read_model(given.model) if given.model else GyroModel(), read(given)
+    model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
     try:
-        time = time_of(given, log)
-        record = even_record(time, output_of(given, log), log.moving)
+        time = verb.time_of(given, log)
+        record = even_record(time, verb.output_of(given, log), log.moving)
         with under_way('noise figures from the Allan deviation'):
             chart = allan_deviation(record.rate, record.interval)
             fit = fit_noise(record.rate, record.interval)
@@ -77,7 +69,7 @@ def _allan(given: argparse.Namespace) -> Answer:
     if given.picture:
         draw_allan(given.picture, chart, fit, names(fit))
     if given.out:
-        write_model(given.out, replace(with_origin(given, model), noise=fit.noise,
+        write_model(given.out, replace(verb.with_origin(given, model), noise=fit.noise,
                                        noise_bounds=fit.noise_bounds))
     of_model = ['The bias instability of the model is that of the fit of all parts, '
                 'since the model adds N and K to it.'] if given.out else []

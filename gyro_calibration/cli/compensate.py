@@ -19,16 +19,8 @@ from datetime import datetime, timezone
 import math
 from typing import Any
 
-from gyro_calibration.cli.verb import (
-    add_log,
-    Answer,
-    not_negative,
-    output_of,
-    read,
-    read_blocks,
-    UsageError,
-    verb,
-)
+from gyro_calibration.cli import verb
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.gaps import Intervals
@@ -50,16 +42,16 @@ import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'compensate', _compensate,
-                  'add compensated rates, and for samples in time the heading, to a log',
-                  'drive.csv --model model.yaml --out compensated.csv')
-    add_log(parser)
+    parser = verb.add(verbs, 'compensate', _compensate,
+                      'add compensated rates, and for samples in time the heading, to a log',
+                      'drive.csv --model model.yaml --out compensated.csv')
+    verb.add_log(parser)
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')
-    parser.add_argument('--threshold', type=not_negative, default=0.0, metavar='DPS',
+    parser.add_argument('--threshold', type=verb.not_negative, default=0.0, metavar='DPS',
                         help='rates below it are set to 0, as below 0.3 in the node; '
                         'default: 0, off')
-    parser.add_argument('--window', type=not_negative, default=0.2, metavar='S',
+    parser.add_argument('--window', type=verb.not_negative, default=0.2, metavar='S',
                         help='averaging time of the threshold filter; 0: single samples; '
                         'default: %(default)g')
     parser.add_argument('--rest', action='store_true', help='detect standstill, as the node does: '
@@ -160,12 +152,12 @@ def _compensated(given: argparse.Namespace, model: GyroModel,
 
 def _chosen(given: argparse.Namespace, model: GyroModel) -> Iterator[Piece]:
     if given.rest or given.hindsight:
-        log = read(given)
-        return followed(replace(log, output=output_of(given, log)), model, given.hindsight,
+        log = verb.read(given)
+        return followed(replace(log, output=verb.output_of(given, log)), model, given.hindsight,
                         given.log)
     threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
-    return pieces((replace(log, output=output_of(given, log)) for log in read_blocks(given)),
-                  model, threshold, given.log)
+    return pieces((replace(log, output=verb.output_of(given, log))
+                   for log in verb.read_blocks(given)), model, threshold, given.log)
 
 
 def _checked(pieces: Iterator[Piece], model: GyroModel, file: str) -> Iterator[Piece]:

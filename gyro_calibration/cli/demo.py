@@ -16,15 +16,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.cli.verb import Answer, UsageError, verb, whole
+from gyro_calibration.cli import verb
+from gyro_calibration.cli.verb import Answer, UsageError
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'demo', _demo, 'emulated gyro, driver, compensation, self-calibration '
-                  'and a drive, on this machine', '--out demo')
+    parser = verb.add(verbs, 'demo', _demo, 'emulated gyro, driver, compensation, '
+                      'self-calibration and a drive, on this machine', '--out demo')
     parser.add_argument('--out', default='demo', metavar='DIR',
                         help='folder for picture, table and log; default: %(default)s')
-    parser.add_argument('--seed', type=whole, default=0,
+    parser.add_argument('--seed', type=verb.whole, default=0,
                         help='seed of the noise; default: %(default)s')
     return parser
 

@@ -19,16 +19,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import (
-    add_log,
-    Answer,
-    origin_of,
-    read_each,
-    UsageError,
-    verb,
-    whole,
-)
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.diagnosis.data_quality import KINDS
 from gyro_calibration.diagnosis.extended_model import calibrated
 from gyro_calibration.diagnosis.findings import Diagnosis
@@ -45,30 +38,30 @@ import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'diagnose', _diagnose, 'measure the error of a simulation, name the '
-                  'cause, extend the model, measure the gain',
-                  'drive.csv --model gyro.yaml --out diagnosis')
-    add_log(parser, nargs='+')
+    parser = verb.add(verbs, 'diagnose', _diagnose, 'measure the error of a simulation, name the '
+                      'cause, extend the model, measure the gain',
+                      'drive.csv --model gyro.yaml --out diagnosis')
+    verb.add_log(parser, nargs='+')
     parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
                         'ideal gyro with the bias and scale factor error that fit the logs best')
     parser.add_argument('--reference-kind', choices=KINDS,
                         help='kind of the reference; default: detected from the log')
     parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and '
                         'model.yaml, the extended model')
-    parser.add_argument('--seed', type=whole, default=0, metavar='N',
+    parser.add_argument('--seed', type=verb.whole, default=0, metavar='N',
                         help='seed of the random draws of significance tests; default: 0')
     return parser
 
 
 def _diagnose(given: argparse.Namespace) -> Answer:
-    logs = list(read_each(given))
+    logs = list(verb.read_each(given))
     model = None if given.model is None else read_model(given.model)
     with under_way('diagnosis') as on_progress:
         found = diagnosed(logs, model, given.seed, given.reference_kind, given.log, on_progress)
     found = replace(found, logs=tuple(given.log))
     if found.model is not model:
         found = replace(found, model=replace(
-            found.model, origin={**found.model.origin, **origin_of(found.logs)}))
+            found.model, origin={**found.model.origin, **verb.origin_of(found.logs)}))
     written = write_diagnosis(given.out, found) if given.out else []
     return Answer([*lines(found), *written], found.figures())
 

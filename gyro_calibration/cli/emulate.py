@@ -20,18 +20,9 @@ import signal
 import sys
 from typing import Any
 
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.simulate import add_motion, simulated
-from gyro_calibration.cli.verb import (
-    add_topics,
-    AS_IT_IS,
-    output_of,
-    positive,
-    read,
-    sensitivity,
-    time_of,
-    UsageError,
-    verb,
-)
+from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find, Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.files import plain
@@ -40,38 +31,38 @@ import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from a model '
-                  'and a motion or from a log; prints its path',
-                  '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
+    parser = verb.add(verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from a '
+                      'model and a motion or from a log; prints its path',
+                      '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
     parser.add_argument('--protocol', required=True, metavar='NAME',
                         help=f'one of {", ".join(PROTOCOLS)}')
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument('--log', metavar='LOG', help='send a recording')
     source.add_argument('--model', metavar='MODEL.yaml', help='send samples of a simulated gyro')
     add_motion(parser, default='rest')
-    parser.add_argument('--rate', type=positive, metavar='HZ',
+    parser.add_argument('--rate', type=verb.positive, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=positive, metavar='DPS',
+    parser.add_argument('--sensitivity', type=verb.positive, metavar='DPS',
                         help='deg/s per count of the wire format; default: that of the protocol')
     parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc',
                         help='columns of the protocol csv; default: %(default)s')
     parser.add_argument('--link', metavar='PATH',
                         help='symbolic link to the pseudo-terminal, whose own name varies')
-    parser.add_argument('--speed', type=positive, default=1.0,
+    parser.add_argument('--speed', type=verb.positive, default=1.0,
                         help='factor to real time; default: 1')
     parser.add_argument('--wait', action='store_true',
                         help='start when a program has opened the port')
     parser.add_argument('--repeat', action='store_true', help='start again at the end')
-    add_topics(parser)
-    parser.set_defaults(**AS_IT_IS)
+    verb.add_topics(parser)
+    parser.set_defaults(**verb.AS_IT_IS)
     return parser
 
 
 def _emulate(given: argparse.Namespace) -> None:
     """Print the path at once, since this verb sends until it ends."""
     protocol, settings = _wire(given)
-    log = read(given) if given.log else simulated(given)[0]
-    time, output = time_of(given, log), output_of(given, log)
+    log = verb.read(given) if given.log else simulated(given)[0]
+    time, output = verb.time_of(given, log), verb.output_of(given, log)
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
                           'have an output; give a log with two or more')
@@ -97,7 +88,7 @@ def _handle_signals(handler: Any) -> None:
 def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
     try:
         protocol, settings = find(given.protocol), Settings(
-            sensitivity=sensitivity(given), columns=tuple(given.columns.split(',')))
+            sensitivity=verb.sensitivity(given), columns=tuple(given.columns.split(',')))
         protocol.check(settings)
     except ValueError as error:
         raise UsageError(str(error)) from None

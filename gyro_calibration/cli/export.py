@@ -16,24 +16,25 @@ import argparse
 from dataclasses import asdict
 from typing import Any
 
-from gyro_calibration.cli.verb import Answer, degrees_celsius, positive, UsageError, verb
+from gyro_calibration.cli import verb
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.files import write_atomically
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.simulator_export import exported, figures, SIMULATORS
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'export', _export, 'write a model as robot simulators read it',
-                  '--to sdf model.yaml --sample-rate 100')
+    parser = verb.add(verbs, 'export', _export, 'write a model as robot simulators read it',
+                      '--to sdf model.yaml --sample-rate 100')
     parser.add_argument('model', metavar='MODEL.yaml')
     parser.add_argument('--to', required=True, choices=SIMULATORS,
                         help='sdf: noise of an <imu> of Gazebo; isaac: noise of an observation '
                         'of Isaac Lab; mujoco: a <gyro> sensor of MuJoCo')
-    parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ',
+    parser.add_argument('--sample-rate', type=verb.positive, default=100.0, metavar='HZ',
                         help='sample rate of the simulated gyro; default: 100')
-    parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC',
+    parser.add_argument('--temperature', type=verb.degrees_celsius, metavar='DEGC',
                         help='default: the reference temperature of the model')
-    parser.add_argument('--span', type=positive, default=3600.0, metavar='S',
+    parser.add_argument('--span', type=verb.positive, default=3600.0, metavar='S',
                         help='longest time over which the bias drifts as modelled; default: 3600')
     parser.add_argument('--out', metavar='FILE', help='default: the text is printed')
     return parser

@@ -29,18 +29,9 @@ from gyro_calibration.calibration.encoder import (
 from gyro_calibration.calibration.rate_table import Bin, binned, Calibration, fit_effects
 from gyro_calibration.calibration.scatter import FEWEST_SWEEPS
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGIES
-from gyro_calibration.cli import plots
+from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import (
-    add_log,
-    add_picture,
-    Answer,
-    origin_of,
-    read_each,
-    UsageError,
-    verb,
-    wrapped,
-)
+from gyro_calibration.cli.verb import Answer, UsageError, wrapped
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.effects import (
     Effect,
@@ -60,10 +51,10 @@ _UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an encoder, '
-                  'or any log with a reference',
-                  'table.csv --out model.yaml')
-    add_log(parser, nargs='+')
+    parser = verb.add(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an encoder, '
+                      'or any log with a reference',
+                      'table.csv --out model.yaml')
+    verb.add_log(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
                         help='dwells: means at constant rates; '
@@ -85,8 +76,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
     parser.add_argument('--matrix', action='store_true', help='print the polynomial as the '
                         'matrix C of Ojeda et al., in deg/s and degC')
-    add_picture(parser, 'the errors before and after')
-    add_picture(parser, 'the error over rate and temperature', '--surface')
+    verb.add_picture(parser, 'the errors before and after')
+    verb.add_picture(parser, 'the error over rate and temperature', '--surface')
     return parser
 
 
@@ -110,7 +101,7 @@ def _orders(text: str) -> list[Effect]:
 
 
 def _fit(given: argparse.Namespace) -> Answer:
-    logs = dict(zip(given.log, read_each(given)))
+    logs = dict(zip(given.log, verb.read_each(given)))
     if _method(given, logs) == 'dwells':
         return _fit_dwells(given, logs)
     return _fit_heading(given, logs)
@@ -132,7 +123,7 @@ def _stored(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
                 'technology': given.technology}
     model = replace(model, gyro={name: value for name, value in identity.items() if value},
-                    origin=origin_of(given.log))
+                    origin=verb.origin_of(given.log))
     if given.out:
         write_model(given.out, model)
     return model

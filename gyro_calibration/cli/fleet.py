@@ -23,8 +23,9 @@ import re
 from typing import Any
 
 from gyro_calibration.calibration.course_over_ground import PRIORS
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.progress import bar
-from gyro_calibration.cli.verb import Answer, origin_of, positive, UsageError, verb, whole, wrapped
+from gyro_calibration.cli.verb import Answer, UsageError, wrapped
 from gyro_calibration.diagnosis.gates import is_confused
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.files import plain, write_atomically
@@ -54,9 +55,9 @@ _SPOKEN = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'fleet', _fleet, 'calibrate and diagnose many logs of many gyros, and '
-                  'attribute errors to the unit, the type and the reference',
-                  'drives/ --out fleet')
+    parser = verb.add(verbs, 'fleet', _fleet, 'calibrate and diagnose many logs of many gyros, '
+                      'and attribute errors to the unit, the type and the reference',
+                      'drives/ --out fleet')
     parser.add_argument('logs', metavar='LOGS', nargs='+', help='logs, folders or globs of them, '
                         'a list (.txt), or a table (.csv) with the columns log and any of unit, '
                         'type, drive, date, temperature')
@@ -66,18 +67,18 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
     parser.add_argument('--type', metavar='NAME', dest='gyro_type', help='type of the gyro in '
                         'logs without a type')
-    parser.add_argument('--rate', type=positive, metavar='HZ',
+    parser.add_argument('--rate', type=verb.positive, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
     parser.add_argument('--technology', choices=list(PRIORS), default='mems',
                         help='technology of the gyros; default: mems')
     parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only, which is '
                         'faster')
-    parser.add_argument('--seed', type=whole, default=0, metavar='N', help='seed of the random '
-                        'draws of a diagnosis; default: 0')
+    parser.add_argument('--seed', type=verb.whole, default=0, metavar='N', help='seed of the '
+                        'random draws of a diagnosis; default: 0')
     parser.add_argument('--workers', type=_count, metavar='N', help='number of processes; '
                         'default: one per core')
-    parser.add_argument('--memory', type=positive, metavar='GB', help='memory limit per worker; '
-                        'default: an equal share of this machine')
+    parser.add_argument('--memory', type=verb.positive, metavar='GB', help='memory limit per '
+                        'worker; default: an equal share of this machine')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
                         'as tcp://host:8786; its workers need the same files')
     return parser
@@ -139,7 +140,7 @@ def _written(given: argparse.Namespace, types: Sequence[TypeFound],
             name = 'models/' + '-'.join(re.sub(r'[^\w.-]', '_', each)[:60] for each in words)
             while f'{name}.yaml' in content:
                 name += '_'
-            text = model_text(replace(model, origin={**model.origin, **origin_of([])}))
+            text = model_text(replace(model, origin={**model.origin, **verb.origin_of([])}))
             content[f'{name}.yaml'] = text.encode()
             names += [] if unit else [f'{name}.yaml']
     for name, each in content.items():

@@ -25,16 +25,10 @@ from gyro_calibration.calibration.motion_design import (
     Plan,
     Prediction,
 )
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_motion
 from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import (
-    add_picture,
-    Answer,
-    positive,
-    UsageError,
-    verb,
-    whole,
-)
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
@@ -59,24 +53,25 @@ LENGTHS, LONGEST = (20.0, 30.0, 60.0, 120.0), 300.0
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'plan', _plan,
-                  'compute the motion that calibrates best within what a robot can do',
-                  '--limits limits.yaml --seconds 20 --out profile.csv')
+    parser = verb.add(verbs, 'plan', _plan,
+                      'compute the motion that calibrates best within what a robot can do',
+                      '--limits limits.yaml --seconds 20 --out profile.csv')
     parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
                         help='limits of the robot; config/limits.yaml is an example')
-    parser.add_argument('--seconds', type=positive, default=20.0, metavar='S',
+    parser.add_argument('--seconds', type=verb.positive, default=20.0, metavar='S',
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
-    add_picture(parser, 'the motion')
+    verb.add_picture(parser, 'the motion')
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model with noise figures; default: that of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
                         help='drive after the calibration whose heading error is predicted, one '
                         f'of {", ".join(NAMED)} or a profile; default: robot')
-    parser.add_argument('--drive', type=positive, metavar='S',
+    parser.add_argument('--drive', type=verb.positive, metavar='S',
                         help='length of that drive, which is repeated; default: its own length')
-    parser.add_argument('--seed', type=whole, default=1, help='seed of the search; default: 1')
+    parser.add_argument('--seed', type=verb.whole, default=1,
+                        help='seed of the search; default: 1')
     return parser
 
 

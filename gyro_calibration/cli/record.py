@@ -22,7 +22,8 @@ import threading
 import time
 from typing import Any
 
-from gyro_calibration.cli.verb import Answer, positive, say, sensitivity, UsageError, verb
+from gyro_calibration.cli import verb
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
@@ -52,12 +53,12 @@ _PATIENCE = 5.0  # s; without a message, until topics without a publisher are na
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'record', _record,
-                  'record a gyro, from its port or from topics, until Ctrl-C',
-                  '--port /dev/ttyUSB0 --out drive.csv')
+    parser = verb.add(verbs, 'record', _record,
+                      'record a gyro, from its port or from topics, until Ctrl-C',
+                      '--port /dev/ttyUSB0 --out drive.csv')
     parser.add_argument('--out', required=True, metavar='FILE',
                         help=f'a new file, {", ".join(KINDS)}')
-    parser.add_argument('--seconds', type=positive, metavar='N',
+    parser.add_argument('--seconds', type=verb.positive, metavar='N',
                         help='duration, s; default: until interrupted')
     topics = parser.add_argument_group('from topics, with ROS 2')
     topics.add_argument('--topic', metavar='TOPIC',
@@ -76,7 +77,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                       help='bit/s; default: that of the protocol')
     port.add_argument('--columns', metavar='NAME,...', help='columns of the protocol csv; '
                       f'default: {",".join(Settings().columns)}')
-    port.add_argument('--sensitivity', type=positive, metavar='DPS',
+    port.add_argument('--sensitivity', type=verb.positive, metavar='DPS',
                       help='deg/s per count; default: that of the protocol')
     port.add_argument('--axis', default='z', choices=['x', 'y', 'z'],
                       help='axis of a gyro with three; default: z')
@@ -85,7 +86,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     port.add_argument('--increments', choices=list(_INCREMENTS), default='default',
                       help='whether the gyro sends angles, not rates; '
                       'default: that of the protocol')
-    port.add_argument('--sample-rate', type=positive, metavar='HZ',
+    port.add_argument('--sample-rate', type=verb.positive, metavar='HZ',
                       help='sample rate of the gyro; default: that of the protocol')
     return parser
 
@@ -241,7 +242,7 @@ class _PortSession(_Session):
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         try:
             self._settings = Settings(
-                sensitivity=sensitivity(given), invert=given.invert, axis=given.axis,
+                sensitivity=verb.sensitivity(given), invert=given.invert, axis=given.axis,
                 columns=columns, increments=_INCREMENTS[given.increments],
                 sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
@@ -300,7 +301,7 @@ class _PortSession(_Session):
         found, self._last_message = self._connection, message
         name = (f'samples of {found.protocol.name} come at {found.baud} bit/s'
                 if found.protocol else '')
-        say(name if state.name == 'reading' else message)
+        verb.say(name if state.name == 'reading' else message)
 
     def _why(self) -> str:
         return f' ({self._connection.last_error})' if self._connection.last_error else ''
@@ -392,8 +393,8 @@ class _TopicSession(_Session):
             self._waiting = False
             self._missing, self._known = node.missing, node.known()
             if self._missing:
-                say(f'no publisher so far of {", ".join(self._missing)}; '
-                    f'there are {", ".join(self._known) or "none"}')
+                verb.say(f'no publisher so far of {", ".join(self._missing)}; '
+                         f'there are {", ".join(self._known) or "none"}')
 
     def _details(self) -> dict[str, Any]:
         return {**super()._details(), 'messages': self._messages}

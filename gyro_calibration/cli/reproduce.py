@@ -18,8 +18,9 @@ from itertools import count
 import textwrap
 from typing import Any
 
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.progress import bar
-from gyro_calibration.cli.verb import Answer, verb, whole
+from gyro_calibration.cli.verb import Answer
 from gyro_calibration.logs.log import Progress
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, Reproduction
@@ -29,12 +30,12 @@ HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'reproduce', _reproduce,
-                  'compare published numbers of the sources with those reproduced here',
-                  'hong_park')
+    parser = verb.add(verbs, 'reproduce', _reproduce,
+                      'compare published numbers of the sources with those reproduced here',
+                      'hong_park')
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
                         help=f'one of {", ".join(SOURCES)}; default: all')
-    parser.add_argument('--seed', type=whole, default=0,
+    parser.add_argument('--seed', type=verb.whole, default=0,
                         help='seed of the noise; default: 0, as in '
                         'docs/explanation/reproduction.md')
     return parser

@@ -32,20 +32,10 @@ from gyro_calibration.calibration.self_calibration import (
     usual_reference,
 )
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
 from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import (
-    add_log,
-    add_picture,
-    Answer,
-    not_negative,
-    output_of,
-    read,
-    time_of,
-    UsageError,
-    verb,
-    with_origin,
-)
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.log_compensation import compensate_log, none_plausible, plausible
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
@@ -63,17 +53,18 @@ _NEAREST = 'nearest'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'self-calibrate', _self_calibrate,
-                  'find scale factor error and bias from about 20 s of known motion',
-                  'run.csv --profile profile.csv --out model.yaml')
-    add_log(parser)
+    parser = verb.add(verbs, 'self-calibrate', _self_calibrate,
+                      'find scale factor error and bias from about 20 s of known motion',
+                      'run.csv --profile profile.csv --out model.yaml')
+    verb.add_log(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
                         'rate_dps; default: the reference of the log')
     parser.add_argument('--turns', type=_turns, metavar='N', help='number of full turns from a '
                         'mark to the same mark with standstill at both ends, counter-clockwise '
                         f'positive; {_NEAREST}: the number nearest to the gyro')
-    parser.add_argument('--marking', type=not_negative, metavar='DEG', help='standard deviation '
-                        'of the angle between both standstills on the mark, deg; '
+    parser.add_argument('--marking', type=verb.not_negative, metavar='DEG',
+                        help='standard deviation of the angle between both standstills on the '
+                        'mark, deg; '
                         f'default: {MARKING / DEGREE:g}')
     parser.add_argument('--method', choices=list(METHODS), default='likelihood',
                         help='default: likelihood; the others as published')
@@ -82,10 +73,10 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                              ('drift', 'deg/s', 'the drift'),
                              ('random-walk', 'deg/sqrt(h)', 'the angle random walk')):
         default = '; default: 0.58 for rates of a profile' if name == 'scale-deviation' else ''
-        parser.add_argument(f'--reference-{name}', type=not_negative, metavar='X',
+        parser.add_argument(f'--reference-{name}', type=verb.not_negative, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
                             f'or of the driven profile, {unit}{default}')
-    add_picture(parser, 'the run, and its heading error before and after')
+    verb.add_picture(parser, 'the run, and its heading error before and after')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with this self-calibration')
     return parser
@@ -115,13 +106,13 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
         raise UsageError('--marking needs --turns, whose mark it is the error of; '
                          'omit it, or give --turns')
     model = read_model(given.model) if given.model else GyroModel()
-    log = read(given)
+    log = verb.read(given)
     return (_of_turns(given, model, log) if given.turns is not None
             else _of_motion(given, model, log))
 
 
 def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, _ = time_of(given, log), output_of(given, log)
+    time, _ = verb.time_of(given, log), verb.output_of(given, log)
     motion, begin = ((read_motion(given.profile), time[0]) if given.profile
                      else _reference(given, log))
     _refuse_implausible(given, model, log)
@@ -180,7 +171,7 @@ def calibrated_run(log: Log, model: GyroModel, motion: Motion, begin: float, met
 
 
 def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, output = time_of(given, log), output_of(given, log)
+    time, output = verb.time_of(given, log), verb.output_of(given, log)
     known, rates = (_refuse_implausible(given, model, log),
                     compensate_log(with_self_calibration(model, None), log))
     marking = MARKING if given.marking is None else given.marking * DEGREE
@@ -219,7 +210,7 @@ def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, use
     """Write the calibration, and return the answer."""
     calibration = recorded(fit, method, log, used)
     if given.out:
-        write_model(given.out, with_self_calibration(with_origin(given, model), calibration))
+        write_model(given.out, with_self_calibration(verb.with_origin(given, model), calibration))
     refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
     remarks = ([f'{refused} rows have an implausible rate or temperature and are not used.']
                if refused else [])

@@ -18,15 +18,8 @@ import os
 import secrets
 from typing import Any
 
-from gyro_calibration.cli.verb import (
-    Answer,
-    degrees_celsius,
-    positive,
-    time_of,
-    UsageError,
-    verb,
-    whole,
-)
+from gyro_calibration.cli import verb
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import motion_by_name, NAMED
@@ -40,16 +33,16 @@ MOST = 20_000_000
 def add_motion(parser: argparse.ArgumentParser, **how: Any) -> None:
     parser.add_argument('--motion', metavar='FILE|NAME',
                         help=f'a motion profile, or one of {", ".join(NAMED)}', **how)
-    parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ',
+    parser.add_argument('--sample-rate', type=verb.positive, default=100.0, metavar='HZ',
                         help='default: 100')
-    parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC',
+    parser.add_argument('--temperature', type=verb.degrees_celsius, metavar='DEGC',
                         help='default: the reference temperature of the model')
-    parser.add_argument('--seed', type=whole, help='seed of the noise; default: random')
+    parser.add_argument('--seed', type=verb.whole, help='seed of the noise; default: random')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'simulate', _simulate, 'write the log of a simulated gyro',
-                  '--model model.yaml --motion robot --out log.csv --seed 1')
+    parser = verb.add(verbs, 'simulate', _simulate, 'write the log of a simulated gyro',
+                      '--model model.yaml --motion robot --out log.csv --seed 1')
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     add_motion(parser, required=True)
     parser.add_argument('--out', required=True, metavar='LOG.csv', help='.csv or .csv.gz')
@@ -58,7 +51,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 def _simulate(given: argparse.Namespace) -> Answer:
     log, seed = simulated(given)
-    duration = float(time_of(given, log)[-1])
+    duration = float(verb.time_of(given, log)[-1])
     write_log(given.out, replace(
         log, notes=(f'simulated with {given.model}, motion {given.motion}, seed {seed}',)))
     data = {'out': given.out, 'rows': len(log), 'duration_s': duration, 'seed': seed}

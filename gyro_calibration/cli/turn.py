@@ -30,18 +30,10 @@ from gyro_calibration.calibration.turn_error import (
     turn_errors,
     TurnErrors,
 )
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import (
-    add_log,
-    add_picture,
-    Answer,
-    output_of,
-    positive,
-    read,
-    UsageError,
-    verb,
-)
+from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.files import digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
@@ -56,21 +48,21 @@ Bins: TypeAlias = 'list[tuple[float, float, Mask]]'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'turn', _turn, 'error of a full turn over rate and temperature, '
-                  'with a static bias only and with a model',
-                  'table.csv --picture turn.png')
-    add_log(parser)
+    parser = verb.add(verbs, 'turn', _turn, 'error of a full turn over rate and temperature, '
+                      'with a static bias only and with a model',
+                      'table.csv --picture turn.png')
+    verb.add_log(parser)
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model to evaluate; default: the effects that the data support, '
                         'fitted for each sweep to the other sweeps')
     parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='technology of the gyro; '
                         'without --model, selects between effects that the data do not '
                         'distinguish')
-    parser.add_argument('--slowest', type=positive, default=SLOWEST / DEGREE, metavar='DPS',
+    parser.add_argument('--slowest', type=verb.positive, default=SLOWEST / DEGREE, metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')
     parser.add_argument('--out', metavar='TURN.csv', help='write the table, one row per turn, in '
                         'SI units')
-    add_picture(parser, 'the errors over the rate')
+    verb.add_picture(parser, 'the errors over the rate')
     return parser
 
 
@@ -78,8 +70,8 @@ def _turn(given: argparse.Namespace) -> Answer:
     if given.model and given.technology:
         raise UsageError('--technology selects effects, and --model has its own; give one of '
                          'the two')
-    log = read(given)
-    output_of(given, log)  # counts alone are wrong use here, as for other verbs
+    log = verb.read(given)
+    verb.output_of(given, log)  # counts alone are wrong use here, as for other verbs
     found = dwells(log)
     with under_way('fit of effects, and errors of turns'):
         rate, kept, remarks, data = (_fitted(found, given.technology) if given.model is None else

@@ -66,8 +66,8 @@ def wrapped(text: str, indent: int = 0) -> str:
                          break_on_hyphens=False)
 
 
-def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None],
-         summary: str, example: str) -> argparse.ArgumentParser:
+def add(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None],
+        summary: str, example: str) -> argparse.ArgumentParser:
     parser = verbs.add_parser(name, help=summary,
                               description=f'{summary[0].upper()}{summary[1:]}.',
                               epilog=f'example: gyro_calibration {name} {example}')
