@@ -35,27 +35,8 @@ from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.driver.timestamps import MessageClock
 from gyro_calibration.heading.gaps import Intervals
-from gyro_calibration.logs.cdr import (
-    along_z,
-    DEFINITIONS,
-    FORCE_COVARIANCE,
-    FORCE_Z,
-    heading_of,
-    IMU,
-    LAYOUTS,
-    MessageError,
-    NO_COVARIANCE,
-    NOT_REPORTED,
-    NSEC_PER_SEC,
-    ODOMETRY,
-    ORIENTATION_COVARIANCE,
-    parse,
-    RATE_COVARIANCE,
-    RATE_Z,
-    serialize,
-    TEMPERATURE,
-    TWIST,
-)
+from gyro_calibration.logs import cdr
+from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
 from gyro_calibration.logs.log import LogError
 from gyro_calibration.logs.recording import interpolated, wrong_kind
 from gyro_calibration.logs.ros_bag import ABOUT, MCAP_END, McapWriter, Message
@@ -181,16 +162,16 @@ class McapRecorder:
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Write a sample of a port as messages on the topics of the driver; the stamp is in ns."""
         force, temperature = sample.specific_force, sample.temperature
-        of_force = NO_COVARIANCE if force is None else along_z(ASSUMED_FORCE_NOISE ** 2)
+        of_force = cdr.NO_COVARIANCE if force is None else cdr.along_z(ASSUMED_FORCE_NOISE ** 2)
         messages = [] if temperature is None else [
-            ('/imu/temperature', TEMPERATURE, [temperature, 0.0])]
-        messages.append(('/imu/data_raw', IMU, [
-            0.0, 0.0, 0.0, 1.0, *NO_COVARIANCE,
-            0.0, 0.0, sample.output, *along_z(self.variance),
+            ('/imu/temperature', cdr.TEMPERATURE, [temperature, 0.0])]
+        messages.append(('/imu/data_raw', cdr.IMU, [
+            0.0, 0.0, 0.0, 1.0, *cdr.NO_COVARIANCE,
+            0.0, 0.0, sample.output, *cdr.along_z(self.variance),
             0.0, 0.0, force or 0.0, *of_force]))
         for topic, kind, numbers in messages:
-            data = serialize(stamp, 'gyro', numbers)
-            self.add_message(Message(topic, kind, stamp, data), DEFINITIONS[kind])
+            data = cdr.serialize(stamp, 'gyro', numbers)
+            self.add_message(Message(topic, kind, stamp, data), cdr.DEFINITIONS[kind])
 
     def add_message(self, message: Message, definition: str) -> None:
         """Write a message with the definition of its kind, as text."""
@@ -437,7 +418,7 @@ class MessageLog:
         if role is None or wrong:
             return
         try:
-            stamp, numbers = parse(message.data, LAYOUTS[message.kind])
+            stamp, numbers = cdr.parse(message.data, cdr.LAYOUTS[message.kind])
         except MessageError:
             self.damaged += 1
             return
@@ -452,10 +433,11 @@ class MessageLog:
             self.samples += 1
             if self._rows is None:
                 return
-            force, is_known = numbers[FORCE_Z], numbers[FORCE_COVARIANCE] != NOT_REPORTED
+            force = numbers[cdr.FORCE_Z]
+            is_known = numbers[cdr.FORCE_COVARIANCE] != cdr.NOT_REPORTED
             if is_known and force and np.isfinite(force):
                 self._rows.hold(stamp, {'acceleration_mps2': force})
-            self._rows.add_row(stamp, numbers[RATE_Z])
+            self._rows.add_row(stamp, numbers[cdr.RATE_Z])
         elif self._rows is not None and role == 'temperature' and np.isfinite(numbers[0]):
             self._rows.hold(stamp, {'temperature_degc': numbers[0]})
         elif self._rows is not None and role == 'reference':
@@ -464,11 +446,11 @@ class MessageLog:
 
 def _reference_of(kind: str, numbers: Sequence[float]) -> tuple[float | None, float | None]:
     """Return heading and rate in a message of a reference; None where its kind holds none."""
-    if kind == TWIST:
+    if kind == cdr.TWIST:
         return None, numbers[5]
-    heading = float(heading_of(*(numbers[place] for place in LAYOUTS[kind].kept[:4])))
-    if kind == IMU:
-        has_heading = numbers[ORIENTATION_COVARIANCE] != NOT_REPORTED
-        has_rate = numbers[RATE_COVARIANCE] != NOT_REPORTED
-        return heading if has_heading else None, numbers[RATE_Z] if has_rate else None
-    return heading, numbers[48] if kind == ODOMETRY else None
+    heading = float(cdr.heading_of(*(numbers[place] for place in cdr.LAYOUTS[kind].kept[:4])))
+    if kind == cdr.IMU:
+        has_heading = numbers[cdr.ORIENTATION_COVARIANCE] != cdr.NOT_REPORTED
+        has_rate = numbers[cdr.RATE_COVARIANCE] != cdr.NOT_REPORTED
+        return heading if has_heading else None, numbers[cdr.RATE_Z] if has_rate else None
+    return heading, numbers[48] if kind == cdr.ODOMETRY else None

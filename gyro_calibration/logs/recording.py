@@ -27,19 +27,8 @@ import os.path
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.logs.cdr import (
-    heading_of,
-    IMU,
-    layout_of,
-    MessageError,
-    NOT_REPORTED,
-    NSEC_PER_SEC,
-    ODOMETRY,
-    parse,
-    POSE,
-    TEMPERATURE,
-    TWIST,
-)
+from gyro_calibration.logs import cdr
+from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
 from gyro_calibration.logs.log import Array, Log, LogError, Mask, ROWS, unwrapped
 from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_messages
 import numpy as np
@@ -47,11 +36,11 @@ from numpy.typing import NDArray
 
 _Nanoseconds = NDArray[np.int64]
 
-REFERENCES = (ODOMETRY, IMU, POSE, TWIST)
+REFERENCES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
 #: Role of a topic -> the option that names it, and the kinds of messages that it may have.
 _ROLES = {
-    'gyro': ('--topic', (IMU,)),
-    'temperature': ('--temperature-topic', (TEMPERATURE,)),
+    'gyro': ('--topic', (cdr.IMU,)),
+    'temperature': ('--temperature-topic', (cdr.TEMPERATURE,)),
     'reference': ('--reference-topic', REFERENCES),
 }
 
@@ -98,7 +87,7 @@ class _Series:
 
     def __init__(self, topic: str, kind: str, definition: str, axis: str):
         self.topic, self.kind, self.damaged = topic, kind, 0
-        self._layout = layout_of(definition, axis)
+        self._layout = cdr.layout_of(definition, axis)
         self.quantities = tuple(self._layout.quantities)
         self._kept = self._layout.kept
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
@@ -109,7 +98,7 @@ class _Series:
     def add(self, message: Message) -> None:
         """Keep what matters of a message; a damaged one is counted."""
         try:
-            stamp, numbers = parse(message.data, self._layout)
+            stamp, numbers = cdr.parse(message.data, self._layout)
             self._received.append(message.received)
         except (MessageError, OverflowError):
             self.damaged += 1
@@ -151,7 +140,7 @@ class _Course:
     def reports(self, quantity: str) -> bool:
         """Return whether the messages have a quantity and do not declare it unknown."""
         return quantity in self.quantities and not (
-            self.values(f'{quantity} variance') == NOT_REPORTED).all()
+            self.values(f'{quantity} variance') == cdr.NOT_REPORTED).all()
 
     @property
     def has_stamps(self) -> bool:
@@ -251,7 +240,7 @@ class _Reader:
         return course
 
     def _only_imu(self) -> str:
-        found = [topic for topic in self._of_kind((IMU,))
+        found = [topic for topic in self._of_kind((cdr.IMU,))
                  if not _same(topic, self._topics.reference)]
         if len(found) == 1:
             return found[0]
@@ -259,14 +248,14 @@ class _Reader:
             raise LogError(f'{self._path}: several gyros, {_listed(found)}; '
                            'select one with --topic')
         reasons = ''.join(f' ({note})' for note in self._contents.notes)
-        raise LogError(f'{self._path}: no message of {IMU} in it{reasons}'
+        raise LogError(f'{self._path}: no message of {cdr.IMU} in it{reasons}'
                        f'{self._what_there_is()}; record the topic of the gyro')
 
     def _reference(self) -> _Course | None:
         wanted = self._topics.reference
         if wanted is None:
             found = [topic for topic in self._of_kind(REFERENCES)
-                     if self._series[topic].kind != IMU]
+                     if self._series[topic].kind != cdr.IMU]
             if found:
                 self._notes.append('no reference was asked for; --reference-topic may be '
                                    f'{_listed(found)}')
@@ -277,7 +266,7 @@ class _Reader:
         wanted = self._topics.temperature
         if wanted is not None:
             return self._course(self._named(wanted, 'temperature'))
-        found = self._of_kind((TEMPERATURE,))
+        found = self._of_kind((cdr.TEMPERATURE,))
         if not found:
             return None
         gyro = self._topics.gyro or self._only_imu()
@@ -296,7 +285,7 @@ class _Reader:
                            f'name one of them by {_ROLES[role][0]}')
         kind = self._contents.topics[topic]
         definition = self._contents.definitions.get(kind)
-        found = layout_of(definition).quantities if definition else {}
+        found = cdr.layout_of(definition).quantities if definition else {}
         if not _NEEDED[role] & set(found) and (wrong := wrong_kind(role, topic, kind)):
             raise LogError(f'{self._path}: {wrong}')
         if topic not in self._series or not len(self._series[topic]):
@@ -372,7 +361,7 @@ class _Reader:
     def _force(self, gyro: _Course) -> Array | None:
         """Return the specific force along z, or None if it is not reported or never filled in."""
         force = gyro.values('force')
-        if (gyro.values('force variance') == NOT_REPORTED).any() or not force.any():
+        if (gyro.values('force variance') == cdr.NOT_REPORTED).any() or not force.any():
             return None
         if not np.isfinite(force).all():
             self._notes.append('the specific force is not finite everywhere and was left out')
@@ -455,10 +444,10 @@ def _headings(course: _Course) -> Array | None:
     variance = course.values('orientation variance')
     # declared unknown by an Imu, or left at its default
     if 'orientation variance' in course.quantities and (
-            (variance == NOT_REPORTED).all()
+            (variance == cdr.NOT_REPORTED).all()
             or not (x.any() or y.any() or z.any() or variance.any()) and (w == 1.0).all()):
         return None
-    heading: Array = heading_of(x, y, z, w)
+    heading: Array = cdr.heading_of(x, y, z, w)
     return heading
 
 
