@@ -100,10 +100,10 @@ _TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch', 'test_s
 # Of those that only compute, what takes longest comes first: the last files, which one of several
 # processes may have to itself, are then short ones.
 _LONG = ('test_diagnosis', 'test_record_verb', 'test_selection', 'test_self_calibration',
-         'test_motion_design', 'test_findings', 'test_candidate_experiments',
-         'test_extended_model', 'test_reproduction', 'test_run_faults', 'test_encoder',
-         'test_followed_recordings', 'test_rate_table_diagnosis', 'test_diagnose_verb',
-         'test_allan', 'test_package', 'test_search', 'test_hidden')
+         'test_motion_design', 'test_findings', 'test_extended_model', 'test_reproduction',
+         'test_run_faults', 'test_encoder', 'test_followed_recordings',
+         'test_rate_table_diagnosis', 'test_diagnose_verb', 'test_allan', 'test_package',
+         'test_search', 'test_hidden')
 
 
 def pytest_collection_modifyitems(config, items):

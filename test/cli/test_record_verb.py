@@ -521,22 +521,6 @@ def test_topics_without_a_publisher_are_reported(ros_domain, record, tmp_path):
     assert not (tmp_path / 'a.csv').exists()
 
 
-def test_a_driver_is_recorded_from_its_topics(start_node, ros, record, wait_until, tmp_path):
-    with gyro(tmp_path / 'gyro'):
-        start_node('driver_node', parameters={'port': tmp_path / 'gyro', 'protocol': 'csv',
-                                              'columns': '[gyro_rad_s, temperature_degc]'})
-        both = [record('record', '--out', tmp_path / name, '--json')
-                for name in ('a.csv', 'a.mcap')]
-        files = [tmp_path / 'a.csv', tmp_path / 'a.mcap']
-        wait_until(lambda: all(holds(file, 201) for file in files), 60.0, 'samples')
-        ends = [each.end(signal.SIGINT) for each in both]
-    logs = [read(file) for file in files]
-    for (code, out, error), log in zip(ends, logs, strict=True):
-        assert code == 0 and json.loads(out)['samples'] == len(log) > 200, error
-        assert (is_unbroken(log) and json.loads(out)['lost'] == 0
-                and (log.temperature == 25.0).all())
-
-
 def test_without_ros_the_remedy_is_reported(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'gyro_calibration.ros.recorder_node', None)
     code, _, error = run('record', '--out', tmp_path / 'a.csv')

@@ -80,7 +80,7 @@ TOGETHER = [('bias_temperature', 'cubic_nonlinearity'), ('warm_up', 'heading_sen
             ('interference_tone', 'thermal_lag'), ('outliers', 'vibration_rectification'),
             ('reference_once_per_rev', 'bias_step'),
             ('bandwidth', 'supply_sensitivity', 'saturation')]
-#: Named in other tests, below, in test_search.py and in test_extension.py.
+#: Named in other tests, below, in test_search.py and in test_extended_model.py.
 ELSEWHERE = ('angle_random_walk', 'dead_zone', 'dropped_samples', 'quantization',
              'reference_scale', 'reference_slip', 'scale_factor_temperature')
 #: Some are tried alone only as evidence, for they are named among others or elsewhere.
