@@ -48,8 +48,8 @@ lint = ['ruff', 'mypy', 'pydocstyle', 'flake8', 'flake8-blind-except', 'flake8-b
         'flake8-class-newline', 'flake8-comprehensions', 'flake8-deprecated', 'flake8-docstrings',
         'flake8-import-order', 'flake8-quotes']
 build = ['setuptools', 'wheel', 'colcon-ros', 'colcon-bash', 'colcon-package-information']
-# vqf and imufusion are other programs that `benchmarks` compares with
-peers = ['vqf', 'imufusion']
+# other programs that `benchmarks` compares with; vqf has no wheel for Python 3.14
+peers = ['vqf; python_version < "3.14"', 'imufusion']
 # launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings;
 # mujoco reads what export writes
 test = ['pytest<8.4', 'pytest-xdist', 'rosbags', 'mcap>=1.6', 'mujoco', *plot, *fuzz, *lint,
