@@ -47,7 +47,7 @@ class FakeGyro:
     """Publishes raw rates with stamps of its own clock, and collects what the node makes of it."""
 
     def __init__(self, ros, wait_until):
-        self.ros, self.wait_until, self.number, self.frame = ros, wait_until, 0, 'gyro'
+        self.ros, self.wait_until, self.number = ros, wait_until, 0
         self._publisher = ros.publisher(Imu, 'imu/data_raw', 1000)
         self.imu = ros.collect(Imu, 'imu/data')
         self.status = ros.collect(DiagnosticArray, '/compensation_node/calibration_status',
@@ -63,17 +63,14 @@ class FakeGyro:
         """
         self.imu.clear(), self.status.clear()
         self.wait_until(lambda: self.send(0.0) or self.imu and self.status, 60.0, 'the node')
-        self.frame = 'last'
-        self.send(0.0)
-        self.wait_until(lambda: self.imu[-1].header.frame_id == 'last', what='the last')
-        self.frame = 'gyro'
+        last = sample(self.number - 1, 0.0).header.stamp
+        self.wait_until(lambda: self.imu[-1].header.stamp == last, what='the last')
         assert self.call('reset_heading').success
         self.imu.clear()
 
     def send(self, rate):
-        message = sample(self.number, float(rate))
-        message.header.frame_id, self.number = self.frame, self.number + 1
-        self._publisher.publish(message)
+        self._publisher.publish(sample(self.number, float(rate)))
+        self.number += 1
 
     def play(self, rates, until=lambda: False):
         """Publish many samples, and return when the node has taken the last one."""
