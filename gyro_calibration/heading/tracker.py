@@ -142,6 +142,7 @@ class HeadingTracker:
         self.resting, self.steps, self._keep, self._interval = False, list[Step](), keep, math.inf
         self.renewed = list[tuple[int, Drift]]()
         self._wanted, self._held, self._pending = WINDOW, RateIntegral(0.0, 0.0, np.zeros(0)), 0.0
+        self._blocks, self._sure = deque[RateIntegral](maxlen=_BLOCKS), False
         self._known: float | None = None
         self._slow: SlowTurn | None = None
         self._last: tuple[float, float, float, Array] | None = None
