@@ -188,7 +188,7 @@ def fit_course(
         float(1.0 / scale - 1.0),
         float(drift / scale),
         covariance,
-        offset - float(late),
+        offset + float(late),
         found.size('angle_random_walk'),
         found.size('reference'),
         time_offset_deviation=float(found.deviations[2]),

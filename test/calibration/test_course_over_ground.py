@@ -35,12 +35,13 @@ def drive(seed, late=0.5, turning=30.0, follows=1.0, burst=0.0):
     return Log(time=time, output=output, reference_heading=course)
 
 
-@pytest.mark.parametrize('late', [-0.7, 0.0, 0.75])
+# between the offsets that are tried first, which are 0.05 s apart
+@pytest.mark.parametrize('late', [-0.725, 0.0, 0.775])
 def test_scale_bias_and_delay_are_found(late):
     found = calibrate_encoder(drive(1, late))
     deviations = np.sqrt(np.diag(found.fit.covariance))
     assert found.method == 'course'
-    assert found.fit.time_offset == pytest.approx(-late, abs=0.2)
+    assert found.fit.time_offset == pytest.approx(-late, abs=0.02)
     assert found.fit.scale_factor_error == pytest.approx(SCALE - 1.0, abs=4.5 * deviations[0])
     assert found.fit.bias == pytest.approx(BIAS, abs=4.5 * deviations[1])
     assert deviations[0] < 0.01 and deviations[1] < 0.1 * DEGREE
