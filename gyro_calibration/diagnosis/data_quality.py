@@ -29,6 +29,7 @@ import math
 from gyro_calibration.calibration.dwells.samples import output_of, where_lost
 from gyro_calibration.diagnosis.causes import CAUSES, finding
 from gyro_calibration.diagnosis.expected_output import (
+    angle_of,
     bridged,
     compare,
     Compared,
@@ -327,18 +328,20 @@ KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyr
 #: course are larger than the noise of the gyro (measured: 22 to 560; exact references up to 66).
 _SPAN, _LARGER, _LARGER_OF_FIXES = 1.0, 8.0, 2.0
 #: A reference rate with more noise than this part of that of the gyro is not exact: less adds 1e-4
-#: to the variance, which logs of up to 2e8 samples do not show. Nor is a heading with more noise
-#: than this part of what the gyro walks in a second: less adds an eighth to the variance of that.
+#: to the variance, which logs of up to 2e8 samples do not show. Nor is a heading whose error is
+#: larger than this part of what both walk apart in a second: less is a fifth of its variance.
 _NOISY, _BLURRED = 0.01, 0.25
-#: The steps of an encoder finer than this, rad, are noise of a known size; the search for exact
-#: references finds more in addition to them (measured at 0.0055 and 0.09 deg).
-_FINE = 0.05 * DEGREE
+#: Rounding explains the error of a heading by an encoder up to this factor. Slips are found from
+#: so many standard deviations on.
+_EXPLAINED, _SLIP = 1.5, 5.0
+#: An error of a heading that is none but of numbers, rad.
+_NUMERICAL = 1e-9
 #: Third differences have a correlation of -0.75 from one to the next for white noise, of -0.67 for
 #: a random walk, and of -0.5 for its integral; a motion is as smooth as that.
 _WHITE = -0.5
 #: Other noise of a reference rate is seen from so many standard deviations on, in this part of the
 #: log, in blocks of so many samples.
-_SEEN, _QUIETEST, _BLOCK = 3.0, 0.3, 25
+_SEEN, _QUIETEST, _BLOCK = 3.0, 0.03, 25
 #: A heading between fixes is straight: nine in ten of its second differences are below this part
 #: of the largest ones.
 _STRAIGHT = 0.1
@@ -373,16 +376,80 @@ def limits(log: Log, reference: Reference) -> bool:
     if log.time is None or reference.kind == 'rest':
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
-        return log.reference_rate is not None and rate_noise_share(log) > _NOISY
+        return log.reference_rate is not None and (
+            rate_noise_share(log) > _NOISY or heading_errors(log).larger)
     if reference.kind == 'course' or reference.known == 'as given':
         return True
-    if reference.kind == 'encoder' and encoder_step(log.reference_heading) < _FINE:
+    found = heading_errors(log)
+    if not found.larger:
         return False
-    # the white noise of the heading over what the gyro walks in a second
-    assert log.output is not None
-    gyro = white_noise(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
-    left = log.reference_heading - integral_of(log.time, bridged(log.output))
-    return gyro > 0.0 and white_noise(left) > _BLURRED * gyro
+    step, interval = encoder_step(log.reference_heading), float(np.median(np.diff(log.time)))
+    rounding = step / math.sqrt(12.0)
+    # Exact references know the rounding as noise that is new in each sample. Beside it and a walk,
+    # a jump has a variance of twice rounding times walk times root interval; but during a rest
+    # the rounding stands, and jumps by up to a step as the motion goes on.
+    seen = step > _SLIP * math.sqrt(2.0 * rounding * found.walk * math.sqrt(interval))
+    return reference.kind != 'encoder' or found.error > _EXPLAINED * rounding or seen
+
+
+@dataclass(frozen=True)
+class HeadingErrors:
+    """
+    What headings of gyro and reference differ by over a second.
+
+    Attributes
+    ----------
+    error : standard deviation of what does not grow with time, rad: of the reference, by stamps or
+        by vibration of the gyro
+    walk : of the gyro without that, no more than its white noise comes to, rad/√s
+    both : a walk that comes to as much as both in a second, rad/√s
+
+    """
+
+    error: float
+    walk: float
+    both: float
+
+    @property
+    def larger(self) -> bool:
+        """Tell whether the error is no small part of what both walk apart in a second."""
+        return self.error > max(_BLURRED * self.both, _NUMERICAL)
+
+
+def heading_errors(log: Log) -> HeadingErrors:
+    """
+    Divide the difference of the headings of gyro and reference by how it grows.
+
+    Its second differences over a lag have the variance ``6 error² + 2 walk² lag``, motion that is
+    seen late, slowly or with another scale taken out. An error that was smoothed is seen from its
+    time constant on.
+
+    """
+    assert log.time is not None and log.output is not None
+    interval, output = float(np.median(np.diff(log.time))), bridged(log.output)
+    turned, heading = angle_of(log.time, output), log.reference_heading
+    if log.reference_rate is not None:
+        heading = angle_of(log.time, bridged(log.reference_rate))
+    assert heading is not None
+    slope = np.gradient(output, log.time)
+    longest = max(round(_SPAN / interval), 4)
+    variance = {}
+    for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
+        off, *motion = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag] for each in (
+            heading - turned, turned, output, slope))
+        known = np.isfinite(off)
+        if np.count_nonzero(known) > 2 * _BLOCK:
+            columns = np.column_stack(motion)[known]
+            left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
+            variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
+                                       / float(stats.norm.isf(0.05))) ** 2
+    whole = variance.pop(1.0, 0.0)
+    error = max([0.0, *((each - part * whole) / (6.0 * (1.0 - part))
+                        for part, each in variance.items())])
+    white = white_noise(log.output) * math.sqrt(interval)
+    return HeadingErrors(
+        math.sqrt(error), min(white, math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _SPAN))),
+        math.sqrt(whole / (2.0 * _SPAN)))
 
 
 def rate_noise_share(log: Log) -> float:
@@ -402,7 +469,11 @@ def rate_noise_share(log: Log) -> float:
     fast, left = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
     blocks = len(fast) // _BLOCK
     energy = np.sum(fast[: blocks * _BLOCK].reshape(blocks, _BLOCK) ** 2, axis=1)
-    quiet = np.repeat(energy <= np.quantile(energy, _QUIETEST), _BLOCK)
+    # by the blocks on both sides, for those that are quiet themselves are so by chance; one with
+    # far more energy than these is a motion between two rests
+    sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
+    most = np.quantile(sides, min(max(_QUIETEST, 8.0 / blocks), 1.0))
+    quiet = np.repeat((sides <= most) & (energy <= 3.0 * most), _BLOCK)
     fast, left = fast[: len(quiet)][quiet], left[: len(quiet)][quiet]
     energy_of_fast = float(fast @ fast)
     variance = energy_of_fast / len(fast) / 20.0

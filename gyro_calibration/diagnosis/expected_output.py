@@ -169,6 +169,13 @@ def integral_of(time: Array, rate: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
 
 
+def angle_of(time: Array, rate: Array) -> Array:
+    """Return the integral of a rate, its curvature between samples included, shape (n,)."""
+    slope = np.gradient(rate, time)
+    step = float(np.median(np.diff(time)))
+    return integral_of(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
+
+
 def reference_rate(log: Log) -> Array | None:
     """Return the rate by the reference, rad/s, nan where it was lost; None without reference."""
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():

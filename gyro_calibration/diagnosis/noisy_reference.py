@@ -55,6 +55,7 @@ from gyro_calibration.diagnosis.spans import (
     Column,
     FEWEST_STRETCHES,
     fit_spans,
+    HEADING,
     PLAIN,
     shared_noise,
     SpanFit,
@@ -87,9 +88,10 @@ SEEN, _RULED_OUT = 4.8, 3.0
 _OF_A_LAG = 0.1
 #: Bins of a curve.
 _BINS = 20
-#: Shares of the false-alarm rate: of the causes that are searched for, and given a model of bias
-#: and of scale factor error. A delay between two clocks is no surprise: it has a level of its own.
-_OF_SEARCH, _OF_VALUE = 0.6, {'bias': 0.05, 'scale_factor_error': 0.05}
+#: Shares of the false-alarm rate: of the causes that are searched for, of a delay, and given a
+#: model of bias and of scale factor error. A delay between two clocks is no surprise: it has a
+#: level of its own.
+_OF_SEARCH, _OF_VALUE = 0.6, {'bias': 0.05, 'scale_factor_error': 0.05, 'time_offset': 0.1}
 _SPOKEN = {'rate_command': 'a reference rate with noise', 'course': 'a course over ground',
            'encoder': 'an encoder', 'odometry': 'odometry', 'motion_capture': 'motion capture',
            'gyro': 'another gyro'}
@@ -107,6 +109,10 @@ MOST, FOLDS = 4, 5
 #: where a stretch counts no more than so much log-likelihood, a ratio of 20: no single stretch
 #: establishes a cause.
 _SURELY, _BOUND = 1.65, 3.0
+#: Effects along the rate that are larger than this part of it are not established: no gyro has
+#: them (two deviations of the prior of a scale factor error), but where a motion makes columns
+#: alike, several that nearly cancel each other fit what none of them is.
+_LARGEST = 2.0 * HEADING.prior[0]
 #: Causes explain a log as well as the best of them up to this likelihood ratio.
 _LIKELY = 25.0
 
@@ -213,7 +219,8 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
         effective = float(done.stretches_of[place])
         freedom = max(effective - 1.0, 1.0)
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
-        if chance >= _OF_VALUE.get(name, 1.0) * rate or effective < FEWEST_STRETCHES:
+        share = 1.0 if name == 'time_offset' and own_clock else _OF_VALUE[name]
+        if chance >= share * rate or effective < FEWEST_STRETCHES:
             continue
         half = min(float(student.ppf(0.975, freedom)) * deviation,
                    1.96 * done.spans.treatment.prior[place])
@@ -488,8 +495,28 @@ def search(done: SpanFit, level: float, on_part: OnPart) -> tuple[SpanFit, list[
         if best is None:
             break
         found.append(best)
-    inside = [each.column for each in found if each.established and not each.column.once]
-    return (fit_spans(done.spans, inside) if inside else done), found
+    extended = done
+    while inside := [each.column for each in found if each.established]:
+        extended = fit_spans(done.spans, inside)
+        worst = max(inside, key=lambda each: _contradiction(extended, each))
+        if _contradiction(extended, worst) < 1.0:
+            return extended, found
+        found = [replace(each, established=each.established and each.column != worst)
+                 for each in found]
+    return done, found
+
+
+def _contradiction(done: SpanFit, cause: Column) -> float:
+    """Return how much too large for the rate an effect is; infinite where its interval holds 0."""
+    places = done.places(cause)
+    values = done.values[places]
+    if len(values) == 1 and abs(values[0]) < done.half(places.start):
+        return math.inf
+    if CAUSES[cause.cause].along != 'rate' or cause.cause not in CATALOGUE:
+        return 0.0
+    columns = CATALOGUE[cause.cause].columns(done.spans.channels, *cause.shapes)
+    added = np.abs(np.tensordot(values, np.array(columns), 1)).max()
+    return float(added / np.abs(done.spans.channels.rate).max()) / _LARGEST
 
 
 def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequence[Column],

@@ -94,7 +94,7 @@ from gyro_calibration.diagnosis.search import (
 )
 from gyro_calibration.diagnosis.steps import CHECKS, OnProgress, Steps
 from gyro_calibration.diagnosis.words import amount
-from gyro_calibration.logs.log import Log
+from gyro_calibration.logs.log import DataRefused, Log
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
@@ -170,7 +170,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                              gates=passed)
         checked += passed
     references = [reference_of(log, kind) for log in logs]
-    if len(logs) == 1 and not rests(logs[0]) and limits(logs[0], references[0]):
+    erring = [place for place, log in enumerate(logs)
+              if not rests(log) and limits(log, references[place])]
+    if erring and len(logs) > 1:
+        where = (list(names) or [f'log {place + 1}' for place in range(len(logs))])[erring[0]]
+        raise DataRefused(
+            f'the reference of {where} errs by more than the gyro, and such logs are not compared '
+            'together: diagnose each alone, or give all to `fleet`')
+    if erring:
         found = diagnose_by_noisy_reference(logs[0], references[0], model, rate, on_progress)
     else:
         found = _by_exact_reference(logs, generator, model, rate, names, on_progress)

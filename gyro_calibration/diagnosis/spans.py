@@ -12,10 +12,10 @@
 Headings over spans: the change of a reference regressed on what the gyro integrates to.
 
 The reference errs, and its errors are larger than those of the gyro from sample to sample. So the
-heading of the reference (of a rate, its integral) is observed, and all columns are integrals of
-what the gyro says: nothing of the reference is a regressor. With the output ``y``, the rate ``w``
-that the values so far make of it, and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``, the
-heading ``psi`` of the reference is, at points ``t`` and less a constant::
+heading of the reference (of a rate, its integral) is observed, and all columns are integrals of a
+rate ``w`` that is the likeliest given both (of a course, that of the gyro; `Spans.corrected`).
+With the output ``y`` and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``, the heading ``psi``
+of the reference is, at points ``t`` and less a constant::
 
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
@@ -40,13 +40,15 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
     wander,
 )
-from gyro_calibration.diagnosis.expected_output import bridged, integral_of
+from gyro_calibration.diagnosis.data_quality import heading_errors, rate_noise_share
+from gyro_calibration.diagnosis.expected_output import angle_of, bridged, integral_of
 from gyro_calibration.logs.log import Array, DEGREE, Log
 from gyro_calibration.logs.quality import robust_deviation, white_noise
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
@@ -60,6 +62,9 @@ _FARTHEST = 10.0
 _FIXED = 1e-6
 #: Delays of a reference that are tried first, s.
 _DELAYS = np.arange(-1.5, 1.501, 0.05)
+#: Noise is no more than this part of the column of a delay, if means over no longer than twice so
+#: many s allow it.
+_NOISY, _LONGEST = 0.05, 0.5
 #: Passes in which values, and points that stand out, are found robustly.
 _PASSES = 2
 #: A gyro rests where its course is lost for so long, s, and its output is as quiet as ever.
@@ -76,7 +81,7 @@ class Treatment:
     span : least length, s
     most : spans of a log, at most
     prior : standard deviations of scale factor error, bias (rad/s) and delay (s) beforehand
-    walk : smallest and largest angle random walk, in units of the white noise of the samples
+    walk : smallest and largest angle random walk, in units of `Spans.walk`
     largest_walk : rad/√s; what vibrates has more white noise than walks
     cosines : of a bias that wanders
     flicker, random_walk : smallest and largest bias instability and rate random walk, rad/s and
@@ -148,7 +153,9 @@ class Spans:
     time, heading : of the points, s and rad, shape (n + 1,)
     rests : begin and end row of each stretch at rest
     treatment : of the kind of the reference
-    white : standard deviation of the white noise of a sample, with that of a reference rate, rad/s
+    walk : the angle random walk by the white noise of the samples, with that of a reference rate,
+        and by what gyro and reference differ by over a second, the smaller first, rad/√s
+    noisier : noise of a reference rate over that of the gyro
     delay : by which the stamps of the gyro are late against the reference, s
 
     """
@@ -161,7 +168,8 @@ class Spans:
     heading: Array
     rests: tuple[tuple[int, int], ...]
     treatment: Treatment
-    white: float
+    walk: tuple[float, float]
+    noisier: float = 0.0
     delay: float = 0.0
 
     @property
@@ -204,8 +212,29 @@ class Spans:
     def plain(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
         rate = np.asarray(self.channels.rate)
-        return np.column_stack([-self.integrals(rate), -self.integrals(np.ones_like(rate)),
-                                self.changes(rate)])
+        return np.column_stack([
+            -self.integrals(rate), -self.integrals(np.ones_like(rate)),
+            np.concatenate([self._rate_changes(), np.zeros(len(self.rests))])])
+
+    def _rate_changes(self) -> Array:
+        """
+        Return the change of the rate over spans, shape (n,), without much noise.
+
+        A column of noise would hold a delay where it is tried first, with a short interval. So the
+        rate is a mean over as long as its noise needs to be a small part of the column.
+
+        """
+        assert self.log.time is not None and self.log.output is not None
+        turned = (np.asarray(self.channels.heading) if self.fine
+                  else angle_of(self.log.time, self.log.output))
+        at, half = self.log.time[self.known] + self.delay, float(np.median(np.diff(self.log.time)))
+        while True:
+            forth, back = (np.interp(at + way, self.log.time, turned) for way in (half, -half))
+            change = np.diff(np.bincount(self.place, (forth - back) / (2.0 * half))
+                             / np.bincount(self.place))
+            if self.walk[0] ** 2 / half < _NOISY * np.mean(change ** 2) or half > _LONGEST:
+                return np.asarray(change)
+            half *= 2.0
 
     def columns(self, cause: Column) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
@@ -218,8 +247,8 @@ class Spans:
             return self.changes(late.astype(float))[:, None]
         if cause.cause == 'bandwidth':
             # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
-            assert self.log.time is not None
-            change = np.gradient(np.asarray(channels.rate), self.log.time)
+            assert self.log.time is not None and self.log.output is not None
+            change = np.gradient(self.log.output, self.log.time)
             return -self.changes(change)[:, None]
         return np.column_stack([
             -self.integrals(np.asarray(each))
@@ -232,14 +261,37 @@ class Spans:
     def corrected(self, values: Array) -> Spans:
         """Return the spans with the rate that scale factor error and bias make of the output."""
         assert self.log.output is not None and self.log.time is not None
-        rate = (self.log.output - values[1]) / (1.0 + values[0])
+        rate: Array = (self.log.output - values[1]) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]))
         turned = angle_of(self.log.time, rate)
         # of the reference, and between its points of the gyro
-        away = np.interp(self.log.time - moved.delay, self.time,
-                         self.heading - moved.points(turned))
+        at = self.log.time - moved.delay
+        away: Array = self.heading - moved.points(turned)
+        if self.fine:
+            away = self._of_both(away)
+            steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(away) - 2)
+            rate = rate + (np.diff(away) / np.diff(self.time))[steps]
         return replace(moved, channels=replace(self.channels.moving(rate, self.log.output),
-                                               heading=turned + away))
+                                               heading=turned + np.interp(at, self.time, away)))
+
+    def _of_both(self, away: Array) -> Array:
+        """
+        Return what of the reference's heading less the gyro's, shape (n + 1,), is of the gyro.
+
+        The heading that is the likeliest given both has errors that are independent of the
+        difference between both. Columns of it are no noise of what they are to explain; those of
+        a gyro alone are, and of motion that is nearly the same in two columns little else is left.
+
+        """
+        if not self.treatment.of_heading:
+            return away / (1.0 + self.noisier ** 2)
+        walk: Array = self.walk[0] ** 2 * np.diff(self.time)
+        second = robust_deviation(np.diff(away, 2)) ** 2
+        stiff = max(second / 6.0 - float(np.median(walk)) / 3.0, 0.0) / walk
+        both = np.zeros((2, len(away)))
+        both[1] = 1.0 + np.append(stiff, 0.0) + np.append(0.0, stiff)
+        both[0, 1:] = -stiff
+        return np.asarray(solveh_banded(both, away))
 
 
 @dataclass(frozen=True)
@@ -309,12 +361,15 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
                                               min(bias, float(prior[1])), delay))
     time, output = log.time - log.time[0], bridged(log.output)
     white = white_noise(log.output)
-    reference = log.reference_heading
+    reference, noisier = log.reference_heading, 0.0
     if reference is None:
         assert log.reference_rate is not None
+        noisier = rate_noise_share(log)
         white = math.hypot(white, white_noise(log.reference_rate))
         reference = angle_of(time, bridged(log.reference_rate))
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
+    if treatment.relative and not treatment.of_heading and heading_errors(log).larger:
+        treatment = replace(treatment, of_heading=True)  # a heading that was differentiated
     known = np.flatnonzero(np.isfinite(reference))
     stamps = time[known]
     length = max(treatment.span, float(stamps[-1] - stamps[0]) / treatment.most,
@@ -330,14 +385,17 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
     channels = replace(channels_of(log), rate=output, time=time, heading=integral_of(time, output))
     return Spans(log, channels, known, place, np.bincount(place, time[known]) / count,
                  np.bincount(place, reference[known]) / count, _rests(time, output, known),
-                 treatment, white)
+                 treatment, _walk(log, white, treatment), noisier)
 
 
-def angle_of(time: Array, rate: Array) -> Array:
-    """Return the integral of a rate, its curvature between samples included, shape (n,)."""
-    slope = np.gradient(rate, time)
-    step = float(np.median(np.diff(time)))
-    return integral_of(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
+def _walk(log: Log, white: float, treatment: Treatment) -> tuple[float, float]:
+    """Return bounds of the angle random walk, but for a factor, rad/√s."""
+    assert log.time is not None
+    walk = white * math.sqrt(float(np.median(np.diff(log.time))))
+    # a vibration is white noise that does not walk, and a filter takes from it what walks
+    walks = walk, heading_errors(log).both if treatment.relative else walk
+    least, most = (min(max(each, 1e-9), treatment.largest_walk) for each in sorted(walks))
+    return least, most
 
 
 def _rests(time: Array, output: Array, known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
@@ -432,7 +490,7 @@ def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
                      prior: Array) -> SpanFit:
     """Fit by the restricted likelihood over a grid of noise, rests with the spans."""
     assert spans.log.time is not None
-    columns, walk = all_columns(spans, causes), _walk(spans)
+    columns, (least, most) = all_columns(spans, causes), spans.walk
     still = np.array([spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
     low, high = spans.treatment.walk
     parts = [replace(part, diagonal=np.concatenate([
@@ -440,7 +498,7 @@ def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
         neighbours=None if part.neighbours is None
         else np.concatenate([part.neighbours, 0.0 * still]))
         for part in heading_noise(spans.time, spans.rates(), outlying,
-                                  angle_random_walk=(low * walk, high * walk))
+                                  angle_random_walk=(low * least, high * most))
         if spans.treatment.of_heading or part.name == 'angle_random_walk']
     waves, shared = _waves(spans)
     deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
@@ -450,13 +508,6 @@ def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)), prior)
     covariance, effective = _cluster_robust(whitened(done, causes), fit)
     return replace(done, covariance=covariance, stretches_of=effective)
-
-
-def _walk(spans: Spans) -> float:
-    """Return the angle random walk that the white noise of the samples amounts to, rad/√s."""
-    assert spans.log.time is not None
-    step = float(np.median(np.diff(spans.log.time)))
-    return min(max(spans.white * math.sqrt(step), 1e-9), spans.treatment.largest_walk)
 
 
 def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array]:
@@ -486,8 +537,8 @@ def _waves(spans: Spans) -> tuple[Array, list[SharedNoise]]:
     """Return the columns of a wandering bias over spans and rests, and their noise."""
     assert spans.log.time is not None
     treatment = spans.treatment
-    unit = _walk(spans) if treatment.relative else 1.0
-    flicker, walk = (None if limits is None else (limits[0] * unit, limits[1] * unit)
+    least, most = spans.walk if treatment.relative else (1.0, 1.0)
+    flicker, walk = (None if limits is None else (limits[0] * least, limits[1] * most)
                      for limits in (treatment.flicker, treatment.random_walk))
     waves, shared = wander(spans.time, flicker, walk, treatment.cosines)
     begin, end = spans.time[0], spans.time[-1]

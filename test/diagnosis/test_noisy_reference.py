@@ -13,17 +13,22 @@
 from dataclasses import replace
 
 from diagnosed import judged_findings, log_of
-from gyro_calibration.diagnosis.data_quality import limits, reference_of
+from gyro_calibration.diagnosis.data_quality import (
+    heading_errors,
+    limits,
+    rate_noise_share,
+    reference_of,
+)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.words import lines
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration_bench.hidden.reference import hide_beside, Imperfect
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, sosfiltfilt
 
 RATE, BIAS_TRUE, SCALE, DELAY = 25.0, 0.3 * DEGREE, 0.004, 0.4
 
@@ -162,6 +167,61 @@ def test_an_effect_of_the_rate_is_established_beside_the_noise_of_a_reference(re
     found, named = established(hidden)
     assert judged_findings(hidden, named).right, lines(found)
     assert named[0].minimum_detectable > 0.0
+
+
+def test_motion_capture_that_was_smoothed_and_an_encoder_with_late_stamps_are_not_exact():
+    # samples of smoothed motion capture have hardly white noise, but the heading errs the same
+    hidden = hide_beside([], 0.0, np.random.default_rng(2), Imperfect('encoder', 0.0055))
+    log, generator = log_of(hidden), np.random.default_rng(5)
+    noise = 0.1 * DEGREE * generator.standard_normal(len(log))
+    smooth = replace(log, reference_heading=hidden.truth.heading + sosfiltfilt(
+        butter(2, 4.0, fs=1.0 / np.median(np.diff(log.time)), output='sos'), noise))
+    assert reference_of(smooth).kind == 'motion_capture' and limits(smooth, reference_of(smooth))
+    errors = heading_errors(smooth)
+    assert errors.error == pytest.approx(
+        float(np.std(smooth.reference_heading - hidden.truth.heading)), rel=0.4)
+    assert not limits(log, reference_of(log))
+    late = 0.01 * generator.uniform(-1.0, 1.0, len(log))
+    jitter = replace(log, reference_heading=log.reference_heading + 0.0055 * DEGREE * np.rint(
+        late * hidden.truth.rate / (0.0055 * DEGREE)))
+    assert reference_of(jitter).kind == 'encoder' and limits(jitter, reference_of(jitter))
+
+
+def swing(seed, rate, noise, interval=0.04, duration=150.0):
+    """Return a log of a motion `rate` of time, with a reference rate of 0.3 times its noise."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, duration, interval)
+    white = noise / np.sqrt(interval) * generator.standard_normal((2, len(time)))
+    true = rate(time)
+    return Log(time=time, output=1.01 * true + 1e-3 + white[0],
+               reference_rate=true + 0.3 * white[1])
+
+
+def test_several_logs_with_a_reference_that_errs_are_not_taken_for_exact():
+    logs = [swing(seed, lambda time: 0.5 * np.sin(time), 1e-4, duration=30.0) for seed in (1, 2)]
+    with pytest.raises(DataRefused, match='the reference of log 1 errs .* diagnose each alone'):
+        diagnose(logs, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_noise_is_no_effect_of_a_motion_in_which_effects_look_alike(seed):
+    # in a slow swing, scale, cubic and an error once a revolution nearly cancel each other: what
+    # is left of their columns is the noise of the rate that they are made of
+    log = swing(seed, lambda time: 0.08 * np.cos(time / 7.0), 6e-4)
+    found = diagnosed(log)
+    assert not [each for each in found.findings if each.status == 'established'], lines(found)
+    assert value(found.model, 'scale_factor_error') == pytest.approx(0.01, abs=0.004)
+
+
+def test_the_noise_of_a_reference_rate_is_seen_in_the_only_short_rest():
+    def by_hand(time):
+        return 1.5 * np.sin(2.0 * np.pi * time) * np.sin(9.1 * time) * (time > 12.0)
+
+    for seed in range(3):
+        log = swing(seed, by_hand, 1e-4)
+        assert rate_noise_share(log) == pytest.approx(0.3, rel=0.25)
+        exact = replace(log, reference_rate=by_hand(log.time))
+        assert limits(log, reference_of(log)) and not limits(exact, reference_of(exact))
 
 
 def test_a_fine_encoder_and_an_exact_rate_are_taken_as_they_are():
