@@ -76,7 +76,7 @@ def test_no_file_but_those_excepted_uses(forbidden, excepted):
 
 def test_only_the_command_line_runs_a_file_that_the_user_names():
     assert {path.name for path in FILES if any(
-        name.endswith('exec_module') for name in names(path)[1])} == {'catalogue.py'}
+        name.endswith('exec_module') for name in names(path)[1])} == {'main.py'}
 
 
 def test_what_is_imported_late_is_named_in_the_code():

@@ -639,7 +639,7 @@ class HeadingTracker:
         """Take the robot for standing from here on."""
         self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
         self._sure = False
-        self._blocks: deque[RateIntegral] = deque(maxlen=_BLOCKS)
+        self._blocks = deque(maxlen=_BLOCKS)
         self._snapshots = [Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
 
     def _move(self, wanted: float) -> None:
