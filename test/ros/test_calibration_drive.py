@@ -479,11 +479,12 @@ def test_a_slip_without_load_is_named_as_one(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
     rig.begin()
     rig.go(5.0)
-    step = rig.robot.step
+    step, noise = rig.robot.step, np.random.default_rng(1)
 
     def slipping():
         reading = step()
-        return type(reading)(reading.stamp, BIAS, reading.heading, reading.rate)
+        output = BIAS + 1e-3 * noise.standard_normal()
+        return type(reading)(reading.stamp, output, reading.heading, reading.rate)
     rig.robot.step = slipping
     rig.go(0.3)
     rig.robot.step = step
