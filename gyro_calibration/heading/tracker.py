@@ -56,8 +56,9 @@ _STEP = 1.0
 _FAR = 4.0
 #: A rest that is over sooner, without a sudden motion, was none, s.
 _BRIEF = 2.0
-#: While the wheels stand, the robot does not turn, and the bias may have moved by so much, rad/s.
-_UNSEEN = 0.2 * DEGREE
+#: While the wheels stand, the robot does not turn, and the bias may have moved by so much, rad/s;
+#: odometry may show that for some time, s, after the robot began to turn.
+_UNSEEN, _LATE_WHEELS = 0.2 * DEGREE, 4.0
 #: Noise of the samples counts from this factor over that of the model on; a mean may be off by so
 #: much more, for noise figures are not better known.
 _ALLOWED = 1.25
@@ -597,6 +598,8 @@ class HeadingTracker:
             turn = self._rested - before.turn
             if abs(self._surprise(before.drift, turn)) > self._sigmas[lag]:
                 if wheels is False:
+                    if lag < _LATE_WHEELS:
+                        continue
                     expected, _ = before.drift.expected(turn)
                     self._drift = self._drift.uncertain(
                         WALK, ((turn.turned - expected) / turn.duration) ** 2)

@@ -274,6 +274,23 @@ def test_odometry_that_is_late_does_not_show_that_the_robot_stands(tmp_path, lat
     assert rig.pipeline.wheels.moving(rig.clock.now) is moving
 
 
+def test_slow_turns_that_late_odometry_hides_at_first_are_no_bias(tmp_path):
+    rig = rested(tmp_path, seconds=60.0, wheels='odom')
+    begin, seen = len(rig.outputs) - 1, []
+
+    def late(stamp, reading):
+        seen.append((stamp, reading.heading, Velocity(angular=(0.0, 0.0, reading.rate))))
+        rig.pipeline.odometry(*seen[max(len(seen) - 1 - round(2.0 / INTERVAL), 0)])
+
+    rig.odometry = late
+    for _ in range(10):
+        for rate in 0.15 * DEGREE, 0.0:
+            rig.robot.command(rate)
+            rig.go(3.0)
+    error, deviation = rig.error(begin)
+    assert abs(error) < 4.0 * deviation, (error, deviation)
+
+
 def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill(
         tmp_path, reported):
     rig = rested(tmp_path, seconds=60.0, wheels='odom')
