@@ -334,6 +334,8 @@ _NOISY, _BLURRED = 0.01, 0.25
 #: Rounding explains the error of a heading by an encoder up to this factor. Slips are found from
 #: so many standard deviations on.
 _EXPLAINED, _SLIP = 1.5, 5.0
+#: So many tones are looked for, each of which noise alone shows with this chance.
+_TONES, _BY_CHANCE = 10, 1e-6
 #: An error of a heading that is none but of numbers, rad.
 _NUMERICAL = 1e-9
 #: Third differences have a correlation of -0.75 from one to the next for white noise, of -0.67 for
@@ -428,10 +430,12 @@ def heading_errors(log: Log) -> HeadingErrors:
     assert log.time is not None and log.output is not None
     interval, output = float(np.median(np.diff(log.time))), bridged(log.output)
     turned, heading = angle_of(log.time, output), log.reference_heading
-    if log.reference_rate is not None:
-        heading = angle_of(log.time, bridged(log.reference_rate))
-    assert heading is not None
     slope = np.gradient(output, log.time)
+    if log.reference_rate is not None:
+        rate = bridged(log.reference_rate)
+        heading = angle_of(log.time, rate + _tones(output - rate, np.column_stack(
+            [output, slope, np.ones(len(output))])))
+    assert heading is not None
     longest = max(round(_SPAN / interval), 4)
     variance = {}
     for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
@@ -450,6 +454,25 @@ def heading_errors(log: Log) -> HeadingErrors:
     return HeadingErrors(
         math.sqrt(error), min(white, math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _SPAN))),
         math.sqrt(whole / (2.0 * _SPAN)))
+
+
+def _tones(difference: Array, motion: Array) -> Array:
+    """Return the tones of a gyro in what it and a rate differ by, shape (n,): no noise is one."""
+    left = difference - motion @ np.linalg.lstsq(motion, difference, rcond=None)[0]
+    count, whole = len(left), np.zeros(len(left))
+    for _ in range(_TONES):
+        power = np.abs(np.fft.rfft(left, 2 * count)) ** 2
+        best = _BLOCK + int(power[_BLOCK:-2].argmax())
+        level = float(np.median(power[max(best - 100, 0):best + 100])) / math.log(2.0)
+        if power[best] < level * math.log(count / _BY_CHANCE):
+            break
+        low, high = (float(np.sqrt(power[best + side])) for side in (-1, 1))
+        place = best + 0.5 * (low - high) / (low - 2.0 * float(np.sqrt(power[best])) + high)
+        phase = math.pi * place / count * np.arange(count)
+        wave = np.column_stack([np.cos(phase), np.sin(phase)])
+        tone = wave @ np.linalg.lstsq(wave, left, rcond=None)[0]
+        left, whole = left - tone, whole + tone
+    return whole
 
 
 def rate_noise_share(log: Log) -> float:
