@@ -331,9 +331,10 @@ _SPAN, _LARGER, _LARGER_OF_FIXES = 1.0, 8.0, 2.0
 #: to the variance, which logs of up to 2e8 samples do not show. Nor is a heading whose error is
 #: larger than this part of what both walk apart in a second: less is a fifth of its variance.
 _NOISY, _BLURRED = 0.01, 0.25
-#: Rounding explains the error of a heading by an encoder up to this factor. Slips are found from
-#: so many standard deviations on.
-_EXPLAINED, _SLIP = 1.5, 5.0
+#: Rounding explains the error of a heading by an encoder up to this factor. Exact references know
+#: it as noise that is new in each sample; but during a rest it stands, and jumps by up to a step as
+#: the motion goes on. Up to this step, rad, that makes no slips (bench: 0.0055 deg, 50 Hz).
+_EXPLAINED, _FINE = 1.5, 0.05 * DEGREE
 #: So many tones are looked for, each of which noise alone shows with this chance.
 _TONES, _BY_CHANCE = 10, 1e-6
 #: An error of a heading that is none but of numbers, rad.
@@ -385,13 +386,9 @@ def limits(log: Log, reference: Reference) -> bool:
     found = heading_errors(log)
     if not found.larger:
         return False
-    step, interval = encoder_step(log.reference_heading), float(np.median(np.diff(log.time)))
-    rounding = step / math.sqrt(12.0)
-    # Exact references know the rounding as noise that is new in each sample. Beside it and a walk,
-    # a jump has a variance of twice rounding times walk times root interval; but during a rest
-    # the rounding stands, and jumps by up to a step as the motion goes on.
-    seen = step > _SLIP * math.sqrt(2.0 * rounding * found.walk * math.sqrt(interval))
-    return reference.kind != 'encoder' or found.error > _EXPLAINED * rounding or seen
+    step = encoder_step(log.reference_heading)
+    return (reference.kind != 'encoder' or step > _FINE
+            or found.error > _EXPLAINED * step / math.sqrt(12.0))
 
 
 @dataclass(frozen=True)
