@@ -332,8 +332,8 @@ _SPAN, _LARGER, _LARGER_OF_FIXES = 1.0, 8.0, 2.0
 #: larger than this part of what both walk apart in a second: less is a fifth of its variance.
 _NOISY, _BLURRED = 0.01, 0.25
 #: Rounding explains the error of a heading by an encoder up to this factor. Exact references know
-#: it as noise that is new in each sample; but during a rest it stands, and jumps by up to a step as
-#: the motion goes on. Up to this step, rad, that makes no slips (bench: 0.0055 deg, 50 Hz).
+#: it as noise that is new in each sample; but during a rest it stands, and jumps by up to a step
+#: as the motion goes on. Up to this step, rad, that makes no slips (bench: 0.0055 deg, 50 Hz).
 _EXPLAINED, _FINE = 1.5, 0.05 * DEGREE
 #: So many tones are looked for, each of which noise alone shows with this chance.
 _TONES, _BY_CHANCE = 10, 1e-6
