@@ -23,6 +23,7 @@ from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.recording import interpolated
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration_bench.hidden.reference import hide_beside, Imperfect
@@ -230,3 +231,19 @@ def test_a_fine_encoder_and_an_exact_rate_are_taken_as_they_are():
     assert reference_of(log).kind == 'encoder' and not limits(log, reference_of(log))
     exact = replace(log, reference_heading=None, reference_rate=hidden.truth.rate)
     assert not limits(exact, reference_of(exact))
+
+
+@pytest.mark.parametrize('begins, ends', [(0.03, 0.03), (1.5, 0.5)])
+def test_odometry_that_begins_after_the_gyro_is_no_course(begins, ends):
+    # 20 Hz, interpolated at 100 Hz as of a bag, with a gyro that is late and has a scale error
+    generator, time = np.random.default_rng(5), np.arange(0.0, 60.0, 0.01)
+    rate = 0.8 * np.sin(0.9 * time) * np.sin(0.23 * time)
+    at = np.arange(begins, 60.0 - ends, 0.05)
+    heading = np.interp(at, time, np.cumsum(rate) * 0.01)
+    log = Log(output=1.02 * np.interp(time - 0.02, time, rate) + BIAS_TRUE
+              + 1e-3 * generator.standard_normal(len(time)), time=time,
+              reference_heading=interpolated(time, at, heading + 3e-4
+                                             * generator.standard_normal(len(at))))
+    assert np.isnan(log.reference_heading[[0, -1]]).all()
+    reference = reference_of(log)
+    assert reference.kind == 'motion_capture' and 'lost' not in reference.known
