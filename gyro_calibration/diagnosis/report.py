@@ -36,6 +36,7 @@ from gyro_calibration.diagnosis.words import (
     certainty,
     change,
     clean,
+    divided,
     for_people,
     heading_shares,
     headline,
@@ -53,6 +54,7 @@ from gyro_calibration.diagnosis.words import (
     span,
     spoken,
     unknown,
+    verdict,
 )
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.model_file import model_text
@@ -65,10 +67,6 @@ _PARTS = 90
 _SLOW = 2e-3 * DEGREE
 #: The curve that holds amplitudes in place of means.
 SPECTRUM = 'frequency'
-_VERDICTS = {'adequate': 'Adequate: no cause was found',
-             'extended': 'Extended: each difference has a cause',
-             'unexplained': 'Unexplained: a difference has no known cause',
-             'mismatched': 'Mismatched: gyro and reference do not belong together'}
 
 _METHOD = (
     '{logs} replayed through the simulation: the motion and the temperature as recorded, the '
@@ -112,8 +110,8 @@ def _header(diagnosis: Diagnosis) -> Markup:
     about = ' · '.join(filter(None, ['Diagnosis', gyro, ', '.join(map(clean, diagnosis.logs))]))
     return element('header', element('p', about, class_='about'), element('h1', what),
                    element('p', gained, class_='gained'),
-                   element('p', _VERDICTS[diagnosis.verdict],
-                           class_=f'verdict {diagnosis.verdict}'),
+                   element('p', parts, class_='gained') if (parts := divided(diagnosis)) else None,
+                   element('p', verdict(diagnosis), class_=f'verdict {diagnosis.verdict}'),
                    None if diagnosis.gain is None else element(
                        'div', *(_tile(*each) for each in _errors(diagnosis.gain)),
                        class_='tiles'))

@@ -243,6 +243,35 @@ def _named(findings: Sequence[Finding]) -> str:
     return f'{names}, which these data cannot distinguish{taken}'
 
 
+def verdict(diagnosis: Diagnosis) -> str:
+    """Return the verdict in a few words."""
+    if diagnosis.verdict == 'extended':
+        return ('Extended: causes were found' if offered(diagnosis)
+                else 'Not extended: causes were found, none was added to the model')
+    return {'adequate': 'Adequate: no cause was found',
+            'unexplained': 'Unexplained: a difference has no known cause',
+            'mismatched': 'Mismatched: gyro and reference do not belong together'}[
+                diagnosis.verdict]
+
+
+def divided(diagnosis: Diagnosis) -> str:
+    """Return which part of the heading error is fitted in any case, and which the causes are."""
+    shares = diagnosis.heading_shares
+    named = {each.effect for each in diagnosis.findings if each.status == 'established'}
+    if not (shares and named):
+        return ''
+    refitted = [name for name in ('bias', 'scale_factor_error')
+                if name in shares and name not in named]
+    parts = []
+    if refitted:
+        parts.append(f'{_share(sum(shares[name] for name in refitted))} is '
+                     f'{listed(list(map(spoken, refitted)))}, refitted in any case')
+    causes = [shares[name] for name in named & set(shares)]
+    parts.append(f'{_share(sum(causes))} is of the named causes' if causes
+                 else 'no part is of the named causes')
+    return f'Of the mean square heading error over 60 s, {", and ".join(parts)}.'
+
+
 def sizes(found: Finding) -> dict[str, Quantity]:
     """Return the parameters of a cause as people read them."""
     return {name: quantity(value, name) for name, value in found.parameters.items()}
