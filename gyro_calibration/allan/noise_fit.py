@@ -509,15 +509,15 @@ def _process(ranking: Ranking, interval: float) -> GaussMarkov | None:
 def _figure(ranking: Ranking, place: int, interval: float) -> Figure:
     """Return a figure with bounds that hold with and without parts of too little evidence."""
     part, process = PARTS[place], ranking.process
-    # flicker and rate random walk stand for a process, and the other parts are beside it
-    beside = process is not None and place not in (_B, _K)
-    best = process if process is not None and beside else ranking.best
+    # flicker and rate random walk stand for a process, and the other parts are fitted with it
+    with_process = process is not None and place not in (_B, _K)
+    best = process if process is not None and with_process else ranking.best
     value, deviation = 0.0, math.nan
-    lower, upper = _bounds(ranking, place, beside)
+    lower, upper = _bounds(ranking, place, with_process)
     if place in ranking.seen and place in best.held:
         value = math.sqrt(best.squares[place])
         deviation = 0.5 * best.deviation(place) / value
-        possible = [best] if beside else ranking.possible
+        possible = [best] if with_process else ranking.possible
         ends = [(lower, upper), *(each.bounds(place) for each in possible if place in each.held)]
         lower, upper = min(value, *(low for low, _ in ends)), max(value, *(up for _, up in ends))
         if place in (_B, _K) and ranking.without(place):
@@ -528,21 +528,21 @@ def _figure(ranking: Ranking, place: int, interval: float) -> Figure:
     return Figure(part, *(each * unit for each in (value, deviation, lower, upper)))
 
 
-def _bounds(ranking: Ranking, place: int, beside: bool) -> tuple[float, float]:
+def _bounds(ranking: Ranking, place: int, with_process: bool) -> tuple[float, float]:
     """
     Return the coefficients between which -2 ln likelihood is within `_CONFIDENCE` of the least.
 
     At each coefficient the other parts are fitted anew, N, B and K among them, which may be there
     without being seen, so that what one of them takes from another is in the bounds; so is a
-    process beside the part.
+    process, where it is fitted with the part.
 
     """
     octaves, misfit = ranking.best.octaves, ranking.misfit
-    if beside and ranking.process is not None:
+    if with_process and ranking.process is not None:
         octaves = ranking.process.octaves
     held = {_N, _B, _K, *(each for one in (*ranking.possible, *ranking.alternatives)
                           for each in one.held)}
-    others = tuple(sorted(held - {place} | ({_PROCESS} if beside else set())))
+    others = tuple(sorted(held - {place} | ({_PROCESS} if with_process else set())))
     joint = describe(octaves, (*others, place), misfit)
     (*_, square), (*_, deviation) = joint.estimate((*others, place))
 
