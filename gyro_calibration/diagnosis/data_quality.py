@@ -377,7 +377,7 @@ def _errs_more(log: Log) -> bool:
     # a heading between slower fixes lies on straight lines
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
     larger = _LARGER_OF_FIXES if usual < _STRAIGHT * large else _LARGER
-    return heading_errors(log).both > larger * walk > 0.0
+    return heading_errors(replace(log, reference_rate=None)).both > larger * walk > 0.0
 
 
 def limits(log: Log, reference: Reference) -> bool:

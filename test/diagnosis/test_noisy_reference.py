@@ -139,6 +139,7 @@ def test_the_kind_of_a_reference_is_given_or_found():
         exact, reference_of(exact, 'odometry'))
     assert reference_of(replace(log, reference_rate=log.output)).kind == 'rate_command'
     assert reference_of(replace(log, reference_heading=None)).kind == 'rest'
+    assert reference_of(replace(log, reference_rate=np.nan * log.output)).kind == 'course'
 
 
 ERRING = [Imperfect('rate', 0.1), Imperfect('rate', 0.5), Imperfect('capture', 0.05),
