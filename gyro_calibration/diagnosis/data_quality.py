@@ -434,7 +434,7 @@ def heading_errors(log: Log) -> HeadingErrors:
     interval, output = float(np.median(np.diff(log.time))), bridged(log.output)
     turned, heading = angle_of(log.time, output), log.reference_heading
     slope = np.gradient(output, log.time)
-    if log.reference_rate is not None:
+    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         rate = bridged(log.reference_rate)
         heading = angle_of(log.time, rate + _tones(output - rate, np.column_stack(
             [output, slope, np.ones(len(output))])))

@@ -140,6 +140,7 @@ def test_the_kind_of_a_reference_is_given_or_found():
     assert reference_of(replace(log, reference_rate=log.output)).kind == 'rate_command'
     assert reference_of(replace(log, reference_heading=None)).kind == 'rest'
     assert reference_of(replace(log, reference_rate=np.nan * log.output)).kind == 'course'
+    assert not limits(replace(exact, reference_rate=np.nan * exact.output), reference_of(exact))
 
 
 ERRING = [Imperfect('rate', 0.1), Imperfect('rate', 0.5), Imperfect('capture', 0.05),
