@@ -54,7 +54,9 @@ def described(app, what, name, obj, options, lines):
 
 def _parted(line):
     found = re.fullmatch(r'( *)(\w+(?:, \w+)*) : (.+)', line)
-    return [found[1] + found[2], f'{found[1]}    {found[3]}'] if found else [line]
+    # a blank between names would make the first of them the type of the last
+    return ([found[1] + found[2].replace(', ', ','), f'{found[1]}    {found[3]}'] if found
+            else [line])
 
 
 def setup(app):

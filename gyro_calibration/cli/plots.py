@@ -112,8 +112,8 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
     above.set(ylabel='rate [deg/s]', title=f'Motion of {motion.duration:.3g} s to calibrate by')
     below.plot(time, motion.heading_at(time) / DEGREE, color='black')
     below.set(xlabel='time [s]', ylabel='heading [deg]')
-    return _save(figure, path, 'Dotted: limits of the robot. Turns both ways separate the scale '
-                 'factor error from the bias; rests show the bias alone.')
+    return _save(figure, path, 'Dotted: rate limit of the robot. Turns both ways separate scale '
+                 'factor error and bias; rests show the bias.')
 
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
@@ -150,7 +150,7 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
              ylim=(lowest * hour, highest * hour), title='Allan deviation of the gyro at rest')
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
-    return _save(figure, path, 'Slope -1/2: white noise, N at 1 s. Lowest part: bias instability. '
+    return _save(figure, path, 'Slope -1/2: white noise, N at 1 s. Flat: flicker, at 0.664 B. '
                  'Slope +1/2: the bias walks.')
 
 
@@ -293,8 +293,10 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float
         percent.set_ylabel('error [% of a turn]')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
-    return _save(figure, path, f'Hatched: slower than {slowest / DEGREE:g} deg/s, left out. The '
-                 'two panels have their own scales.')
+    return _save(figure, path, 'A spread at one rate is an effect of temperature; a slope or a '
+                 'curve along the rate, of the scale factor; errors that grow towards slow turns, '
+                 'of the bias. Hatched: slower than '
+                 f'{slowest / DEGREE:g} deg/s, left out. Each panel has its own scale.')
 
 
 def _panels(rows: int, columns: int, inches: tuple[float, float],
