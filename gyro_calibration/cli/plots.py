@@ -293,10 +293,9 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float
         percent.set_ylabel('error [% of a turn]')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
-    return _save(figure, path, 'A spread at one rate is an effect of temperature; a slope or a '
-                 'curve along the rate, of the scale factor; errors that grow towards slow turns, '
-                 'of the bias. Hatched: slower than '
-                 f'{slowest / DEGREE:g} deg/s, left out. Each panel has its own scale.')
+    return _save(figure, path, 'Greys in order: temperature. A step between the senses: scale '
+                 'factor error; a curve: nonlinearity; growth towards slow turns: bias or noise. '
+                 f'Hatched: slower than {slowest / DEGREE:g} deg/s, left out. Scales differ.')
 
 
 def _panels(rows: int, columns: int, inches: tuple[float, float],

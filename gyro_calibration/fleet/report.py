@@ -205,7 +205,9 @@ def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval
            style: str) -> Chart:
     unit, factor = for_people(each.unit, each.name)
     middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / _BAND
-    return Chart(name, f'{spoken(each.name)} by {kind}', f'{kind}s: {", ".join(names)}', kind, '',
+    return Chart(name, f'{spoken(each.name)} by {kind}',
+                 f'{kind.capitalize()}s whose bars do not overlap differ; of a bar across zero '
+                 f'the sign is open. {kind.capitalize()}s: {", ".join(names)}.', kind, '',
                  np.arange(1.0, len(names) + 1.0), spoken(each.name), unit,
                  [Line(kind, style, factor * middle, factor * half, dots=True)], names=names)
 
