@@ -143,8 +143,9 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
         # IEEE Std 952 reads angle random walk at 1 s; the others are named along their line
         at = (int(np.argmin(np.abs(along - 1.0))) if symbol == 'N'
               else len(along) * (1 if symbol in 'BQ' else 2) // 3)
-        # below what rises, above what falls: away from the sum
-        axes.annotate(symbol, (along[at], up[at]), xytext=(10, -14) if symbol in 'KR' else (0, 6),
+        # below what rises or lies close to the sum
+        axes.annotate(symbol, (along[at], up[at]),
+                      xytext={'N': (-9, -16), 'K': (10, -14), 'R': (10, -14)}.get(symbol, (0, 6)),
                       textcoords='offset points', fontsize=13, weight='bold', ha='center')
     axes.set(xlabel='averaging time [s]', ylabel='Allan deviation [deg/h]',
              ylim=(lowest * hour, highest * hour), title='Allan deviation of the gyro at rest')
