@@ -397,7 +397,7 @@ def allan(log: Log) -> NoiseFigures:
 
     """
     time, output = _in_time(log)
-    even = even_record(time, output, log.moving)
+    even = even_record(time, output, log.moving, log.reference_heading)
     chart, found = allan_deviation(even.rate, even.interval), fit_noise(even.rate, even.interval)
     return NoiseFigures(chart, found, tuple(allan_answer.lines(even, chart, found)))
 

@@ -21,11 +21,15 @@ from gyro_calibration.logs.quality import robust_deviation, runs
 from gyro_calibration.logs.stamps import Integers, LONG, number_stamps, Stamps
 import numpy as np
 from scipy.signal import medfilt
+from scipy.stats import pearsonr
 
 #: The least number of samples for a noise figure.
 FEWEST = 100
 #: Largest share of lost samples in a window; the variance of its mean changes by at most as much.
 LOST_SHARE = 0.01
+#: At least so many spans show whether a reference turns with the output: it does if most of the
+#: variance is common to both, and is so by chance at rest with at most this probability.
+_SPANS, _FOLLOWS = 8, 1e-4
 #: Share of a record that may be lost.
 _MOST_LOST = 0.3
 
@@ -48,7 +52,8 @@ class Record:
     remarks: tuple[str, ...] = ()
 
 
-def even_record(time: Array, output: Array, moving: Array | None = None) -> Record:
+def even_record(time: Array, output: Array, moving: Array | None = None,
+                heading: Array | None = None) -> Record:
     """
     Put samples on an even grid, lost ones marked.
 
@@ -57,6 +62,7 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
     time : stamps, s, increasing, shape (n,)
     output : rad/s, shape (n,); nan counts as lost
     moving : 1 where the log says that the gyro was moved; counts as lost
+    heading : by a reference, rad, which shows motion where the log does not say it
 
     Raises
     ------
@@ -78,6 +84,8 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
         remarks.append(f'{left_out} samples without output, or moving, are left out.')
     remarks += _remove_outliers(rate, stamps)
     _refuse_motion(rate, stamps)
+    if heading is not None and moving is None:
+        _refuse_turning(time, output, heading)
     # no window reaches across a long gap, so that it need not be kept in full
     kept = np.ones(len(rate), dtype=bool)
     for gap in runs(np.isnan(rate)):
@@ -96,6 +104,23 @@ def refuse_few(count: int, samples: str = 'samples') -> None:
     if count < FEWEST:
         raise DataRefused(f'{count} {samples}; an Allan deviation needs at least {FEWEST}: '
                           'record longer')
+
+
+def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
+    """Refuse a record whose reference turns with the output over spans of some length."""
+    sums = np.concatenate([[0.0], np.nancumsum(output)])
+    for span in 2.0 ** np.arange(math.log2(max(time[-1] - time[0], 1.0) / _SPANS)):
+        ends = np.searchsorted(time, np.arange(time[0], time[-1], span))
+        mean, change = np.diff(sums[ends]) / np.maximum(np.diff(ends), 1), np.diff(heading[ends])
+        known = np.isfinite(change)
+        if known.sum() < _SPANS or not min(np.ptp(mean[known]), np.ptp(change[known])) > 0.0:
+            continue
+        correlation, chance = pearsonr(mean[known], change[known])
+        if correlation ** 2 > 0.5 and chance < _FOLLOWS:
+            raise DataRefused(
+                f'the reference heading turns with the output ({100.0 * correlation ** 2:.0f} % '
+                f'of the variance of means over {span:g} s): the gyro was moved; give a part at '
+                'rest by --from and --to, or record one')
 
 
 def _refuse_dead(time: Array, output: Array) -> None:

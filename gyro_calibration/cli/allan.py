@@ -60,7 +60,8 @@ def _allan(given: argparse.Namespace) -> Answer:
     model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
     try:
         time = verb.time_of(given, log)
-        record = even_record(time, verb.output_of(given, log), log.moving)
+        record = even_record(time, verb.output_of(given, log), log.moving,
+                             log.reference_heading)
         with under_way('noise figures from the Allan deviation'):
             chart = allan_deviation(record.rate, record.interval)
             fit = fit_noise(record.rate, record.interval)

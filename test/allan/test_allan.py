@@ -345,6 +345,22 @@ def test_what_the_log_says_was_moved_is_left_out():
                      INTERVAL).figures['N'].value == pytest.approx(1e-3, rel=0.03)
 
 
+def test_a_reference_that_turns_with_the_output_shows_motion_and_one_that_wanders_does_not():
+    """A record that moves all the time sets its own scale, as a car on a straight road does."""
+    generator = np.random.default_rng(23)
+    time, count = stamps(10_000), 10_000
+    turns = lfilter([0.02 * math.sqrt(2e-2)], [1.0, -0.99], generator.standard_normal(count))
+    rate = simulate_noise(WALK, count, INTERVAL, generator) + turns
+    assert len(even_record(time, rate).rate) == count
+    course = INTERVAL * np.cumsum(turns) + 0.5 * DEGREE * generator.standard_normal(count)
+    with pytest.raises(DataRefused, match='the reference heading turns with the output'):
+        even_record(time, rate, heading=course)
+    for _ in range(20):
+        rate = simulate_noise(WALK, count, INTERVAL, generator)
+        wandering = np.cumsum(1e-3 * generator.standard_normal(count))
+        assert len(even_record(time, rate, heading=wandering).rate) == count
+
+
 def test_three_recordings_of_one_kind_of_gyro_agree(data):
     """ADIS16405, data sheet: 2 deg/√h and 0.007 deg/s, typical; 0.01 to 0.1 s are filtered."""
     fits = []
