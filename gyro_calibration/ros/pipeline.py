@@ -295,8 +295,7 @@ class Pipeline:
             self._stood = math.nan
         elif abs(math.remainder(heading - self._stood, math.tau)) > _CONTRADICTION:
             self._contradicted, self._stood = now, heading
-            tracker = self.estimator.tracker
-            self.estimator.rewind(tracker.heading, tracker.variance + _CONTRADICTION ** 2)
+            self._add_unknown_turn(_CONTRADICTION)
         elif math.isnan(self._stood):
             self._stood = heading
         # A late message shows nothing of now, and one that contradicts itself no standstill.
@@ -382,8 +381,7 @@ class Pipeline:
         (first, fastest), self._standing = self._standing or (now, 0.0), None
         if now - first > BLIND:
             turned = min(fastest * (now - first), math.tau)
-            tracker = self.estimator.tracker
-            self.estimator.rewind(tracker.heading, tracker.variance + turned ** 2)
+            self._add_unknown_turn(turned)
             self.journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                   'came; turns in this time are not in the heading')
 
@@ -425,7 +423,7 @@ class Pipeline:
             turned = 0.25 * _ACCELERATION * interval ** 2
             if silence < 0.5 * interval:  # or no samples are lost, and the stamps leapt
                 turned += abs(estimator.rate) * interval
-            estimator.rewind(tracker.heading, tracker.variance + turned ** 2)
+            self._add_unknown_turn(turned)
         self._stamps.add(time)
         self._look_for_repeats(time, output, now)
         if self.monitor.works and self.monitor.add(time, output, estimator.corrected):
@@ -454,6 +452,11 @@ class Pipeline:
             self._recent.popleft()
         return found
 
+    def _add_unknown_turn(self, angle: float) -> None:
+        """Add a turn that was not measured, rad, to the variance of the heading."""
+        tracker = self.estimator.tracker
+        self.estimator.rewind(tracker.heading, tracker.variance + angle ** 2)
+
     def _look_for_repeats(self, time: float, output: float, now: float) -> None:
         """Take a turn for unknown while the gyro repeats one value."""
         if not self._repeats.add(time, output, self.wheels.turning(now)):
@@ -462,8 +465,7 @@ class Pipeline:
             self.stuck = (f'the gyro reports {output:g} rad/s again and again: it is dead, '
                           'saturated, or its driver stands')
             self.journal.event = self.stuck
-            tracker = self.estimator.tracker
-            self.estimator.rewind(tracker.heading, tracker.variance + math.tau ** 2)
+            self._add_unknown_turn(math.tau)
             if self.session.drives:
                 self.session.end(self.stuck)
 
