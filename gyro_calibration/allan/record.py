@@ -109,13 +109,16 @@ def refuse_few(count: int, samples: str = 'samples') -> None:
 def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
     """Refuse a record whose reference turns with the output over spans of some length."""
     sums = np.concatenate([[0.0], np.nancumsum(output)])
-    for span in 2.0 ** np.arange(math.log2(max(time[-1] - time[0], 1.0) / _SPANS)):
+    duration = time[-1] - time[0]
+    shortest, longest = max(1.0, duration / len(time)), duration / _SPANS
+    for span in np.geomspace(shortest, longest, 1 + int(np.log2(max(longest / shortest, 1.0)))):
         ends = np.searchsorted(time, np.arange(time[0], time[-1], span))
         mean, change = np.diff(sums[ends]) / np.maximum(np.diff(ends), 1), np.diff(heading[ends])
         known = np.isfinite(change)
-        if known.sum() < _SPANS or not min(np.ptp(mean[known]), np.ptp(change[known])) > 0.0:
+        both = np.stack([mean[known], change[known]])
+        if known.sum() < _SPANS or (np.ptp(both, axis=1) <= 1e-9 * np.abs(both).max(axis=1)).any():
             continue
-        correlation, chance = pearsonr(mean[known], change[known])
+        correlation, chance = pearsonr(*both)
         if correlation ** 2 > 0.5 and chance < _FOLLOWS:
             raise DataRefused(
                 f'the reference heading turns with the output ({100.0 * correlation ** 2:.0f} % '
