@@ -62,6 +62,7 @@ from rclpy.clock import ROSClock
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
@@ -331,7 +332,7 @@ class CompensationNode(Node):
         if self._velocity is None:
             kind = TwistStamped if self._stamped else Twist
             try:
-                self._velocity = self.create_publisher(kind, 'cmd_vel', 10)
+                self._velocity = publish_on(self, kind, 'cmd_vel', QoSProfile(depth=10))
             except RuntimeError as error:  # the policy of a secured graph may forbid it
                 reason = str(error).partition(',')[0]
                 return (f'this node may not publish cmd_vel ({reason}): allow it in the policy, '
