@@ -25,7 +25,7 @@ import threading
 import time
 
 try:
-    from geometry_msgs.msg import Twist
+    from geometry_msgs.msg import Twist, TwistStamped
     from nav_msgs.msg import Odometry
     from rclpy.qos import QoSProfile
     from rosgraph_msgs.msg import Clock
@@ -144,6 +144,8 @@ class RosRobot:
     speed : float or None
         Simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and
         stamps are those of the node's clock.
+    stamped : bool
+        Commands are TwistStamped.
 
     Attributes
     ----------
@@ -160,7 +162,7 @@ class RosRobot:
 
     """
 
-    def __init__(self, node, robot, *, speed=None):
+    def __init__(self, node, robot, *, speed=None, stamped=False):
         self.robot, self.node, self.also = robot, node, None
         self.clock_absent = self.clock_stands = False
         self.commands, self.headings, self.moments = [], {}, []
@@ -169,15 +171,17 @@ class RosRobot:
         self._imu = node.create_publisher(Imu, 'imu/data_raw', quality)
         self._odometry = node.create_publisher(Odometry, 'odom', quality)
         self._clock = node.create_publisher(Clock, '/clock', 10) if speed else None
-        self._heard = node.create_subscription(Twist, 'cmd_vel', self._on_command, quality)
+        self._heard = node.create_subscription(
+            TwistStamped if stamped else Twist, 'cmd_vel', self._on_command, quality)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _on_command(self, message):
+        rate = getattr(message, 'twist', message).angular.z
         with self._lock:
-            self.commands.append((now(), message.angular.z))
-            self.robot.command(message.angular.z)
+            self.commands.append((now(), rate))
+            self.robot.command(rate)
 
     def _run(self):
         interval = INTERVAL / (self._speed or 1.0)
@@ -241,7 +245,7 @@ def now():
 
 class SecondCommander:
     """
-    Somebody else on cmd_vel at 20 Hz: a soft stop (rate 0) or teleop.
+    Somebody else on cmd_vel at 20 Hz: a soft stop (rate 0) or teleop, as TwistStamped.
 
     Attributes
     ----------
@@ -251,7 +255,7 @@ class SecondCommander:
     """
 
     def __init__(self, node):
-        self.rate, self._publisher = None, node.create_publisher(Twist, 'cmd_vel', 10)
+        self.rate, self._publisher = None, node.create_publisher(TwistStamped, 'cmd_vel', 10)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -259,8 +263,8 @@ class SecondCommander:
     def _run(self):
         while not self._stop.wait(0.05):
             if self.rate is not None:
-                message = Twist()
-                message.angular.z = self.rate
+                message = TwistStamped()
+                message.twist.angular.z = self.rate
                 self._publisher.publish(message)
 
     def close(self):

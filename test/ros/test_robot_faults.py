@@ -54,8 +54,7 @@ class Stage:
 
     def robot(self, **how):
         """Start the robot."""
-        speed = how.pop('speed', None)
-        self.base = RosRobot(self.ros.node, Robot(noise=5e-3, **how), speed=speed)
+        self.base = RosRobot(self.ros.node, Robot(noise=5e-3), **how)
         self.closing.append(self.base.close)
         return self.base
 
@@ -163,9 +162,9 @@ def test_an_unplugged_gyro_stops_the_robot_and_the_diagnostics_name_it(stage):
 
 def test_a_second_commander_is_obeyed_at_once(stage):
     """A soft stop first, then teleop."""
-    robot, other = stage.robot(), SecondCommander(stage.ros.node)
+    robot, other = stage.robot(stamped=True), SecondCommander(stage.ros.node)
     stage.closing.append(other.close)
-    stage.node()
+    stage.node(cmd_vel_stamped='true')
     for rate in (0.0, 0.3):
         answer = stage.drive()
         begin, other.rate = now(), rate
