@@ -468,8 +468,9 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
     """
     Return the samples of the rest after a run, from `SETTLED` s after the motion on.
 
-    It begins later, by up to its length, where the robot still moves then, as one that swings out.
-    None where the log ends before, or the robot drives on.
+    It begins later, by up to its length in the limits, where the robot still moves then, as one
+    that swings out. It lasts until the robot moves, at most as long as the motion did. None where
+    the log ends before, or the robot drives on.
 
     Parameters
     ----------
@@ -479,19 +480,27 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
     """
     limits = limits or Limits()
     begin = motion.duration + max(fit.time_offset, 0.0) + SETTLED
-    latest = max(min(float(time[-1]) - limits.rest, begin + limits.rest), begin)
+    latest = max(min(float(time[-1]) - limits.rest, begin + motion.duration), begin)
     begins = np.arange(begin, latest + 1e-9, 0.25)
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
-    rests = [slice(*np.searchsorted(time, [each, each + limits.rest]).tolist()) for each in begins]
-    if rests[0].stop - rests[0].start < 10 or time[-1] < begin + 0.9 * limits.rest:
+    windows = [slice(*np.searchsorted(time, [each, each + limits.rest]).tolist())
+               for each in begins]
+    if windows[0].stop - windows[0].start < 10 or time[-1] < begin + 0.9 * limits.rest:
         return None
     # a difference of halves scatters by twice the deviation of a mean
-    rest = next((each for each in rests if _change_at_rest(corrected[each])
-                 < 4.0 * _deviation_of_mean(corrected[each])), rests[-1])
-    means = np.array([part.mean() for part in np.array_split(corrected[rest], 4)])
-    apart = max(CHANCE * 2.0 * _deviation_of_mean(corrected[rest]), _DRIVING)
+    sizes = np.array([_change_at_rest(corrected[each])
+                      / max(2.0 * _deviation_of_mean(corrected[each]), 1e-300)
+                      for each in windows])
+    late = np.flatnonzero(begins <= begin + limits.rest)
+    first = next((each for each in late.tolist() if sizes[each] < 2.0), int(late[-1]))
+    means = np.array([part.mean() for part in np.array_split(corrected[windows[first]], 4)])
+    apart = max(CHANCE * 2.0 * _deviation_of_mean(corrected[windows[first]]), _DRIVING)
     # a slow and steady turn is no drive: before the fit it passed for a bias
-    return (None if abs(means.mean()) > limits.bias or np.ptp(means) > 2.0 * apart else rest)
+    if abs(means.mean()) > limits.bias or np.ptp(means) > 2.0 * apart:
+        return None
+    moving = first + 1 + np.flatnonzero(sizes[first + 1:] > 4.0)
+    last = windows[int(moving[0])].start if len(moving) else windows[-1].stop
+    return slice(windows[first].start, max(last, windows[first].stop))
 
 
 def _change_at_rest(rate: Array) -> float:

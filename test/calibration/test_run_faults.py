@@ -191,7 +191,9 @@ def test_the_rest_after_a_run_is_found_and_a_drive_is_none():
     rate = output(0, time=time)
     rest = rest_after(time, rate, calibrated(0), CALIBRATION)
     assert (time[rest][0] == pytest.approx(21.0, abs=0.02)
-            and time[rest][-1] == pytest.approx(23.0, abs=0.02))
+            and time[rest][-1] == pytest.approx(26.0, abs=0.3))
+    driven = rest_after(time, rate + np.where(time > 24.5, 0.2, 0.0), calibrated(0), CALIBRATION)
+    assert driven.start == rest.start and 23.0 <= time[driven][-1] <= 24.5
     assert rest_after(time, rate + np.where(time > 20.5, 0.2, 0.0), calibrated(0),
                       CALIBRATION) is None
     assert rest_after(TIME, rate[:2001], calibrated(0), CALIBRATION) is None
