@@ -14,8 +14,6 @@ from math import ceil
 
 import numpy as np
 
-BITS_PER_BYTE = 10  # 8 data bits, a start and a stop bit
-
 
 def damaged(data, generator, lost=0.0, doubled=0.0, flipped=0.0):
     """Return what arrives of bytes; each is lost, comes twice, or with one of its bits flipped."""
@@ -37,10 +35,3 @@ def bursts(sent, interval=0.016):
             gathered = b''
         end, gathered = own_end, gathered + data
     yield end, gathered
-
-
-def single_bytes(sent, baud):
-    """Give bytes, (s, bytes), one by one, each when the line has had the time for it."""
-    for due, data in sent:
-        for place in range(len(data)):
-            yield due + place * BITS_PER_BYTE / baud, data[place:place + 1]

@@ -96,14 +96,6 @@ def test_only_the_bits_of_the_axis_count(axis):
     assert with_status(0x77 & ~gyro, name) == []
 
 
-def test_an_invalid_sample_is_counted_and_missing():
-    decoder = PROTOCOL.decoder()
-    frames = [PROTOCOL.encode(Sample(0.1, sequence=k), valid=k not in (3, 4)) for k in range(7)]
-    samples = decoder.feed(b''.join(frames))
-    assert [sample.missing for sample in samples] == [0, 0, 0, 2, 0] and decoder.faults == 2
-    assert [sample.sequence for sample in samples] == [0, 1, 2, 5, 6]
-
-
 @pytest.mark.parametrize('temperature', [-40, -1, 0, 25, 85])
 def test_the_temperature_has_a_sign(temperature):
     sample, = decoded(sealed(GOLDEN[:30] + struct.pack('>h', temperature)))
