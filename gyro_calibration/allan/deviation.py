@@ -28,7 +28,6 @@ from gyro_calibration.allan.record import angle_of, lost_before, refuse_few, who
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.logs.stamps import Integers
 from gyro_calibration.model.noise import (
-    ALLAN_FLOOR,
     ANGLE_RANDOM_WALK,
     FLICKER,
     GaussMarkov,
@@ -72,11 +71,6 @@ class Floor:
     deviation: float
     lower: float
     upper: float
-
-    @property
-    def bias_instability(self) -> tuple[float, float, float]:
-        """Return B, 1 / 0.664 of the floor (IEEE Std 952), and its bounds, rad/s."""
-        return self.deviation / ALLAN_FLOOR, self.lower / ALLAN_FLOOR, self.upper / ALLAN_FLOOR
 
 
 @dataclass(frozen=True)

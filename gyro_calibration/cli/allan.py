@@ -72,9 +72,7 @@ def _allan(given: argparse.Namespace) -> Answer:
     if given.out:
         write_model(given.out, replace(verb.with_origin(given, model), noise=fit.noise,
                                        noise_bounds=fit.noise_bounds))
-    of_model = ['The bias instability of the model is that of the fit of all parts, '
-                'since the model adds N and K to it.'] if given.out else []
-    return Answer([*lines(record, chart, fit), *of_model], _data(given, record, chart, fit),
+    return Answer(lines(record, chart, fit), _data(given, record, chart, fit),
                   (given.picture, given.out))
 
 
@@ -90,8 +88,7 @@ def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
 
 def _line(symbol: str, figure: Figure) -> str:
     unit, factor = UNITS[symbol]
-    name = ('Flicker, in a fit of all parts together' if symbol == 'B'
-            else f'{_words(figure).capitalize()} {symbol}')
+    name = f'{_words(figure).capitalize()} {symbol}'
     if not figure.value:
         return (f'{name}: not seen; below {figure.upper * factor:.3g} {unit} '
                 f'({figure.upper:.3g} {figure.part.unit}).')
@@ -113,15 +110,13 @@ def _words(figure: Figure) -> str:
 def _floor_line(chart: AllanChart, fit: NoiseFit) -> str:
     unit, factor = UNITS['B']
     floor = chart.floor
-    value, lower, upper = floor.bias_instability
-    where = (f'the lowest Allan deviation, {floor.deviation * factor:.4g} {unit} '
-             f'at {floor.time:.4g} s, over 0.664')
+    text = (f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} '
+            f'at {floor.time:.4g} s, 95 %: {floor.lower * factor:.4g} '
+            f'to {floor.upper * factor:.4g}')
     if fit.floor_reached:
-        return (f'Bias instability B: {value * factor:.4g} {unit}, 95 %: {lower * factor:.4g} '
-                f'to {upper * factor:.4g} ({value:.4g} rad/s): {where}.')
-    return (f'Bias instability B: below {upper * factor:.4g} {unit} ({upper:.3g} rad/s): {where}, '
-            'and the deviation still falls at the end of the chart; '
-            'record longer to reach its minimum.')
+        return f'{text}.'
+    return (f'{text}. The deviation still falls at the end of the chart; record longer to reach '
+            'its minimum.')
 
 
 def _fit_line(fit: NoiseFit) -> str:
@@ -143,7 +138,6 @@ def _fit_line(fit: NoiseFit) -> str:
 
 def _data(given: argparse.Namespace, record: Record, chart: AllanChart,
           fit: NoiseFit) -> dict[str, Any]:
-    value, lower, upper = chart.floor.bias_instability
     figures = {figure.part.name: {
         'symbol': symbol, 'unit': figure.part.unit, 'value': figure.value, 'lower': figure.lower,
         'upper': figure.upper, 'seen': bool(figure.value),
@@ -153,8 +147,6 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart,
                'differences': chart.differences, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval,
             'remarks': list(record.remarks), **figures,
-            'bias_instability': {'symbol': 'B', 'unit': 'rad/s', 'value': value, 'lower': lower,
-                                 'upper': upper, 'seen': fit.floor_reached},
             'floor': {**vars(chart.floor), 'reached': fit.floor_reached},
             'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit,
             'rivals': list(fit.alternatives),

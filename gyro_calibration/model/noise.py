@@ -209,7 +209,7 @@ def _flicker_covariance(time: Number) -> Array:
 
 ANGLE_RANDOM_WALK = Part('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
                          lambda time: -0.5 * np.abs(time))
-FLICKER = Part('flicker', 'B', 'rad/s', 0.0, ALLAN_FLOOR ** 2, _flicker_covariance)
+FLICKER = Part('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR ** 2, _flicker_covariance)
 RATE_RANDOM_WALK = Part('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
                         lambda time: np.abs(time) ** 3 / 12.0)
 QUANTIZATION = Part('quantization', 'Q', 'rad', -1.0, 3.0,

@@ -15,6 +15,7 @@ import math
 
 from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.allan import allan_deviation, even_record, fit_noise, PARTS
+from gyro_calibration.cli.allan import names
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
 from gyro_calibration.logs.stamps import number_stamps
 from gyro_calibration.model.model_file import read_model
@@ -205,7 +206,7 @@ def test_a_record_that_is_too_short_for_the_floor_says_so_and_bounds_the_bias_in
     assert (not short.floor_reached and not short.figures['B'].value
             and short.figures['B'].upper > 3e-4)
     assert (long.floor_reached
-            and long.chart.floor.bias_instability[0] == pytest.approx(3e-4, rel=0.4))
+            and long.chart.floor.deviation == pytest.approx(ALLAN_FLOOR * 3e-4, rel=0.4))
 
 
 def stamps(count):
@@ -442,18 +443,18 @@ def test_what_the_verb_refuses_is_reported(log, tmp_path, run, words, code, said
     assert found == code and said in error
 
 
-def test_bias_instability_is_the_floor_over_0_664_and_a_model_gets_what_the_others_do_not_explain(
-        tmp_path, run):
+def test_text_data_picture_and_model_have_one_bias_instability(tmp_path, run):
+    """It is that of the fit: the lowest deviation also holds N and K, which a model adds to it."""
     path, out = tmp_path / 'rest.csv', tmp_path / 'model.yaml'
-    noise = Noise(3e-4, 1e-4, 3e-5)
-    write_log(path, Log(time=stamps(100_000), output=simulate_noise(
-        noise, 100_000, INTERVAL, np.random.default_rng(19))))
+    rate = simulate_noise(Noise(3e-4, 1e-4, 3e-5), 100_000, INTERVAL, np.random.default_rng(19))
+    write_log(path, Log(time=stamps(100_000), output=rate))
     answer = json.loads(run('allan', path, '--out', out, '--json')[1])
-    lowest = int(np.argmin(answer['chart']['upper']))
-    assert answer['bias_instability']['value'] == pytest.approx(
-        answer['chart']['deviation'][lowest] / ALLAN_FLOOR)
-    assert (read_model(out).noise.bias_instability == answer['flicker']['value']
-            < answer['bias_instability']['value'])
+    value = answer['bias_instability']['value']
+    assert read_model(out).noise.bias_instability == value < answer['floor']['deviation'] / 0.664
+    text = f'{value / DEGREE * 3600.0:.4g} deg/h'
+    assert f'Bias instability B: {text},' in run('allan', path)[1]
+    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in names(
+        fit_noise(rate, INTERVAL))['B']
 
 
 def test_what_comes_before_and_after_is_left_out(tmp_path, run):
