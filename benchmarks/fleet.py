@@ -34,12 +34,10 @@ from gyro_calibration.calibration.self_calibration import Reference, self_calibr
 from gyro_calibration.diagnosis.expected_output import bridged
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.fleet.pooling import DRIVES, Observed, Pooled, POWER_ONS, SLOPES, UNITS
-from gyro_calibration.fleet.prior import models
 from gyro_calibration.fleet.run import finished, Lost, processes
-from gyro_calibration.fleet.slow_effects import slow_effects
-from gyro_calibration.fleet.summary import counted, lacking, summarized
+from gyro_calibration.fleet.summary import counted, lacking, models, summarized
 from gyro_calibration.fleet.table import entries
-from gyro_calibration.fleet.work import done, Task
+from gyro_calibration.fleet.work import done, slow_effects, Task
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, part, read_log

@@ -32,7 +32,7 @@ from gyro_calibration.calibration.selection import select_effects, Selection, TE
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import Answer, UsageError, wrapped
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DEGREE, Log, NORMAL_95
 from gyro_calibration.model.effects import (
     Effect,
     Parameter,
@@ -213,7 +213,7 @@ def _model_data(model: GyroModel) -> dict[str, Any]:
     for effect, parameter, value, deviation in _fitted(model):
         values.setdefault(effect, {})[parameter.name] = {
             'estimate': value, 'standard_deviation': deviation,
-            'ci95': [value - 1.96 * deviation, value + 1.96 * deviation]
+            'ci95': [value - NORMAL_95 * deviation, value + NORMAL_95 * deviation]
             if math.isfinite(deviation) else None, 'unit': parameter.unit}
     return {'effects': values,
             'covariance': None if model.covariance is None else model.covariance.tolist(),
@@ -302,7 +302,7 @@ def _value_lines(model: GyroModel) -> Iterator[str]:
     for effect, parameter, value, deviation in _fitted(model):
         unit, factor = _UNITS.get(parameter.unit, (parameter.unit, 1.0))
         name = effect if parameter.name == effect else f'{effect} {parameter.name}'
-        low, high = ((value + sign * 1.96 * deviation) * factor for sign in (-1, 1))
+        low, high = ((value + sign * NORMAL_95 * deviation) * factor for sign in (-1, 1))
         sure = (f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}'
                 if math.isfinite(deviation) else f'{"-":>10s}   {"-":27s}')
         yield f'{name:38s} {value * factor:12.5g} {sure} {unit}'

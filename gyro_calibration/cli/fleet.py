@@ -30,7 +30,6 @@ from gyro_calibration.diagnosis.gates import is_confused
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.files import plain, write_atomically
 from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
-from gyro_calibration.fleet.prior import models
 from gyro_calibration.fleet.report import report, tables
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes, usual_workers
 from gyro_calibration.fleet.summary import (
@@ -40,6 +39,7 @@ from gyro_calibration.fleet.summary import (
     FALSE_ALARMS,
     Found,
     in_words,
+    models,
     sentences,
     summarized,
     TypeFound,

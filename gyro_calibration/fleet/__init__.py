@@ -12,8 +12,8 @@
 A fleet: many logs of many gyros, and what is the unit's, the type's and the reference's.
 
 Reading order, each imports only from those before it: `table` (which log is of which unit),
-`slow_effects` (of a log), `work` (on one log), `run` (of many tasks), `pooling` (of one value over
-the logs of a type), `outliers` (among units and drives), `summary` (of a type),
-`prior` (models for units), `report` (the page, and tables for other programs).
+`work` (on one log), `run` (of many tasks), `pooling` (of one value over the logs of a type, and
+its outliers), `summary` (of a type, and models for its units), `report` (the page, and tables for
+other programs).
 
 """

@@ -33,6 +33,12 @@ it is flat in the logarithms of the expected mean squares, and the intervals are
 The equations are those of mixed models (Henderson 1975): units are eliminated first, as each log
 is of one unit, so that only the columns of drives and ``beta`` are solved for.
 
+A unit or drive that stands out is given an effect of its own and all else is pooled again, so that
+it is compared with what the others predict for one more unit. Its chance is multiplied by the
+number of those that it was chosen from (Bonferroni). Where there are many, the next is tested with
+it, for two that stand out hide each other; the last one below the level counts, and all before it
+(generalized extreme studentized deviate, Rosner 1983).
+
 """
 
 from __future__ import annotations
@@ -59,7 +65,7 @@ SLOPES = ('slopes_0', 'slopes_1')
 #: Logs of a unit, at different values of a column, that show a slope of its own.
 _FEWEST = 3
 #: Points of the sequence over the variances, and of a slice through the likeliest.
-POINTS, _SLICE = 512, 41
+_POINTS, _SLICE = 512, 41
 #: Largest standard deviation that is possible, in those of the values about their median.
 _LARGEST = 30.0
 
@@ -161,10 +167,6 @@ class _Equations:
         step = max(2_000_000 // size, 1)
         return [slice(begin, begin + step) for begin in range(0, points, step)]
 
-    def solve(self, sizes: Mapping[str, Array]) -> _Solved:
-        """Return the solutions for variances of shape (points,)."""
-        return _Solved(self, sizes)
-
 
 def _summing(group: Numbers) -> Any:
     """Return the matrix that sums over the members of each group."""
@@ -172,7 +174,7 @@ def _summing(group: Numbers) -> Any:
 
 
 class _Solved:
-    """Solutions at many points; the first axis of all arrays is that of the points."""
+    """Solutions for variances of shape (points,), which is the first axis of all arrays."""
 
     def __init__(self, at: _Equations, sizes: Mapping[str, Array]):
         of, fixed, count = at.of, at.fixed, len(next(iter(sizes.values())))
@@ -272,7 +274,7 @@ class Pooled:
 
     """
 
-    def __init__(self, observed: Observed, points: int = POINTS):
+    def __init__(self, observed: Observed):
         """Pool; raise `DataRefused` where there is less than two logs more than fixed effects."""
         fixed = observed.fixed
         if len(observed) < fixed.shape[1] + 1:
@@ -290,14 +292,14 @@ class Pooled:
             observed, value=(observed.value - self._middle) / self._size,
             deviation=np.maximum(observed.deviation / self._size, 1e-5),
             columns=self._fixed[:, 1:])
-        self.names = _told_apart(observed)
+        self.names = _distinguishable(observed)
         self._bounds = _bounds(self._scaled, self.names)
         self._equations = _Equations(self._scaled, self._fixed, DRIVES in self.names)
         self._best = self._search()
         self.likeliest = {name: float(value[0]) * (1.0 if name == OWN else self._size ** 2)
                           for name, value in self._sizes(self._best[None]).items()
                           if name in self.names}
-        self._sample, self._weight = self._integrated(points)
+        self._sample, self._weight = self._integrated()
         self._kept: _Solved | None = None
 
     # the variances
@@ -314,7 +316,7 @@ class Pooled:
         found = []
         for part in self._equations.chunks(len(points)):
             sizes = self._sizes(points[part])
-            found.append(self._equations.solve(sizes).log_likelihood)
+            found.append(_Solved(self._equations, sizes).log_likelihood)
             if prior:
                 found[-1] = found[-1] + _log_prior(self._equations, sizes) + sum(
                     column for name, column in zip(self.names, points[part].T) if name != OWN)
@@ -345,12 +347,12 @@ class Pooled:
         found = -self._log_likelihood(np.vstack([point, point + step * np.eye(len(point))]))
         return float(found[0]), (found[1:] - found[0]) / step
 
-    def _integrated(self, points: int) -> tuple[Array, Array]:
+    def _integrated(self) -> tuple[Array, Array]:
         """Return points of the variances, shape (points, names), and their weights."""
         if not self.names:
             return np.empty((1, 0)), np.ones(1)
-        uniform = qmc.Halton(len(self.names), scramble=False).random(points + 1)[1:]
-        sample, log_density = np.empty_like(uniform), np.zeros(points)
+        uniform = qmc.Halton(len(self.names), scramble=False).random(_POINTS + 1)[1:]
+        sample, log_density = np.empty_like(uniform), np.zeros(_POINTS)
         for place, name in enumerate(self.names):
             axis = np.linspace(*self._bounds[name], _SLICE)
             along = self._log_likelihood(_moved(self._best, place, axis), prior=True)
@@ -365,11 +367,6 @@ class Pooled:
         log_weight = self._log_likelihood(sample, prior=True) - log_density
         weight = np.exp(log_weight - log_weight.max())
         return sample, weight / weight.sum()
-
-    @property
-    def effective_points(self) -> float:
-        """Return how many points count: 1 over the sum of squared weights."""
-        return float(1.0 / np.sum(self._weight ** 2))
 
     @cached_property
     def components(self) -> dict[str, Component]:
@@ -414,18 +411,18 @@ class Pooled:
         for part in parts:
             sizes = self._sizes(self._sample[part])
             if len(parts) > 1:
-                yield sizes, self._equations.solve(sizes)
+                yield sizes, _Solved(self._equations, sizes)
                 continue
-            self._kept = self._kept or self._equations.solve(sizes)
+            self._kept = self._kept or _Solved(self._equations, sizes)
             yield sizes, self._kept
 
-    def estimate(self, wanted: Wanted, level: float = 0.95) -> Interval:
-        """Return estimates with intervals that hold with a chance of `level`."""
+    def estimate(self, wanted: Wanted) -> Interval:
+        """Return estimates with intervals that hold with 95 %."""
         mean, variance = self._moments(wanted)
         value = self._weight @ mean
         deviation = np.sqrt(self._weight @ (variance + (mean - value) ** 2))
         low, high = (_quantile(mean, variance, self._weight, chance)
-                     for chance in (0.5 * (1.0 - level), 0.5 * (1.0 + level)))
+                     for chance in (0.025, 0.975))
         return Interval(value, deviation, low, high)
 
     def chance(self, wanted: Wanted) -> Array:
@@ -459,7 +456,7 @@ class Pooled:
         """Return how many standard deviations one more fixed effect is from 0, roughly."""
         fixed = np.column_stack([self._fixed, column])
         sizes = self._sizes(self._best[None])
-        solved = _Equations(self._scaled, fixed, DRIVES in self.names).solve(sizes)
+        solved = _Solved(_Equations(self._scaled, fixed, DRIVES in self.names), sizes)
         row = np.zeros((1, fixed.shape[1]))
         row[0, -1] = 1.0
         mean, variance = solved.moments(self.wanted(fixed=row))
@@ -474,12 +471,12 @@ class Pooled:
         rows = np.zeros((len(groups), self._fixed.shape[1]))
         wanted = (self.wanted(unit=groups, fixed=rows) if kind == UNITS
                   else self.wanted(drive=groups, fixed=rows))
-        mean, variance = self._equations.solve({**sizes, kind: size}).moments(wanted)
+        mean, variance = _Solved(self._equations, {**sizes, kind: size}).moments(wanted)
         known = np.maximum(size - variance[0], 1e-12 * size)
         return np.asarray(mean[0] / np.sqrt(known))
 
 
-def _told_apart(of: Observed) -> list[str]:
+def _distinguishable(of: Observed) -> list[str]:
     """Return the variances that the logs can tell apart."""
     logs = np.bincount(of.unit)
     names = [UNITS] if len(logs) > 1 else []
@@ -551,3 +548,117 @@ def _quantile(mean: Array, variance: Array, weight: Array, chance: float) -> Arr
         below = within(middle) < chance
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return np.asarray(0.5 * (low + high))
+
+
+#: Fewer units or drives do not show what is usual.
+FEWEST = 4
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """
+    A unit or drive that stands out.
+
+    Attributes
+    ----------
+    number : of the unit or drive
+    excess : by how much it differs from what the others predict, in the unit of the value
+    chance : that the farthest of as many would be as far off
+
+    """
+
+    number: int
+    excess: float
+    chance: float
+
+
+def outliers(observed: Observed, kind: str, level: float, pooled: Pooled | None = None
+             ) -> list[Outlier]:
+    """
+    Return the units or drives that stand out.
+
+    Parameters
+    ----------
+    observed : one value over the logs of a type
+    kind : `pooling.UNITS` or `pooling.DRIVES`
+    level : chance that any stands out where none does
+    pooled : the value, where it is pooled already
+
+    """
+    number = observed.unit if kind == UNITS else observed.drive
+    groups = np.unique(number[number >= 0])
+    if len(groups) < FEWEST or len(observed) < FEWEST + 1:
+        return []
+    # Rosner's levels hold from 15 on
+    most = min(len(groups) // 5, 10) if len(groups) >= 15 else 1
+    found: list[Outlier] = []
+    without: Observed = observed
+    pooled = pooled or Pooled(observed)
+    for _ in range(most):
+        if kind not in pooled.names:
+            break
+        standing = np.abs(pooled.standing(kind))[groups]
+        standing[np.isin(groups, [each.number for each in found])] = 0.0
+        worst = int(groups[np.argmax(standing)])
+        without = without.with_column((number == worst).astype(float))
+        pooled = Pooled(without)
+        excess, chance = _last(pooled)
+        found.append(Outlier(worst, excess, min(chance * (len(groups) - len(found)), 1.0)))
+    last = max((place for place, each in enumerate(found, 1) if each.chance < level), default=0)
+    return found[:last]
+
+
+@dataclass(frozen=True)
+class Change:
+    """
+    A unit that is another one from some date on.
+
+    Attributes
+    ----------
+    unit : its number
+    since : number of the first date on which it is another one
+    size : of the change, in the unit of the value
+    chance : that the largest of as many possible changes would be as large
+
+    """
+
+    unit: int
+    since: int
+    size: float
+    chance: float
+
+
+def changes(observed: Observed, date: Numbers, level: float, pooled: Pooled | None = None
+            ) -> list[Change]:
+    """
+    Return the units that change between dates, beyond how they repeat; the clearest change alone.
+
+    Parameters
+    ----------
+    observed : one value over the logs of a type
+    date : number of the date of each log, in their order, or -1, shape (n,)
+    level : chance that any changes where none does
+    pooled : the value, where it is pooled already
+
+    """
+    pooled = pooled or Pooled(observed)
+    if POWER_ONS not in pooled.names:
+        return []
+    candidates = [(int(unit), int(since)) for unit in np.unique(observed.unit)
+                  for since in np.unique(date[(observed.unit == unit) & (date >= 0)])[1:]]
+    if not candidates:
+        return []
+    columns = [((observed.unit == unit) & (date >= since)).astype(float)
+               for unit, since in candidates]
+    place = int(np.argmax([abs(pooled.score(column)) for column in columns]))
+    size, chance = _last(Pooled(observed.with_column(columns[place])))
+    chance = min(chance * len(candidates), 1.0)
+    return [Change(*candidates[place], size, chance)] if chance < level else []
+
+
+def _last(pooled: Pooled) -> tuple[float, float]:
+    """Return the last fixed effect, and the chance that it is as far from zero."""
+    row: Array = np.zeros((1, pooled.observed.fixed.shape[1]))
+    row[0, -1] = 1.0
+    wanted = pooled.wanted(fixed=row)
+    return float(pooled.estimate(wanted).value[0]), float(pooled.chance(wanted)[0])

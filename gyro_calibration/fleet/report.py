@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.report import page
 from gyro_calibration.diagnosis.words import amount, for_people, quantity, sentence, spoken
 from gyro_calibration.fleet.pooling import Component, DRIVES, Interval, POWER_ONS, UNITS
 from gyro_calibration.fleet.summary import Found, in_words, sentences, TypeFound
-from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.log import Array, NORMAL_95
 import numpy as np
 
 _SPREADS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
@@ -31,8 +31,6 @@ _SPREADS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
 _PER = {'age': 'year', 'temperature': 'K'}
 #: Rows from which on a table is scrolled inside the page and has a field to search.
 _LONG = 12
-#: Of a normal distribution, as charts draw it.
-_BAND = 1.96
 _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')
 #: Sorts a table by the column that is clicked, and shows the rows that hold a text.
@@ -170,7 +168,7 @@ def _logs(records: Sequence[Mapping[str, Any]]) -> Markup:
 
 
 def _of_log(value: Mapping[str, Any], name: str) -> Markup:
-    size = _BAND * value['deviation']
+    size = NORMAL_95 * value['deviation']
     return _cell(str(quantity(Estimate(value['value'], (
         value['value'] - size, value['value'] + size), value['unit']), name)), value['value'])
 
@@ -204,7 +202,7 @@ def _spread(each: Found, of: Component | None) -> Markup:
 def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval,
            style: str) -> Chart:
     unit, factor = for_people(each.unit, each.name)
-    middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / _BAND
+    middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / NORMAL_95
     return Chart(name, f'{spoken(each.name)} by {kind}',
                  f'{kind.capitalize()}s whose bars do not overlap differ; of a bar across zero '
                  f'the sign is open. {kind.capitalize()}s: {", ".join(names)}.', kind, '',
@@ -224,8 +222,6 @@ def _dates_chart(found: TypeFound, each: Found, name: str) -> Chart:
                  f'dates: {", ".join(found.dates)}', 'date', '', place, spoken(each.name), unit,
                  [Line('log', 'measured', factor * value, dots=True)], names=found.dates)
 
-
-# for other programs
 
 def tables(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
     """

@@ -98,7 +98,7 @@ def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
     Raises
     ------
     ImportError : `distributed` is not installed
-    OSError, ValueError : nobody answers there, or it is no address
+    OSError, ValueError : no scheduler answers there, or it is no address
 
     """
     from distributed import Client

@@ -21,20 +21,26 @@ from typing import Any
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate
 from gyro_calibration.diagnosis.words import amount, listed, quantity, spoken
 from gyro_calibration.files import plain
-from gyro_calibration.fleet.outliers import Change, changes, Outlier, outliers
 from gyro_calibration.fleet.pooling import (
+    Change,
+    changes,
     Component,
     DRIVES,
     Interval,
     Numbers,
     Observed,
+    Outlier,
+    outliers,
     OWN,
     Pooled,
     POWER_ONS,
     SLOPES,
     UNITS,
 )
-from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.log import Array, DataRefused, NORMAL_95
+from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom
@@ -116,23 +122,22 @@ class TypeFound:
     level: float
 
 
-def summarized(records: Sequence[Record], false_alarms: float = FALSE_ALARMS) -> list[TypeFound]:
+def summarized(records: Sequence[Record]) -> list[TypeFound]:
     """
     Return what is known of each type, by the records of logs that are evidence.
 
     Parameters
     ----------
     records : as `work.done` returns them
-    false_alarms : chance that a fleet without any cause gives an alarm
 
     """
     types = sorted({str(each['type']) for each in records})
-    named = {kind: [[each for each in records if each['type'] == kind]] for kind in types}
-    values = {kind: _names(logs[0]) for kind, logs in named.items()}
+    logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
+    values = {kind: _names(logs[kind]) for kind in types}
     # of a value a unit, a drive, a change, and an effect of the type; and of the effects of
     # diagnoses the type's, a unit's and a drive's
     tests = 4 * sum(map(len, values.values())) + 3 * len(types)
-    return [_of_type(kind, named[kind][0], values[kind], false_alarms / tests) for kind in types]
+    return [_of_type(kind, logs[kind], values[kind], FALSE_ALARMS / tests) for kind in types]
 
 
 def _names(records: Sequence[Record]) -> list[tuple[str, bool]]:
@@ -145,7 +150,10 @@ def _names(records: Sequence[Record]) -> list[tuple[str, bool]]:
 
 def _of_type(name: str, records: Sequence[Record], values: Sequence[tuple[str, bool]],
              level: float) -> TypeFound:
-    units, drives, dates = (sorted({str(each[key]) for each in records} - {''}, key=_natural)
+    def natural(text: str) -> tuple[int, str]:
+        return len(text) if text.isdigit() else 0, text  # 2 before 10
+
+    units, drives, dates = (sorted({str(each[key]) for each in records} - {''}, key=natural)
                             for key in ('unit', 'drive', 'date'))
     found = {}
     for value, slow in values:
@@ -154,11 +162,6 @@ def _of_type(name: str, records: Sequence[Record], values: Sequence[tuple[str, b
         except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
             continue
     return TypeFound(name, units, drives, dates, records, found, level)
-
-
-def _natural(text: str) -> tuple[int, str]:
-    """Return what sorts 2 before 10."""
-    return len(text) if text.isdigit() else 0, text
 
 
 def _of_value(name: str, slow: bool, records: Sequence[Record], units: Sequence[str],
@@ -200,9 +203,11 @@ def _observed(records: Sequence[Record], name: str, key: str, units: Sequence[st
     unit = np.array([units.index(str(each['unit'])) for each in records])
     drive = np.array([drives.index(str(each['drive'])) if each['drive'] else -1
                       for each in records])
+    days = [date.fromisoformat(each['date']).toordinal() for each in records if each['date']]
+    warmth = [float(each['temperature']) for each in records if each['temperature'] is not None]
     columns = {covariate: column - column.mean() for covariate, column in (
-        ('age', _ages(records)), ('temperature', _temperatures(records)))
-        if column is not None and _varies(column, unit)}
+        ('age', np.array(days) / 365.25), ('temperature', np.array(warmth)))
+        if len(column) == len(records) and _varies(column, unit)}
     # slopes need logs enough in addition to the means of units
     if not columns or len(records) < len(set(unit.tolist())) + len(columns) + 2:
         return Observed(value, deviation, unit, drive), []
@@ -210,26 +215,11 @@ def _observed(records: Sequence[Record], name: str, key: str, units: Sequence[st
                     len(columns)), list(columns)
 
 
-def _ages(records: Sequence[Record]) -> Array | None:
-    """Return the dates of logs in years; None where one has none."""
-    if not all(each['date'] for each in records):
-        return None
-    return np.array([date.fromisoformat(each['date']).toordinal() / 365.25 for each in records])
-
-
-def _temperatures(records: Sequence[Record]) -> Array | None:
-    if any(each['temperature'] is None for each in records):
-        return None
-    return np.array([float(each['temperature']) for each in records])
-
-
 def _varies(column: Array, unit: Numbers) -> bool:
     """Tell whether a covariate varies within units."""
     centre = np.bincount(unit, column) / np.maximum(np.bincount(unit), 1)
     return bool(np.std(column - centre[unit]) > 1e-9 * (1.0 + np.abs(column).max()))
 
-
-# who is to blame
 
 def in_words(of: Interval, place: int, unit: str, name: str) -> str:
     """Return a value with its interval, for people."""
@@ -240,13 +230,23 @@ def in_words(of: Interval, place: int, unit: str, name: str) -> str:
 def sentences(found: TypeFound) -> Iterator[str]:
     """Say whose each value is, and what stands out."""
     for each in found.values.values():
-        yield from _blame(found, each)
-    yield from _lacking(found)
+        yield from _shares(found, each)
+    slow = [each for each in found.values.values() if each.slow]
+    if repeating := lacking(found):
+        first, *others = repeating
+        also = (f'; {listed([spoken(each.name) for each in others], "or")} would look alike'
+                if others else '')
+        size = in_words(first.mean, 0, first.unit, first.name)
+        yield (f'{spoken(first.name)}: it repeats in all units, so the model of the type lacks '
+               f'it: {size}{also}')
+    elif slow:
+        yield (f'{listed([spoken(each.name) for each in slow])}: none repeats, so what single '
+               'logs show of them is the wander of the bias')
     yield from (_of_count(each, len(found.units)) for each in counted(found))
 
 
-def _blame(found: TypeFound, each: Found) -> Iterator[str]:
-    """Say what a value owes to units, drives and power-ons, and which stand out."""
+def _shares(found: TypeFound, each: Found) -> Iterator[str]:
+    """Give what a value owes to units, drives and power-ons, and which stand out."""
     if not each.slow:
         shares = {name: each.components[name] for name in (UNITS, DRIVES, POWER_ONS)
                   if name in each.components}
@@ -275,21 +275,6 @@ def lacking(found: TypeFound) -> list[Found]:
     """Return the slow effects that repeat in all units, the clearest first."""
     slow = [each for each in found.values.values() if each.slow and each.chance < found.level]
     return sorted(slow, key=lambda each: each.chance)
-
-
-def _lacking(found: TypeFound) -> Iterator[str]:
-    slow = [each for each in found.values.values() if each.slow]
-    repeating = lacking(found)
-    if repeating:
-        first, *others = repeating
-        also = (f'; {listed([spoken(each.name) for each in others], "or")} would look alike'
-                if others else '')
-        size = in_words(first.mean, 0, first.unit, first.name)
-        yield (f'{spoken(first.name)}: it repeats in all units, so the model of the type lacks '
-               f'it: {size}{also}')
-    elif slow:
-        yield (f'{listed([spoken(each.name) for each in slow])}: none repeats, so what single '
-               'logs show of them is the wander of the bias')
 
 
 @dataclass(frozen=True)
@@ -366,8 +351,6 @@ def _of_count(each: Counted, units: int) -> str:
             f'{each.units} of {units} units: {whose[each.owner]}')
 
 
-# as data
-
 def data(found: TypeFound) -> dict[str, Any]:
     """Return what is known of a type as JSON can hold it."""
     return {'type': found.name, 'units': list(found.units), 'drives': list(found.drives),
@@ -413,3 +396,47 @@ def _interval(of: Interval, place: int) -> dict[str, Any]:
 
 def _alarm(names: Sequence[str], of: Outlier) -> dict[str, Any]:
     return {'name': names[of.number], 'excess': of.excess, 'chance': of.chance}
+
+
+def models(found: TypeFound) -> Iterator[tuple[str, GyroModel]]:
+    """
+    Give for a further unit of a type, with the name '', and for each unit: name and model.
+
+    They hold the values that are usual, and as tolerance how far a power-on may be from them, so
+    that their interval of 95 % is that of the fleet. The compensation counts the tolerance until
+    there is a self-calibration; that takes it as its prior (`GyroModel.prior`).
+
+    """
+    yield '', _model(found, None)
+    for place, name in enumerate(found.units):
+        yield name, _model(found, place)
+
+
+def _model(found: TypeFound, unit: int | None) -> GyroModel:
+    terms, variances = [], []
+    spread = {'bias': 0.0, 'scale_factor_error': 0.0}
+    for name, each in found.values.items():
+        # the time offset of logs is that of their references
+        if each.slow or name not in CATALOGUE or name == 'time_offset':
+            continue
+        effect = CATALOGUE[name]
+        of, place = (each.new_unit, 0) if unit is None else (each.next_log, unit)
+        low, high = float(of.low[place]), float(of.high[place])
+        # of as wide a normal distribution
+        value, deviation = 0.5 * (high + low), 0.5 * (high - low) / NORMAL_95
+        if effect.shapes or len(effect.parameters) > 1 or not math.isfinite(deviation):
+            continue
+        terms.append(Term(effect, (value,)))
+        variances.append(0.0 if name in spread else deviation ** 2)
+        if name in spread:
+            spread[name] = deviation
+    gyro = {'name': found.name, 'serial_number': '' if unit is None else found.units[unit]}
+    logs = (len(found.records) if unit is None
+            else sum(each['unit'] == found.units[unit] for each in found.records))
+    noise = {name: float(np.median([each['noise'].get(name, 0.0) for each in found.records]))
+             for name in Noise.__dataclass_fields__}
+    return GyroModel(
+        tuple(terms), np.diag(variances), noise=Noise(**noise),
+        gyro={name: text for name, text in gyro.items() if text},
+        origin={'fleet': {'units': len(found.units) if unit is None else 1, 'logs': logs}},
+        tolerance=Tolerance(**spread))

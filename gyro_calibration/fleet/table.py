@@ -128,7 +128,7 @@ def _of(path: str, visited: set[str]) -> Iterator[Entry]:
             yield from _of(each, visited)
     elif path.endswith('.txt'):
         lines = (line.strip() for line in _text(path).splitlines())
-        yield from (Entry(_beside(path, line)) for line in lines if line and line[0] != '#')
+        yield from (Entry(_resolved(path, line)) for line in lines if line and line[0] != '#')
     elif path.endswith('.csv') and os.path.exists(path) and (columns := _header(path)):
         yield from _rows(path, columns)
     else:
@@ -174,8 +174,8 @@ def _separator(line: str) -> str:
     return max(',;\t', key=line.count)
 
 
-def _beside(path: str, log: str) -> str:
-    """Return the path of a log that a table names: as it is, or seen from the table."""
+def _resolved(path: str, log: str) -> str:
+    """Return the path of a log that a table names: from the folder of the table, or as it is."""
     seen = Path(path).parent / log
     return str(seen) if seen.exists() or not Path(log).exists() else log
 
@@ -198,7 +198,7 @@ def _rows(path: str, columns: Sequence[str]) -> Iterator[Entry]:
         log = stated.pop('log').strip()
         if not log:
             raise InputError(f'{path}, line {number}: names no log')
-        yield Entry(_beside(path, log)).with_missing(stated)
+        yield Entry(_resolved(path, log)).with_missing(stated)
 
 
 def pattern(text: str) -> re.Pattern[str]:

@@ -60,6 +60,8 @@ Progress = Callable[[Iterable[Any]], Iterable[Any]]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
+#: Standard deviations of a normal distribution that hold 95 %.
+NORMAL_95 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor, twice as fast as memory.
 CACHED = 1 << 14

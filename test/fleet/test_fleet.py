@@ -27,12 +27,10 @@ from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.files import InputError
-from gyro_calibration.fleet.outliers import changes, outliers
-from gyro_calibration.fleet.pooling import Observed, Pooled
-from gyro_calibration.fleet.prior import models
+from gyro_calibration.fleet.pooling import changes, Observed, outliers, Pooled
 from gyro_calibration.fleet.report import report, tables
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes
-from gyro_calibration.fleet.summary import counted, data, sentences, summarized
+from gyro_calibration.fleet.summary import counted, data, models, sentences, summarized
 from gyro_calibration.fleet.table import described, entries, Entry, pattern
 from gyro_calibration.fleet.work import done, Task
 from gyro_calibration.logs.log import Log, write_log
