@@ -39,7 +39,7 @@ from gyro_calibration.calibration.self_calibration import record, self_calibrate
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.heading.log_heading import track
+from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.compensation import covariance, rate_sensitivity

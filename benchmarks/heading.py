@@ -46,7 +46,7 @@ import bounds
 from drives import Course, COURSES, Drive, GYROS, simulate, slow_path
 from gyro_calibration.calibration.self_calibration import fit_heading, record, self_calibrate
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
-from gyro_calibration.heading.log_heading import in_hindsight
+from gyro_calibration.heading.log_compensation import in_hindsight
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.compensation import covariance, rate_sensitivity

@@ -33,7 +33,7 @@ import argparse
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.heading.log_heading import track
+from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.model.compensation import covariance, rate_sensitivity
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration

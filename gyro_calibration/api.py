@@ -52,7 +52,7 @@ from gyro_calibration.model.effects import STEADY
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import model_of, write_model
 from gyro_calibration.model.motion import from_rates, Motion, motion_by_name, motion_of
-from gyro_calibration.model.simulation import simulate as simulate_motion
+from gyro_calibration.model.motion import simulate as simulate_motion
 import numpy as np
 
 __all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_log', 'read_model',

@@ -39,8 +39,7 @@ from gyro_calibration.cli.plan import read_limits, write_motion
 from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.listening import recognize
-from gyro_calibration.driver.protocols.protocol import Splitter
-from gyro_calibration.driver.protocols.splitters import LineSplitter
+from gyro_calibration.driver.protocols.protocol import LineSplitter, Splitter
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.files import LARGEST
 from gyro_calibration.heading.bias_table import (

@@ -16,8 +16,8 @@ tau is half the mean square of the difference between neighbouring means over ta
 at every sample (overlapping). Its uncertainty is computed: second differences of the angle are
 Gaussian, and the variances and covariances of their mean squares follow from theirs.
 
-Reading order: `record` (samples at rest on an even grid), `deviation` (the chart, and the
-covariance of Allan variances), `noise_fit` (parts of the noise).
+Reading order: `deviation` (samples at rest on an even grid, the chart, and the covariance of Allan
+variances), `noise_fit` (parts of the noise).
 
 """
 
@@ -26,9 +26,15 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from gyro_calibration.allan.deviation import allan_deviation, AllanChart, averaging_sizes, Floor
+from gyro_calibration.allan.deviation import (
+    allan_deviation,
+    AllanChart,
+    averaging_sizes,
+    even_record,
+    Floor,
+    Record,
+)
 from gyro_calibration.allan.noise_fit import Figure, fit_noise, NoiseFit
-from gyro_calibration.allan.record import even_record, Record
 from gyro_calibration.model.noise import Part, PARTS
 
 __all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record',

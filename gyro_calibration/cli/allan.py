@@ -27,8 +27,7 @@ from gyro_calibration.allan import (
 )
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
-from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer, under_way, UsageError
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model

@@ -27,12 +27,12 @@ from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
 from gyro_calibration.heading.integration import BlockIntegrator, Threshold
 from gyro_calibration.heading.log_compensation import (
+    in_hindsight,
     LogCompensation,
     none_plausible,
     plausible,
     rows_of,
 )
-from gyro_calibration.heading.log_heading import in_hindsight
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
 from gyro_calibration.model.compensation import covariance, quadratic_form

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer, under_way, UsageError
 from gyro_calibration.diagnosis.data_quality import KINDS
 from gyro_calibration.diagnosis.extended_model import calibrated
 from gyro_calibration.diagnosis.findings import Diagnosis

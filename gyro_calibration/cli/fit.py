@@ -30,8 +30,7 @@ from gyro_calibration.calibration.rate_table import Bin, binned, Calibration, fi
 from gyro_calibration.calibration.scatter import FEWEST_SWEEPS
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGIES
 from gyro_calibration.cli import plots, verb
-from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import Answer, UsageError, wrapped
+from gyro_calibration.cli.verb import Answer, under_way, UsageError, wrapped
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_95
 from gyro_calibration.model.effects import (
     Effect,

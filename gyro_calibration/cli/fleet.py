@@ -24,8 +24,7 @@ from typing import Any
 
 from gyro_calibration.calibration.course_over_ground import PRIORS
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.progress import bar
-from gyro_calibration.cli.verb import Answer, UsageError, wrapped
+from gyro_calibration.cli.verb import Answer, bar, UsageError, wrapped
 from gyro_calibration.diagnosis.gates import is_confused
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.files import plain, write_atomically

@@ -27,8 +27,7 @@ from gyro_calibration.calibration.motion_design import (
 )
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_motion
-from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer, under_way, UsageError
 from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model

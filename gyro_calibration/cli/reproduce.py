@@ -19,8 +19,7 @@ import textwrap
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.progress import bar
-from gyro_calibration.cli.verb import Answer
+from gyro_calibration.cli.verb import Answer, bar
 from gyro_calibration.logs.log import Progress
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, Reproduction

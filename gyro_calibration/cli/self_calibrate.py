@@ -34,8 +34,7 @@ from gyro_calibration.calibration.self_calibration import (
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
-from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer, under_way, UsageError
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.log_compensation import compensate_log, none_plausible, plausible
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask

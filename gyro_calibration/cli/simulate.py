@@ -22,8 +22,7 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import motion_by_name, NAMED
-from gyro_calibration.model.simulation import simulate
+from gyro_calibration.model.motion import motion_by_name, NAMED, simulate
 import numpy as np
 
 #: Samples of a simulation, which takes 100 bytes for each.

@@ -32,8 +32,7 @@ from gyro_calibration.calibration.turn_error import (
 )
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
-from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import Answer, UsageError
+from gyro_calibration.cli.verb import Answer, under_way, UsageError
 from gyro_calibration.files import digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask

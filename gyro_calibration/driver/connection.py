@@ -17,13 +17,14 @@ No ROS, and no thread: `Connection.chunks` gives the samples, in a thread of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import glob
 import math
 from operator import sub
 import os
 import threading
+from typing import NamedTuple
 
 from gyro_calibration.driver.protocols import Decoder, find, Protocol, Sample, Settings
 from gyro_calibration.driver.protocols.listening import BAUDS, Recognition, recognize
@@ -433,3 +434,63 @@ class Connection:
     def _close(self) -> None:
         if self._port is not None:
             self._port.close()
+
+
+class Mean(NamedTuple):
+    """The mean stamp, s, and the mean sample, of a number of samples."""
+
+    stamp: float
+    sample: Sample
+    size: int
+
+
+class Decimation:
+    """
+    Joins samples in groups; where samples are lost, a group has fewer and is not longer.
+
+    Parameters
+    ----------
+    size : samples of a group; 1 leaves them as they are
+
+    """
+
+    def __init__(self, size: int):
+        self._size = size
+        self._group: list[tuple[float, Sample]] = []
+
+    def add(self, samples: Sequence[Sample], stamps: Sequence[float],
+            period: float) -> Iterator[Mean]:
+        """Take samples with their stamps and the period of the gyro, s; give complete groups."""
+        longest = (self._size - 0.5) * period
+        for sample, stamp in zip(samples, stamps, strict=True):
+            if self._group and not 0.0 < stamp - self._group[0][0] < longest:
+                yield from self.flush()
+            self._group.append((stamp, sample))
+            if len(self._group) >= self._size:
+                yield from self.flush()
+
+    def flush(self) -> Iterator[Mean]:
+        """Give a group that has begun: it must not wait where the next sample is not in sight."""
+        if not self._group:
+            return
+        group, self._group = self._group, []
+        if len(group) == 1:
+            yield Mean(*group[0], 1)
+            return
+        begin = group[0][0]  # seconds since 1970 added up would lose digits
+        samples = [sample for _, sample in group]
+        yield Mean(
+            begin + _mean([stamp - begin for stamp, _ in group]),
+            Sample(_mean([sample.output for sample in samples]),
+                   _known_mean([sample.temperature for sample in samples]),
+                   specific_force=_known_mean([sample.specific_force for sample in samples])),
+            len(group))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _known_mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return _mean(known) if known else None

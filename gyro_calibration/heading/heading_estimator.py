@@ -132,7 +132,7 @@ class HeadingEstimator:
         settings : of the tracker
         temperature_timeout : an older temperature is held, and counts as less and less known, s
         now : s since 1970
-        keep : the steps of the tracker, for `log_heading.in_hindsight`
+        keep : the steps of the tracker, for `log_compensation.in_hindsight`
 
         """
         self._assumptions, self._settings, self._timeout, self._keep = (

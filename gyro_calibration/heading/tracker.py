@@ -27,16 +27,19 @@ import math
 from gyro_calibration.heading.gaps import CLOSE, FASTEST, Gaps, LONGEST
 from gyro_calibration.heading.integration import Threshold, ThresholdFilter
 from gyro_calibration.heading.kalman import begin, Drift, HEADING, RateIntegral, WALK
-from gyro_calibration.heading.sample_blocks import Epoch, EvenSamples, Samples, SETTLING
 from gyro_calibration.heading.stationary import (
     BEGINS,
     BLOCK,
     Block,
     Energy,
+    Epoch,
+    EvenSamples,
     LAGS,
     most_scatter,
+    Samples,
     SCATTERED,
     SCATTERS,
+    SETTLING,
     sigmas,
     SlowTurn,
     Snapshot,

@@ -12,6 +12,6 @@
 What a gyro is: effects with values, noise; simulation and compensation with them.
 
 Reading order: `effects`, `channels`, `noise`, `gyro_model`, `presets`, `settings_file`,
-`model_file`, `motion`, `simulation`, `simulator_export`, `compensation`.
+`model_file`, `motion`, `simulator_export`, `compensation`.
 
 """

@@ -29,7 +29,7 @@ from typing import Any
 
 from gyro_calibration.logs.log import Log, Number
 from gyro_calibration.model.effects import Channels
-from gyro_calibration.model.effects.lag import lag_ahead
+from gyro_calibration.model.effects.effect import lag_ahead
 import numpy as np
 
 #: What the next sample needs to know, by (channel, time constant) of a lag and ('heating', filter

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A known motion about one axis: the profile of a calibration, or the drive of a robot."""
+"""A known motion about one axis, of a calibration or a drive, and what a gyro reports of it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,11 @@ import math
 from pathlib import Path
 
 from gyro_calibration.files import InputError, LARGEST, read_bytes, reason
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, SHORTEST, shown
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Number, SHORTEST, shown
+from gyro_calibration.model.channels import History
+from gyro_calibration.model.effects import Channels
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.noise import simulate_noise
 import numpy as np
 
 #: Bytes of a motion profile: an hour at 100 Hz has half of it.
@@ -204,3 +208,49 @@ def _numbers(path: str | Path, rows: Iterable[list[str]],
                 raise MotionError(f'{path}: column {name} holds something that is not a finite '
                                   'number; correct or remove the row')
             yield value
+
+
+def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
+             generator: np.random.Generator | None = None,
+             temperature: Number | None = None) -> Log:
+    """
+    Return the log of a simulated gyro.
+
+    Parameters
+    ----------
+    model : effects and noise of the gyro
+    motion : its true motion, kept in the log as the reference
+    sample_rate : Hz
+    generator : source of the noise; without one there is none
+    temperature : degC, of all samples or of each, shape (n,); default: the reference temperature
+
+    """
+    time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate
+    rate, heading = motion.rate_at(time), motion.heading_at(time)
+    degc = np.broadcast_to(model.reference_temperature if temperature is None else temperature,
+                           len(time)).astype(float)
+    channels = History().follow(time, degc, heading=heading)
+    output = respond(model, time, channels.moving(rate, rate), generator)
+    return Log(output=output, time=time, temperature=degc, reference_rate=rate,
+               reference_heading=heading)
+
+
+def respond(model: GyroModel, time: Array, channels: Channels,
+            generator: np.random.Generator | None = None) -> Array:
+    """
+    Return the output, rad/s, shape (n,), of a gyro in a motion and its surroundings.
+
+    Parameters
+    ----------
+    model : effects and noise of the gyro
+    time : stamps, s, increasing, shape (n,); the noise is that of samples at their median interval
+    channels : true rate and surroundings at these times, of a log by `history.channels_of`
+    generator : source of the noise; without one there is none
+
+    """
+    rate = model.distorted('rate', channels.rate, time)
+    output = model.output_in(channels.moving(rate, rate))
+    if generator is not None:
+        output = output + simulate_noise(model.noise, len(time), float(np.median(np.diff(time))),
+                                         generator)
+    return model.distorted('output', output, time)

@@ -24,8 +24,7 @@ import threading
 import time
 from types import SimpleNamespace
 
-from gyro_calibration.driver.connection import AUTO, Connection, State
-from gyro_calibration.driver.decimation import Decimation, Mean
+from gyro_calibration.driver.connection import AUTO, Connection, Decimation, Mean, State
 from gyro_calibration.driver.protocols import PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
 from gyro_calibration.driver.timestamps import NodeTime, read_together, steady

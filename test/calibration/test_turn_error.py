@@ -30,9 +30,8 @@ from gyro_calibration.model.effects import (
     SINE_RESPONSE,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import from_rates
+from gyro_calibration.model.motion import from_rates, simulate
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import simulate
 import numpy as np
 import pytest
 

@@ -28,7 +28,7 @@ from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.model_file import model_text, read_model
-from gyro_calibration.model.simulation import respond
+from gyro_calibration.model.motion import respond
 from gyro_calibration_bench.hidden import (
     described,
     draw_gyro,

@@ -25,9 +25,8 @@ from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import turns
+from gyro_calibration.model.motion import simulate, turns
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import simulate
 from gyro_calibration_bench.hidden import hide
 import numpy as np
 import pytest

@@ -18,9 +18,8 @@ from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import turns
+from gyro_calibration.model.motion import simulate, turns
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import simulate
 import numpy as np
 import pytest
 

@@ -10,7 +10,7 @@
 
 """The mean of several samples in place of each."""
 
-from gyro_calibration.driver.decimation import Decimation
+from gyro_calibration.driver.connection import Decimation
 from gyro_calibration.driver.protocols import Sample
 import pytest
 

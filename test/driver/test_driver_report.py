@@ -19,8 +19,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
-from gyro_calibration.driver.connection import Connection
-from gyro_calibration.driver.decimation import Mean
+from gyro_calibration.driver.connection import Connection, Mean
 from gyro_calibration.driver.protocols import find, Sample, Settings
 from gyro_calibration.ros.diagnostics import ERROR, OK, WARN
 from gyro_calibration.ros.driver_node import Messages, PARAMETERS, settings

@@ -14,7 +14,7 @@ import math
 import struct
 
 from gyro_calibration.driver.protocols import find, Sample, Settings
-from gyro_calibration.driver.protocols.splitters import FrameSplitter
+from gyro_calibration.driver.protocols.protocol import FrameSplitter
 import pytest
 
 #: Interface control document 56-0298, section 5.2.1.

@@ -21,7 +21,7 @@ import math
 from faulty_heading import one
 from gyro_calibration.heading.gaps import Gaps, Intervals
 from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
-from gyro_calibration.heading.log_heading import track
+from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration

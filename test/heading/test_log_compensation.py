@@ -20,7 +20,7 @@ from gyro_calibration.model.compensation import covariance, quadratic_form
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.simulation import respond
+from gyro_calibration.model.motion import respond
 import numpy as np
 from operations import operations
 import pytest

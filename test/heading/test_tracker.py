@@ -15,7 +15,7 @@ import math
 from chance import RARE, rms_bounds
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import begin, HEADING, RateIntegral, smoothed
-from gyro_calibration.heading.log_heading import track
+from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets

@@ -25,9 +25,8 @@ from gyro_calibration.model.effects import (
     rate_temperature_polynomial,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.motion import CALIBRATION, respond
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import respond
 import numpy as np
 import pytest
 

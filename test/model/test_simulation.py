@@ -14,9 +14,8 @@ from gyro_calibration.logs.log import read_log
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import CALIBRATION, ROBOT
+from gyro_calibration.model.motion import CALIBRATION, respond, ROBOT, simulate
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import respond, simulate
 import numpy as np
 import pytest
 

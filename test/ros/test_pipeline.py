@@ -21,8 +21,8 @@ from gyro_calibration.logs.cdr import UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.motion import respond
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import respond
 from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.wheels import Velocity
 from hypothesis import given, HealthCheck, settings

@@ -29,13 +29,14 @@ from gyro_calibration.driver.protocols.protocol import (
     check_rates,
     GYRO_COLUMNS,
     KNOWN_COLUMNS,
+    LineSplitter,
+    NUMBER,
     Protocol,
     Reading,
     Settings,
     stateless,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import LineSplitter, NUMBER
 
 _NUMBER = re.compile(NUMBER)
 _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)

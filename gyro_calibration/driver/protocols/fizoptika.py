@@ -29,12 +29,12 @@ from functools import partial
 
 from gyro_calibration.driver.protocols.protocol import (
     check_counts,
+    FrameSplitter,
     Protocol,
     Reading,
     Settings,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _HEADER = 0xDD
 # number of the high byte: name, unit of one count, offset, default of an emulated unit

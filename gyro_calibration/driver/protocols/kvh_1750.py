@@ -36,6 +36,7 @@ import struct
 import zlib
 
 from gyro_calibration.driver.protocols.protocol import (
+    FrameSplitter,
     Protocol,
     Reading,
     Settings,
@@ -43,7 +44,6 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')

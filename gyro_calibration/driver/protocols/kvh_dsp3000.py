@@ -29,13 +29,13 @@ import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
+    LineSplitter,
     Protocol,
     Reading,
     Settings,
     stateless,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import LineSplitter
 
 _LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
 

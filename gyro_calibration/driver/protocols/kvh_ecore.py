@@ -25,13 +25,13 @@ from functools import partial
 import math
 
 from gyro_calibration.driver.protocols.protocol import (
+    FrameSplitter,
     Protocol,
     Reading,
     Settings,
     stateless,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _COUNT = math.radians(0.00183)
 

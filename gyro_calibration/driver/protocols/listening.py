@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import re
 
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
-from gyro_calibration.driver.protocols.splitters import LineSplitter, NUMBER
+from gyro_calibration.driver.protocols.protocol import LineSplitter, NUMBER
 
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 """Bits per second to try in this order: first those of new gyros, then others that some can do."""

@@ -24,13 +24,13 @@ import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
+    LineSplitter,
     Protocol,
     Reading,
     Settings,
     stateless,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import LineSplitter
 
 _COUNT = math.radians(0.07)
 _LINE = re.compile(rb'!ANG:[-+.0-9]+,[-+.0-9]+,[-+.0-9]+,AN:(-?[0-9]{1,5}(?:,-?[0-9]{1,5}){8}) *')

@@ -30,6 +30,8 @@ import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
+    LineSplitter,
+    NUMBER,
     Protocol,
     Reading,
     Settings,
@@ -37,7 +39,6 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import LineSplitter, NUMBER
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
 # what the firmware sends when it is not asked for more

@@ -29,6 +29,7 @@ import math
 import struct
 
 from gyro_calibration.driver.protocols.protocol import (
+    FrameSplitter,
     Protocol,
     Reading,
     Settings,
@@ -36,7 +37,6 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
-from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _COUNT = math.radians(2000.0) / 0x8000
 _FORCE = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count

@@ -15,8 +15,7 @@ Simulation, calibration, diagnosis and compensation meet here. Most effects add
 as a delay, or rounding.
 
 Reading order, each imports only from those before it: `effect` (the records: channels, parameters,
-effects), `lag` (of first order), `polynomial` (of Ojeda, Chung and Borenstein), `catalogue` (all
-others).
+effects; the lag), `polynomial` (of Ojeda, Chung and Borenstein), `catalogue` (all others).
 
 """
 

@@ -22,8 +22,7 @@ from collections.abc import Iterable
 import math
 
 from gyro_calibration.logs.log import Array, Number
-from gyro_calibration.model.effects.effect import Channels, Effect, Parameter
-from gyro_calibration.model.effects.lag import lagged_signal
+from gyro_calibration.model.effects.effect import Channels, Effect, lagged_signal, Parameter
 import numpy as np
 from scipy.interpolate import CubicSpline
 

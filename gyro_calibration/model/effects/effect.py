@@ -9,7 +9,7 @@
 # under the License.
 
 """
-An effect, its parameters, and what it may look at: the records.
+An effect, its parameters, and what it may look at: the records; and a lag of first order.
 
 An effect is a record and a model is a tuple of them, without subclasses or a registry: effects are
 combined in any way since each only adds columns. Effects on the signal (a delay, a lag, rounding)
@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import math
 
 from gyro_calibration.logs.log import Array, Number
 import numpy as np
@@ -165,3 +166,59 @@ class Effect:
             return lambda channels: value * columns(channels, *shapes)[0]
         return lambda channels: sum(
             value * column for value, column in zip(coefficients, columns(channels, *shapes)))
+
+
+def lag_ahead(interval: Number, change: Number, time_constant: float,
+              ahead: float = 0.0) -> Number:
+    """
+    Return what a lagged signal is ahead of the signal, of one instant or of many (shape (n,)).
+
+    A lag obeys ``time_constant * d(lagged)/dt = signal - lagged``, here exactly for a signal that
+    is linear between its samples. What it is ahead decays by exp(-x) over an interval of x time
+    constants, and a change of the signal by d takes ``d (1 - exp(-x)) / x`` away from it.
+
+    Parameters
+    ----------
+    interval : since the sample before, s, not negative
+    change : of the signal since the sample before
+    time_constant : s, above 0
+    ahead : what the lagged signal was ahead at the sample before the first one
+
+    """
+    if not isinstance(interval, np.ndarray):
+        x = interval / time_constant
+        return math.exp(-x) * ahead + change * (math.expm1(-x) / x if x else -1.0)
+    # intervals of no length leave the formulas a number
+    x = np.maximum(interval / time_constant, 1e-300)
+    fallen = np.expm1(-x)
+    return _recurrence(fallen + 1.0, change * (fallen / x), ahead)
+
+
+def lagged_signal(signal: Array, time: Array, time_constant: float) -> Array:
+    """Return a signal, shape (n,), through a lag that starts in its first value."""
+    interval, change = np.diff(time, prepend=time[:1]), np.diff(signal, prepend=signal[:1])
+    return signal + lag_ahead(interval, change, time_constant)
+
+
+def _recurrence(factors: Array, added: Array, before: float) -> Array:
+    """
+    Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,).
+
+    Rows of sqrt(n) samples go on side by side, each from zero; then each gets what the row before
+    it has come to.
+
+    """
+    count = len(factors)
+    width = math.isqrt(max(count - 1, 0)) + 1
+    padding = (0, -count % width)
+    product = np.ascontiguousarray(np.pad(factors, padding).reshape(-1, width).T)
+    total = np.ascontiguousarray(np.pad(added, padding).reshape(-1, width).T)
+    for k in range(1, width):
+        total[k] += product[k] * total[k - 1]
+        product[k] *= product[k - 1]
+    starts = [before]
+    for factor, sum_of_row in zip(product[-1].tolist(), total[-1].tolist()):
+        starts.append(factor * starts[-1] + sum_of_row)
+    product *= np.array(starts[:-1])
+    total += product
+    return total.T.ravel()[:count]
