@@ -224,11 +224,12 @@ def _pair(log: Log) -> tuple[Array, Array, Motion]:
         known, heading = np.isfinite(rate), np.full(len(log), np.nan)
         heading[known] = integrate(log.time[known], rate[known])
     answered, seen = np.isfinite(log.output), np.isfinite(heading)
-    for known, name in ((answered, 'gyro'), (seen, 'reference')):
-        if known.sum() < max(100, 0.1 * len(log)):
+    # a reference may come far less often than the gyro
+    for known, name, fewest in ((answered, 'gyro', max(100, len(log) // 10)),
+                                (seen, 'reference', 100)):
+        if known.sum() < fewest:
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
-                              'at least a tenth and 100 are needed: '
-                              'repair its line and record again')
+                              f'at least {fewest} are needed: repair its line and record again')
     start = log.time[seen][0]
     return (log.time[answered] - start, log.output[answered],
             from_headings(log.time[seen], heading[seen]))

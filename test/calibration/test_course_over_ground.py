@@ -10,6 +10,7 @@
 
 """Calibration against a course over ground: late, smoothed, lost, and at times far off."""
 
+from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
@@ -35,10 +36,12 @@ def drive(seed, late=0.5, turning=30.0, follows=1.0, burst=0.0):
     return Log(time=time, output=output, reference_heading=course)
 
 
-# between the offsets that are tried first, which are 0.05 s apart
-@pytest.mark.parametrize('late', [-0.725, 0.0, 0.775])
-def test_scale_bias_and_delay_are_found(late):
-    found = calibrate_encoder(drive(1, late))
+# between the offsets that are tried first, which are 0.05 s apart; fixes come at 50 and 4 Hz
+@pytest.mark.parametrize('late, every', [(-0.725, 1), (0.0, 1), (0.775, 12)])
+def test_scale_bias_and_delay_are_found(late, every):
+    log = drive(1, late)
+    fixes = np.where(np.arange(len(log)) % every, math.nan, log.reference_heading)
+    found = calibrate_encoder(replace(log, reference_heading=fixes))
     deviations = np.sqrt(np.diag(found.fit.covariance))
     assert found.method == 'course'
     assert found.fit.time_offset == pytest.approx(-late, abs=0.02)
