@@ -119,13 +119,15 @@ class Calibration:
         """Return the two-sided probability of as much of an effect where there is none."""
         used = take(self.dwells, self.scatter.kept)
         term = next(each for each in self.terms if each.effect is effect)
-        if not self.freedom or not np.any(term.error(channels_of(used))):
-            return 1.0
-        others = [each for each in self.terms if each is not term]
         # The whole effect, not its derivative by a shape: near zero, that of a sine vanishes too.
-        columns = ([*columns_of(used, others).T, term.error(channels_of(used))] if others
-                   else [term.error(channels_of(used))])
-        below = float(self._uncertainty(np.column_stack(columns),
+        error = np.broadcast_to(term.error(channels_of(used)), len(used))
+        others = np.column_stack([np.empty((len(used), 0)), *(
+            columns_of(used, [each]) for each in self.terms if each is not term)])
+        left = error - others @ np.linalg.lstsq(others, error, rcond=None)[0]
+        # a sine may have its zeros at the rates of all dwells
+        if not self.freedom or np.linalg.norm(left) <= 1e-9 * np.linalg.norm(error):
+            return 1.0
+        below = float(self._uncertainty(np.column_stack([others, error]),
                                         self.residual[self.scatter.kept]).below(-1.0)[-1])
         return 2.0 * min(below, 1.0 - below)
 

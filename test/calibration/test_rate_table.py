@@ -73,6 +73,14 @@ def measured(terms=LINEAR, seed=1, **table):
 
 # estimates
 
+def test_a_sine_that_is_zero_at_the_rates_of_all_dwells_is_chance():
+    rate = np.tile(6.0 * DEGREE * np.arange(-10, 11), 2)
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
+    fit = fit_effects(dwells(rate, noise), [BIAS, SCALE_FACTOR_ERROR])
+    sine = Term(SINE_RESPONSE, (30.0, 1.0))
+    assert replace(fit, terms=(*fit.terms, sine)).chance_of(SINE_RESPONSE) == 1.0
+
+
 @pytest.mark.parametrize('terms, table', [
     (CUBIC, Table()), (SINE, Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)),
     (SINE, Table(told=True)),
