@@ -216,13 +216,6 @@ def test_a_model_that_compensates_leaves_less_inside_its_range_and_as_much_outsi
     assert known.difference(-10.0, 5.0, 0.0)[1] > 10.0 * inside
 
 
-def test_a_gyro_without_noise_figures_has_a_table_too():
-    table = BiasTable(GyroModel())
-    for number in range(5):
-        table.add(20.0, 1e-3, 1e-10, float(number))
-    assert table.predict(20.0, 5.0) == (pytest.approx(1e-3), pytest.approx(0.0, abs=1e-9))
-
-
 def test_what_is_known_as_well_as_can_be_still_can_be_read(tmp_path):
     table = BiasTable(GyroModel())
     for number in range(100):

@@ -52,13 +52,6 @@ def drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
     return replace(log, output=respond(model, TIME, channels_of(log).moving(rate, rate)))
 
 
-def test_a_log_with_everything_around_comes_back_to_its_rates():
-    model = model_of(VALUES | HEADING)
-    log = drive(model)
-    assert np.abs(log.output - log.reference_rate).max() > 0.01
-    assert compensate_log(model, log) == pytest.approx(log.reference_rate, abs=1e-10)
-
-
 @pytest.mark.parametrize('size', [1, 700, 5000])
 def test_blocks_are_compensated_as_the_whole(size):
     model = model_of(VALUES | HEADING, covariance=np.eye(16) * 1e-10)
@@ -85,14 +78,6 @@ def test_a_heading_that_nobody_measured_is_found_meanwhile(size):
     assert np.concatenate(rates) == pytest.approx(log.reference_rate, abs=1e-8)
     plain = compensate_log(model_of({'scale_factor_error': (0.01,)}), log)
     assert np.abs(plain - log.reference_rate).max() > 1e-3, 'the heading did not matter'
-
-
-def test_a_reference_heading_that_is_lost_for_a_while_is_bridged():
-    model = model_of(HEADING)
-    log = drive(model)
-    torn = replace(log, reference_heading=np.where((TIME > 100.0) & (TIME < 100.5), np.nan,
-                                                   log.reference_heading))
-    assert compensate_log(model, torn) == pytest.approx(log.reference_rate, abs=1e-5)
 
 
 @pytest.mark.parametrize('size', [500, 700, 5000, 18000])

@@ -141,24 +141,6 @@ def test_the_variance_after_a_calibration_is_that_of_the_noise():
 
 # rest and motion
 
-def test_without_known_noise_it_is_the_trapezoid_rule():
-    time = np.arange(0.0, 20.0, 0.01)
-    rate = 0.5 * np.sin(time)
-    found = follow(time, rate, noise=Noise())
-    assert found.heading == pytest.approx(integrate(time, rate), abs=1e-12)
-    assert not found.resting.any() and (found.rate == rate).all()
-
-
-def test_at_rest_the_rate_is_zero_and_the_heading_stands():
-    motion = turns([(30, 0), (4, 45), (30, 0)])
-    time, true, _, rate = gyro(motion, np.random.default_rng(2))
-    found = follow(time, rate)
-    late = (time > 40.0) & (time < 63.0)
-    assert found.resting[late].all() and (found.rate[late] == 0.0).all()
-    assert np.ptp(found.heading[late]) == 0.0
-    moving = (time > 30.2) & (time < 34.0)
-    assert not found.resting[moving].any()
-
 
 def test_what_was_no_rest_is_not_deleted():
     tracker = HeadingTracker(XV3500, KNOWN, Settings())
@@ -235,16 +217,6 @@ def test_a_bias_that_jumps_by_more_than_the_model_says_does_not_make_the_heading
     late = (found.heading - heading)[time > 610.0]
     assert np.abs(late).max() < 1.0 * DEGREE < 0.1 * 0.04 * 500.0 * DEGREE
     assert (late ** 2 < 16.0 * found.variance[time > 610.0]).all()
-
-
-def test_wheels_that_move_are_motion_and_wheels_that_stand_are_no_turn():
-    time = np.arange(0.0, 200.0, INTERVAL)
-    drift = (simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(5))
-             + 0.06 * DEGREE * (time > 60.0))
-    assert not follow(time, drift, wheels=[True] * len(time)).resting.any()
-    standing = follow(time, drift, wheels=[False] * len(time))
-    assert (standing.resting[20:].all()
-            and standing.heading[-1] == pytest.approx(standing.heading[40], abs=1e-12))
 
 
 @pytest.mark.parametrize('after', [None, False], ids=['silent', 'standing'])

@@ -41,15 +41,6 @@ def test_a_report_has_the_full_name_the_level_and_all_values_as_text(ros, heard,
     assert heard[-1].header.stamp.sec > 0
 
 
-def test_each_report_is_made_anew(ros, heard, wait_until):
-    reports = iter([(OK, 'first', {})] + 1000 * [(ERROR, 'second', {})])
-    made = Diagnostics(ros.node, 'thing', lambda: next(reports))
-    made.now()
-    assert made.level == OK
-    wait_until(lambda: made.now() or heard, what='a report')
-    assert made.level == ERROR and heard[-1].status[0].message == 'second'
-
-
 @pytest.mark.parametrize('node_class, name, parameters, words', [
     (DriverNode, 'driver_node: gyro', {'port': '/nonexistent/gyro'}, 'does not exist'),
     (CompensationNode, 'compensation_node: heading', {'use_sim_time': 'true'},

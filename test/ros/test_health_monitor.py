@@ -110,17 +110,6 @@ def test_twice_the_noise_is_missed_in_hardly_a_stretch_and_a_tenth_more_is_no_mi
     assert all(rest is None or rest.noise_fits for rest in more)
 
 
-@pytest.mark.parametrize('moved', [0.05 * DEGREE, 1.0 * DEGREE])
-def test_a_bias_that_moved_is_found(moved):
-    outputs = moved + stretches(MEMS, 0.1, np.random.default_rng(16))
-    check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:5])
-    assert f'{check.last.bias / DEGREE:.4f} deg/s' in check.bias_alarm and not check.noise_alarm
-    assert check.last.bias == pytest.approx(moved, abs=0.02 * DEGREE)
-    check.recalibrated()
-    assert not check.bias_alarm
-    assert not fed(check, outputs[5:8] - moved, begin=100.0).bias_alarm
-
-
 def test_a_bias_of_unknown_uncertainty_is_not_examined():
     outputs = 0.01 + stretches(MEMS, 0.1, np.random.default_rng(17))
     check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:5], bias_variance=math.nan)

@@ -37,19 +37,6 @@ STATUSES = {'/driver_node: gyro', '/compensation_node: heading'}
 FUNCTIONS = {'degrees', 'sqrt'}  # of the message paths of Foxglove
 
 
-def policy():
-    """Return the topics that driver and compensation publish, by their policy in config/sros2."""
-    enclaves = ElementTree.parse(CONFIG / 'sros2' / 'policy.xml').getroot().iter('enclave')
-    published = set()
-    for enclave in enclaves:
-        for profile in enclave.iter('profile'):
-            for topics in profile.iter('topics'):
-                if topics.get('publish') == 'ALLOW':
-                    names = [topic.text.replace('~', profile.get('node')) for topic in topics]
-                    published |= {f'/{name.lstrip("/")}' for name in names}
-    return published
-
-
 def field(message, names):
     """Return the field of a message at a path; an array stands for its element."""
     for name in names:
@@ -75,10 +62,6 @@ def check_path(path):
             message = DiagnosticStatus()
         elif index:
             message = float(message[int(index)])
-
-
-def test_the_topics_are_those_that_the_nodes_publish():
-    assert set(TOPICS) <= policy()
 
 
 def paths():

@@ -482,19 +482,6 @@ def test_the_temperature_is_used_extrapolated_held_or_replaced(tmp_path, tempera
     assert rig.journal.counts['temperature_clipped'] == counted
 
 
-def test_outside_of_the_calibrated_temperatures_the_published_variance_grows(tmp_path):
-    model = yaml.safe_dump({
-        **yaml.safe_load(TEMPERATURE_MODEL), 'covariance': [[1e-8, 0.0], [0.0, 1e-12]],
-        'noise': {'angle_random_walk': 1e-5},
-        'tolerance': {'bias_per_kelvin': 1e-3, 'scale_factor_error_per_kelvin': 1e-3}})
-    inside, outside, far = (
-        Rig(tmp_path, model=model, stationary_method='none').feed(
-            np.full(50, 0.5), temperature=degc)[-1] for degc in (30.0, 50.0, 95.0))
-    added = outside.rate_variance - inside.rate_variance
-    assert added == pytest.approx((10.0 * 1e-3) ** 2 + (10.0 * 1e-3 * outside.rate) ** 2, rel=0.1)
-    assert far.rate_variance > 20.0 * outside.rate_variance and np.isfinite(far.heading_variance)
-
-
 def test_a_rate_beyond_the_calibrated_range_is_counted(tmp_path):
     rig = Rig(tmp_path, model=TEMPERATURE_MODEL)
     rig.feed(np.full(10, 1.5), temperature=30.0)
