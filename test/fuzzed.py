@@ -65,6 +65,7 @@ from gyro_calibration.model.model_file import model_text, ModelError, read_model
 from gyro_calibration.model.motion import CALIBRATION, MotionError, read_motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from recordings import channel, chunk, database, MCAP, record, text
 
 #: Longest message of an error, in characters without the path; s that an input may take; bytes
 #: that a decoder may hold back.
@@ -455,46 +456,23 @@ def _messages() -> list[tuple[str, str, int, bytes]]:
 
 def _mcap_seeds() -> list[bytes]:
     """Return a recording in MCAP: a magic, records of one byte, length and content, the magic."""
-    def record(code: int, body: bytes) -> bytes:
-        return struct.pack('<BQ', code, len(body)) + body
-
-    def text(words: str) -> bytes:
-        return struct.pack('<I', len(words)) + words.encode()
-    channels = {
-        topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
-    declared = b''.join(
-        record(3, struct.pack('<H', number) + text(kind) + text('ros2msg') + text(''))
-        + record(4, struct.pack('<HH', number, number) + text(topic) + text('cdr')
-                 + struct.pack('<I', 0))
-        for topic, (number, kind) in channels.items())
-    messages = b''.join(record(5, struct.pack('<HIQQ', channels[topic][0], 0, time, time) + data)
+    numbers = {topic: number for number, (topic, *_) in enumerate(_messages()[:3], 1)}
+    declared = b''.join(channel(numbers[topic], topic, kind)
+                        for topic, kind, _, _ in _messages()[:3])
+    messages = b''.join(record(5, struct.pack('<HIQQ', numbers[topic], 0, time, time) + data)
                         for topic, _, time, data in _messages())
-    chunk = record(
-        6, struct.pack('<QQQI', 0, 1, len(declared + messages), zlib.crc32(declared + messages))
-        + text('') + struct.pack('<Q', len(declared + messages)) + declared + messages)
-    magic, head, end = (b'\x89MCAP0\r\n', record(1, text('ros2') + text('')),
-                        record(15, bytes(4)) + record(2, bytes(20)))
-    return [magic + head + declared + messages + end + magic, magic + head + chunk + end + magic,
-            magic + head + chunk[:-40]]
+    whole = chunk(declared + messages, checksum=zlib.crc32(declared + messages))
+    head, end = record(1, text('ros2') + text('')), record(15, bytes(4)) + record(2, bytes(20))
+    return [MCAP + head + declared + messages + end + MCAP, MCAP + head + whole + end + MCAP,
+            MCAP + head + whole[:-40]]
 
 
 def _database_seeds() -> list[bytes]:
-    import sqlite3
     path = path_of('_seed.db3')
     path.unlink(missing_ok=True)
-    with contextlib.closing(sqlite3.connect(path)) as database:
-        database.execute('PRAGMA page_size = 512')
-        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
-                         'serialization_format TEXT)')
-        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, '
-                         'timestamp INTEGER, data BLOB)')
-        topics = {
-            topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
-        rows = [(number, name, kind, 'cdr') for name, (number, kind) in topics.items()]
-        database.executemany('INSERT INTO topics VALUES (?, ?, ?, ?)', rows)
-        messages = [(topics[name][0], time, data) for name, _, time, data in _messages()]
-        database.executemany('INSERT INTO messages VALUES (NULL, ?, ?, ?)', messages)
-        database.commit()
+    database(path, {topic: kind for topic, kind, _, _ in _messages()[:3]},
+             [(topic, time, data) for topic, _, time, data in _messages()],
+             'PRAGMA page_size = 512').close()
     return [path.read_bytes()]
 
 

@@ -8,11 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Recordings for tests, written by the library rosbags, independent of the reader here."""
+"""Recordings for tests: by the library rosbags, independent of the reader here, and by hand."""
 
+import sqlite3
+import struct
 
 import numpy as np
-import pytest
 
 BEGIN = 1_700_000_000_000_000_000  # ns
 #: How long after its stamp a message was received, in ns.
@@ -26,6 +27,7 @@ KINDS = {'sqlite3': {}, 'sqlite3-file': {'mode': 'FILE'}, 'sqlite3-message': {'m
 
 def rosbags():
     """Return the modules of the library; skip where it is missing."""
+    import pytest  # not where a fuzzer takes the builders below
     pytest.importorskip('rosbags',
                         reason='rosbags, which writes recordings for tests, is not installed')
     from rosbags import rosbag2, typesys
@@ -136,3 +138,60 @@ def of_log(log, distribution='ROS2_JAZZY'):
 def file_of(path):
     """Return the one file of messages in the folder of a recording."""
     return next(file for file in path.iterdir() if file.name != 'metadata.yaml')
+
+
+# By hand: odd, torn and hostile ones
+
+
+MCAP = b'\x89MCAP0\r\n'
+
+
+def text(words):
+    """Return a text as MCAP holds it."""
+    return struct.pack('<I', len(words.encode())) + words.encode()
+
+
+def record(code, body):
+    """Return a record of MCAP."""
+    return struct.pack('<BQ', code, len(body)) + body
+
+
+def chunk(content, compression='', size=None, checksum=0):
+    """Return a chunk of MCAP whose content, once unpacked, has this size, as it says."""
+    return record(6, struct.pack('<QQQI', 0, 0, len(content) if size is None else size,
+                                 checksum)
+                  + text(compression) + struct.pack('<Q', len(content)) + content)
+
+
+def channel(number, topic, kind):
+    """Return schema and channel of a topic of MCAP."""
+    return (record(3, struct.pack('<H', number) + text(kind) + text('ros2msg') + text(''))
+            + record(4, struct.pack('<HH', number, number) + text(topic) + text('cdr') + text('')))
+
+
+def database(path, topics, messages=None, pragma='PRAGMA user_version'):
+    """
+    Return an open database as rosbag2 writes one.
+
+    Parameters
+    ----------
+    path : of the file
+    topics : topic -> kind
+    messages : (topic, ns, bytes) of each; None makes no table of messages
+    pragma : executed before the tables are made
+
+    """
+    made = sqlite3.connect(path)
+    made.execute(pragma)
+    made.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
+                 'serialization_format TEXT)')
+    made.executemany("INSERT INTO topics(name, type, serialization_format) VALUES (?, ?, 'cdr')",
+                     topics.items())
+    if messages is not None:
+        numbers = {topic: number for number, topic in enumerate(topics, 1)}
+        made.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, '
+                     'timestamp INTEGER, data BLOB)')
+        made.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)',
+                         ((numbers[topic], *rest) for topic, *rest in messages))
+    made.commit()
+    return made

@@ -21,7 +21,6 @@ import os
 import re
 import signal
 import socket
-import sqlite3
 import stat
 import struct
 import subprocess
@@ -32,6 +31,7 @@ from gyro_calibration.files import explained, InputError, plain, reason, write_a
 from gyro_calibration.heading.bias_table import BiasTable, Prior
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.logs.cdr import IMU
 from gyro_calibration.logs.log import Log, LogError, read_log, read_log_blocks, write_log
 from gyro_calibration.logs.ros_bag import Contents, read_messages
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
@@ -41,6 +41,7 @@ from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 import pytest
+from recordings import channel, chunk, database, MCAP, record
 
 MODEL = 'effects: {bias: {bias: 0.001}}\nnoise: {angle_random_walk: 1.0e-4}\n'
 ROWS = ''.join(f'{row / 100:.2f},{0.1 * (row % 7)}\n' for row in range(400))
@@ -334,27 +335,14 @@ def test_equal_names_of_columns_take_no_longer_than_others(count, tmp_path):
     assert found[:4] == ['x.2', 'x', 'x.1', 'x.3'] and len(set(found)) == count + 1
 
 
-def text(value):
-    return struct.pack('<I', len(value)) + value.encode()
-
-
-def record(code, body):
-    return struct.pack('<BQ', code, len(body)) + body
-
-
 def mcap(content, compression, times):
     """Return an MCAP file of so many equal chunks."""
     compress = {
         'zstd': lambda data:
             pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
         'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
-    packed = compress(content)
-    chunk = record(6, struct.pack('<QQQI', 0, 0, len(content), 0) + text(compression)
-                   + struct.pack('<Q', len(packed)) + packed)
-    schema = record(
-        3, struct.pack('<H', 1) + text('sensor_msgs/msg/Imu') + text('ros2msg') + text(''))
-    channel = record(4, struct.pack('<HH', 1, 1) + text('/imu') + text('cdr') + text(''))
-    return b'\x89MCAP0\r\n' + schema + channel + chunk * times
+    return MCAP + channel(1, '/imu', IMU) + times * chunk(
+        compress(content), compression, len(content))
 
 
 def small_messages(size):
@@ -406,7 +394,7 @@ PLAIN = (
      "'messages'", 'cannot be read'),
 ], ids=['generated', 'stored', 'view', 'view called a table'])
 def test_nothing_in_the_schema_of_a_recording_is_computed(messages, more, words, tmp_path):
-    with database(tmp_path / 'a.db3') as made:
+    with database(tmp_path / 'a.db3', {'/imu': IMU}) as made:
         made.execute(messages)
         if 'AS (' in messages and 'VIEW' not in messages:
             made.executemany('INSERT INTO messages(topic_id, timestamp) VALUES (1, ?)',
@@ -415,16 +403,8 @@ def test_nothing_in_the_schema_of_a_recording_is_computed(messages, more, words,
     refused(tmp_path / 'a.db3', words)
 
 
-def database(path):
-    made = sqlite3.connect(path)
-    made.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
-                 'serialization_format TEXT)')
-    made.execute("INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu', 'cdr')")
-    return made
-
-
 def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_path):
-    with database(tmp_path / 'a.db3') as made:
+    with database(tmp_path / 'a.db3', {'/imu': IMU}) as made:
         made.execute(PLAIN + ')')
         rows = [(1, row, bytes(5_000_000 if row % 50 == 0 else 400)) for row in range(100)]
         made.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)', rows)

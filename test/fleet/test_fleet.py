@@ -40,6 +40,7 @@ from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import from_rates
 import numpy as np
 import pytest
+from recordings import MCAP, record, text
 from scipy import stats
 
 DEGREE = np.pi / 180.0
@@ -110,12 +111,9 @@ def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_p
 
 def _mcap(said):
     """Return an MCAP file with a metadata record."""
-    def text(each):
-        return struct.pack('<I', len(each)) + each.encode()
     pairs = b''.join(text(name) + text(value) for name, value in said.items())
-    body = text('gyro') + struct.pack('<I', len(pairs)) + pairs
-    return (b'\x89MCAP0\r\n' + struct.pack('<BQ', 1, 8) + bytes(8)
-            + struct.pack('<BQ', 0x0C, len(body)) + body)
+    return MCAP + record(1, bytes(8)) + record(
+        0x0C, text('gyro') + struct.pack('<I', len(pairs)) + pairs)
 
 
 def test_notes_metadata_and_names_say_what_a_table_does_not(tmp_path):

@@ -15,8 +15,6 @@ from dataclasses import replace
 import hashlib
 import json
 import shutil
-import sqlite3
-import struct
 import sys
 import tracemalloc
 
@@ -34,7 +32,18 @@ from gyro_calibration.logs.recording import blocks_of, read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording
 import numpy as np
 import pytest
-from recordings import BEGIN, DELAY, file_of, KINDS, Messages, of_log, write
+from recordings import (
+    BEGIN,
+    chunk,
+    database,
+    DELAY,
+    file_of,
+    KINDS,
+    MCAP,
+    Messages,
+    of_log,
+    write,
+)
 import yaml
 
 RATE = 100.0
@@ -284,18 +293,10 @@ def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
 
 
 def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):
-    with contextlib.closing(sqlite3.connect(tmp_path / 'live.db3')) as database:
-        database.execute('PRAGMA journal_mode=WAL')
-        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
-                         'serialization_format TEXT)')
-        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, '
-                         'timestamp INTEGER, data BLOB)')
-        database.execute('INSERT INTO topics VALUES (1, "/imu", ?, "cdr")', [IMU])
-        rows = [(BEGIN + n, serialize(BEGIN + n * 10 ** 7, 'gyro', 37 * [float(n)]))
-                for n in range(300)]
-        database.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)',
-                             rows)
-        database.commit()
+    messages = [('/imu', BEGIN + number, serialize(BEGIN + number * 10 ** 7, 'gyro',
+                                                   37 * [float(number)])) for number in range(300)]
+    with contextlib.closing(database(tmp_path / 'live.db3', {'/imu': IMU}, messages,
+                                     'PRAGMA journal_mode=WAL')):
         (tmp_path / 'dead').mkdir()
         for file in tmp_path.glob('live.db3*'):
             shutil.copy(file, tmp_path / 'dead')
@@ -339,10 +340,7 @@ def test_a_chunk_is_never_larger_than_it_says(tmp_path, name):
     bomb = {
         'zstd': lambda data: pytest.importorskip('zstandard').compress(data),
         'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[name](bytes(1 << 26))
-    body = (struct.pack('<QQQI', 0, 0, 1000, 0) + struct.pack('<I', len(name)) + name.encode()
-            + struct.pack('<Q', len(bomb)) + bomb)
-    (tmp_path / 'bomb.mcap').write_bytes(
-        b'\x89MCAP0\r\n' + struct.pack('<BQ', 6, len(body)) + body)
+    (tmp_path / 'bomb.mcap').write_bytes(MCAP + chunk(bomb, name, 1000))
     with pytest.raises(LogError, match='no message of sensor_msgs/msg/Imu'):
         read_recording(tmp_path / 'bomb.mcap')
 
