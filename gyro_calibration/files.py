@@ -218,15 +218,18 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         path.parent.mkdir(parents=True, exist_ok=True)
         old = replaceable(path)
         remove_leftovers(path)
-        # Nobody else may read what only the owner of the old file may; a new one gets what the
-        # umask leaves.
+        # only its owner may read it, as may be so of the old file; a new one gets what the umask
+        # leaves
         handle, temporary = _created(path, 0o644 if old is None else 0o600)
         try:
             with os.fdopen(handle, 'wb') as file:
                 yield file
                 file.flush()
                 if old is not None:
-                    _make_alike(file.fileno(), old)
+                    for owner in ((-1, old.st_gid), (old.st_uid, -1)):
+                        with suppress(OSError):  # as far as that is allowed
+                            os.fchown(file.fileno(), *owner)
+                    os.fchmod(file.fileno(), old.st_mode & 0o777)
                 os.fsync(file.fileno())
                 os.replace(temporary, path)
         except BaseException:
@@ -259,7 +262,7 @@ def replaceable(path: str | Path) -> os.stat_result | None:
 
     Raises
     ------
-    OSError : it is a pipe, a socket, a device or a folder, or a link to one; or nobody can look
+    OSError : it is a pipe, a socket, a device or a folder, or a link to one; or it cannot be seen
 
     """
     try:
@@ -272,14 +275,6 @@ def replaceable(path: str | Path) -> os.stat_result | None:
     return None
 
 
-def _make_alike(handle: int, old: os.stat_result) -> None:
-    """Give a new file owner, group and mode of the old one, as far as that is allowed."""
-    for owner in ((-1, old.st_gid), (old.st_uid, -1)):
-        with suppress(OSError):
-            os.fchown(handle, *owner)
-    os.fchmod(handle, old.st_mode & 0o777)
-
-
 def _stem(path: Path) -> str:
     """Return what the names of temporary files begin with; a long name is cut to leave room."""
     return f'.{os.fsdecode(os.fsencode(path.name)[:200])}.'
@@ -289,15 +284,11 @@ def remove_leftovers(path: str | Path) -> None:
     """Remove what killed writers of a file left there, but nothing that is being written."""
     path = Path(path)
     leftover = re.compile(re.escape(_stem(path)) + '[a-z0-9_]{8}')
-    # Nobody waits for it; a folder that cannot be read or written to is reported when it matters.
+    # a folder that cannot be read or written to is reported when it matters
     with suppress(OSError):
-        for name in filter(leftover.fullmatch, os.listdir(path.parent)):
+        for found in [each for each in path.parent.iterdir() if leftover.fullmatch(each.name)]:
             with suppress(OSError):
-                _remove_unlocked(path.parent / name)
-
-
-def _remove_unlocked(path: Path) -> None:
-    if stat.S_ISREG(os.lstat(path).st_mode):
-        with opened(path) as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.unlink(path)
+                if stat.S_ISREG(os.lstat(found).st_mode):
+                    with opened(found) as file:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        os.unlink(found)

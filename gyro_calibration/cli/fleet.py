@@ -28,7 +28,7 @@ from gyro_calibration.cli.verb import Answer, bar, UsageError, wrapped
 from gyro_calibration.diagnosis.gates import is_confused
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.files import plain, write_atomically
-from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
+from gyro_calibration.fleet.pooling import DRIVES, POWER_ONS, UNITS
 from gyro_calibration.fleet.report import report, tables
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes, usual_workers
 from gyro_calibration.fleet.summary import (
@@ -36,7 +36,6 @@ from gyro_calibration.fleet.summary import (
 )
 from gyro_calibration.fleet.summary import (
     FALSE_ALARMS,
-    Found,
     in_words,
     models,
     sentences,
@@ -74,8 +73,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'faster')
     parser.add_argument('--seed', type=verb.whole, default=0, metavar='N', help='seed of the '
                         'random draws of a diagnosis; default: 0')
-    parser.add_argument('--workers', type=_count, metavar='N', help='number of processes; '
-                        'default: one per core')
+    parser.add_argument('--workers', type=verb.positive_integer, metavar='N',
+                        help='number of processes; default: one per core')
     parser.add_argument('--memory', type=verb.positive, metavar='GB', help='memory limit per '
                         'worker; default: an equal share of this machine')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
@@ -88,13 +87,6 @@ def _pattern(text: str) -> re.Pattern[str]:
         return pattern(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is below 1; give an integer of 1 or more')
-    return value
 
 
 def _fleet(given: argparse.Namespace) -> Answer:
@@ -153,8 +145,10 @@ def _lines(found: TypeFound) -> Iterator[str]:
         (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
     yield f'{found.name or "Type not stated, pooled as one"}: {counts}.'
     for each in found.values.values():
-        parts = [f'{spoken} {_spread(each, each.components[name])}' for name, spoken in _SPOKEN
-                 if name in each.components]
+        # the upper bound of a standard deviation that may be zero
+        parts = [f'{spoken} {"" if of.low > 0.0 else "less than "}'
+                 f'{amount(of.estimate if of.low > 0.0 else of.high, each.unit, each.name)}'
+                 for name, spoken in _SPOKEN if (of := each.components.get(name))]
         mean = in_words(each.mean, 0, each.unit, each.name)
         yield f'  {each.name}: {mean}; {", ".join(parts)}'
         if not each.slow:
@@ -162,13 +156,6 @@ def _lines(found: TypeFound) -> Iterator[str]:
                 f'unit {plain(name)} {in_words(each.units, place, each.unit, each.name)}'
                 for place, name in enumerate(found.units) if np.isfinite(each.units.value[place]))
     yield from (f'  {text}.' for text in sentences(found))
-
-
-def _spread(each: Found, of: Component) -> str:
-    """Return a standard deviation in words; its upper bound where it may be zero."""
-    if of.low > 0.0:
-        return amount(of.estimate, each.unit, each.name)
-    return f'less than {amount(of.high, each.unit, each.name)}'
 
 
 def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str, Any]]:

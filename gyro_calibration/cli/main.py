@@ -45,7 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     given = _parser(words[0] if words else '').parse_args(words)
     try:
-        _refuse_empty(given)
+        for name, value in vars(given).items():
+            # as from a shell variable that is not set
+            if value == '' or isinstance(value, list) and '' in value:
+                raise UsageError(f'{name.replace("_", "-")} is empty; give a value or omit it')
         for path in given.catalogue:
             _load_effects(path)
         answer = given.verb(given)
@@ -101,13 +104,6 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_numbers(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _refuse_empty(given: argparse.Namespace) -> None:
-    """Refuse an option with an empty value, as from a shell variable that is not set."""
-    for name, value in vars(given).items():
-        if value == '' or isinstance(value, list) and '' in value:
-            raise UsageError(f'{name.replace("_", "-")} is empty; give a value or omit it')
 
 
 def _show(text: str) -> None:

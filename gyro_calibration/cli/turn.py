@@ -118,16 +118,13 @@ def _as_given(given: argparse.Namespace, model: GyroModel, log: Log,
     if beyond:
         remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; '
                        'the correction is extrapolated')
-    rate = _around(model, log, found) if model.looks_around else result.rate
+    rate = result.rate
+    if model.looks_around:  # the model depends on the past: the log is compensated row by row
+        error = np.asarray(log.output) - compensate_log(model, log)
+        rate = found.output - np.array([error[rows].mean() for rows in found.rows])
     return rate, not_outlying(found), remarks, {
         'effects': names, 'left_out': False, 'temperature_clipped': clipped,
         'beyond_range': beyond}
-
-
-def _around(model: GyroModel, log: Log, found: Dwells) -> Array:
-    """Return rates by a model that depends on the past: the log is compensated row by row."""
-    error = np.asarray(log.output) - compensate_log(model, log)
-    return found.output - np.array([error[rows].mean() for rows in found.rows])
 
 
 def _fitted_to(model: GyroModel, log: str) -> str:

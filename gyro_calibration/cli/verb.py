@@ -202,6 +202,13 @@ def not_negative(text: str) -> float:
     return 0.0 if float(text) == 0.0 else positive(text)
 
 
+def positive_integer(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is below 1; give an integer of 1 or more')
+    return value
+
+
 def whole(text: str) -> int:
     """Return a seed, as a numpy Generator takes it."""
     value = int(text)

@@ -75,7 +75,11 @@ class Entry:
         if 'temperature' in new:
             new['temperature'] = _temperature(self.log, new['temperature'])
         if 'date' in new:
-            new['date'] = _date(self.log, new['date'])
+            try:
+                new['date'] = date.fromisoformat(new['date'][:10]).isoformat()
+            except ValueError:
+                raise InputError(f'{self.log}: its date is given as {new["date"]!r}; wanted such '
+                                 'as 2026-03-01') from None
         return replace(self, **new)
 
     def merged(self, other: Entry) -> Entry:
@@ -301,11 +305,3 @@ def _temperature(log: str, text: str) -> float:
     if not -273.15 <= value <= 1e4:
         raise InputError(f'{log}: its temperature is given as {text!r}; wanted degC')
     return value
-
-
-def _date(log: str, text: str) -> str:
-    try:
-        return date.fromisoformat(text[:10]).isoformat()
-    except ValueError:
-        raise InputError(f'{log}: its date is given as {text!r}; wanted such as '
-                         '2026-03-01') from None

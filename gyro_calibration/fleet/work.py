@@ -37,7 +37,6 @@ from gyro_calibration.calibration.noise_grid import BandedNoise, heading_noise, 
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.diagnosis.data_quality import inspect
 from gyro_calibration.diagnosis.expected_output import bridged, is_far
-from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.gates import gates, mismatch, refuse, rests
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
@@ -315,20 +314,15 @@ def calibrate(log: Log, technology: str = 'mems'
         return found.method, found.model, offset
     refuse(log)
     if log.time is not None and rests(log):
-        return 'rest', _at_rest(log), {}
+        bias, deviation = rest_bias(log)
+        walk = white_noise(log.output, order=1) * math.sqrt(float(np.median(np.diff(log.time))))
+        return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
+                                 noise=Noise(angle_random_walk=walk)), {}
     of_table = None if log.time is not None else inspect(log)
     if of_table is not None and is_far(of_table.factor):
         raise DataRefused(f'{of_table.findings[0].evidence}: correct the unit or the sign of the '
                           'column of the gyro')
     return 'dwells', select_effects(dwells(log), technology).calibration.model, {}
-
-
-def _at_rest(log: Log) -> GyroModel:
-    assert log.time is not None and log.output is not None
-    bias, deviation = rest_bias(log)
-    walk = white_noise(log.output, order=1) * math.sqrt(float(np.median(np.diff(log.time))))
-    return GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
-                     noise=Noise(angle_random_walk=walk))
 
 
 def _values(model: GyroModel) -> dict[str, dict[str, Any]]:
@@ -360,12 +354,10 @@ def _diagnosed(task: Task, log: Log) -> dict[str, Any]:
                               'findings': []}}
     page = task.record.with_suffix('.html')
     write_atomically(page, report(found).encode())
-    return {'diagnosis': _summary(found), 'page': f'logs/{page.name}'}
-
-
-def _summary(found: Diagnosis) -> dict[str, Any]:
-    return {'verdict': found.verdict, 'reason': '', 'findings': [
+    findings = [
         {'effect': each.effect, 'status': each.status, 'p_value': each.p_value,
          'ambiguous_with': list(each.ambiguous_with),
          'parameters': {name: value.figures() for name, value in each.parameters.items()}}
-        for each in found.findings]}
+        for each in found.findings]
+    return {'diagnosis': {'verdict': found.verdict, 'reason': '', 'findings': findings},
+            'page': f'logs/{page.name}'}

@@ -403,7 +403,10 @@ class BiasTable:
         if self._dated_anew:
             return True
         kept = {(each.run, _bin(each)): each for each in self._kept}
-        return any(_differs(kept.get((each.run, _bin(each))), each) for each in self.entries)
+        # by half a standard deviation, or a fifth of the variance
+        return any(old is None or (each.bias - old.bias) ** 2 > 0.25 * old.variance
+                   or each.variance < 0.8 * old.variance
+                   for each in self.entries for old in [kept.get((each.run, _bin(each)))])
 
     def due(self, now: float, ending: bool = False) -> bool:
         """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
@@ -484,12 +487,6 @@ def _possible(entry: Entry) -> bool:
 def _bounded(temperature: float, time: float) -> tuple[float, float]:
     """Return temperature, degC, and time, s since 1970, limited to their possible ranges."""
     return min(max(temperature, -273.15), 1e4), min(max(time, 0.0), 1e11)
-
-
-def _differs(kept: Entry | None, entry: Entry) -> bool:
-    """Tell whether an entry is new: by half a standard deviation, or a fifth of the variance."""
-    return (kept is None or (entry.bias - kept.bias) ** 2 > 0.25 * kept.variance
-            or entry.variance < 0.8 * kept.variance)
 
 
 def propagated(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
@@ -612,7 +609,11 @@ def write_bias_table(path: str | Path, table: BiasTable,
 
     """
     message = _keep_aside(Path(path), table.digest)
-    written = write_atomically(path, (_HEADER + settings_text(_content(table))).encode())
+    entries = [{'temperature': round(each.temperature, 3), 'bias': _short(each.bias),
+                **_common(each)} for each in table.entries]
+    content = {'format': FORMAT, 'version': VERSION, 'model': table.digest, 'entries': entries,
+               'jumps': [_common(each) for each in table.jumps]}
+    written = write_atomically(path, (_HEADER + settings_text(content)).encode())
     table.kept(now)
     return message, written
 
@@ -645,8 +646,10 @@ def _read(path: Path) -> tuple[str, list[Entry], list[Jump]]:
 
 
 def _entry(row: Mapping[str, Any], temperature: float, bias: float) -> Entry:
+    # of a text, or of what YAML takes it for
+    text = str(row['time']).removesuffix('Z').removesuffix('+00:00')
     entry = Entry(temperature, bias, float(row['standard_deviation']) ** 2,
-                  _seconds(row['time']), int(row['run']))
+                  float(np.datetime64(text, 's').astype('int64')), int(row['run']))
     if not _possible(entry):
         raise ValueError(f'no gyro has {entry}')
     return entry
@@ -658,20 +661,6 @@ def _rows(content: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
             or not all(isinstance(row, dict) for row in rows)):
         raise ValueError(f'{name} is no list of at most {ENTRIES} rows')
     return rows
-
-
-def _seconds(value: Any) -> float:
-    """Return a time, s since 1970, from its text, or from what YAML takes it for."""
-    return float(np.datetime64(
-        str(value).removesuffix('Z').removesuffix('+00:00'), 's').astype('int64'))
-
-
-def _content(table: BiasTable) -> dict[str, Any]:
-    entries = [{'temperature': round(each.temperature, 3), 'bias': _short(each.bias),
-                **_common(each)} for each in table.entries]
-    jumps = [_common(each) for each in table.jumps]
-    return {'format': FORMAT, 'version': VERSION, 'model': table.digest,
-            'entries': entries, 'jumps': jumps}
 
 
 def _common(row: Entry | Jump) -> dict[str, Any]:

@@ -148,17 +148,12 @@ class Intervals:
             self.lost += self._late
             self.longest = max(self.longest, interval)
             return self._late
-        if self._late:
-            self._catch_up(interval)
-        return 0
-
-    def _catch_up(self, interval: float) -> None:
-        """Take a sample back from the lost ones that only came late."""
-        if interval < _SHORT * self.usual:
+        if self._late and interval < _SHORT * self.usual:  # of the lost ones, this came only late
             self._late -= 1
             self.lost -= 1
         else:
             self._late = 0
+        return 0
 
     def _look(self) -> None:
         """Find the usual interval: the median, unless the stamps come in bursts."""

@@ -108,16 +108,13 @@ class LogCompensation:
         lost = time[known[np.minimum(after, len(known) - 1)]] - time[known[np.maximum(before, 0)]]
         return (inside & (lost <= _BRIDGED)) | ((before < 0) & (not earlier))
 
-    def _seeks_heading(self, log: Log) -> bool:
-        return log.reference_heading is None or not np.isfinite(log.reference_heading).any()
-
     def _around(self, log: Log) -> tuple[Compensated, Array]:
         time = np.zeros(len(log)) if log.time is None else log.time
         around = self._history.follow(time, log.temperature, log.specific_force, log.supply,
                                       _bridged(time, log.reference_heading))
         if not self._model.looks_at('heading') or log.time is None:
             return self._compensated(log, around)
-        if self._seeks_heading(log):
+        if log.reference_heading is None or not np.isfinite(log.reference_heading).any():
             return self._compensated(log, self._found_heading(log, around))
         result, sensitivity = self._compensated(log, around)
         self._turned = (self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:],

@@ -103,7 +103,11 @@ def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
             return step, aligned, deviation
         number = np.rint((place[within] - offset) / step)
         if np.ptp(number) > 0.0:
-            step, deviation = _slope(number, place[within])
+            step, off, spread = _line(number, place[within])
+            good = np.abs(off) <= 0.3 * abs(step)
+            if np.ptp(number[good]) > 0.0:
+                step, off, spread = _line(number[good], place[within][good])
+            deviation = float(np.std(off) / spread)
         if within.all():
             return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
         reach *= 4.0
@@ -121,15 +125,6 @@ def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
               if len(counts) > 1 else counts)
     mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
     return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
-
-
-def _slope(number: Array, place: Array) -> tuple[float, float]:
-    """Return the slope of places over whole numbers, without outliers, and its deviation."""
-    slope, off, spread = _line(number, place)
-    good = np.abs(off) <= 0.3 * abs(slope)
-    if np.ptp(number[good]) > 0.0:
-        slope, off, spread = _line(number[good], place[good])
-    return slope, float(np.std(off) / spread)
 
 
 def _line(number: Array, place: Array) -> tuple[float, Array, float]:

@@ -208,7 +208,12 @@ class _Reader:
         self._notes = [f'ROS 2 recording {Path(path).name}']
 
     def log(self, rate: float | None) -> Log:
-        gyro, reference, temperature = self._gyro(), self._reference(), self._temperature_topic()
+        wanted = self._topics.gyro
+        gyro = self._course(self._named(wanted, 'gyro') if wanted else self._only_imu())
+        if not gyro.reports('rate'):
+            raise LogError(f'{self._path}: {gyro.topic} declares that it reports no angular '
+                           'velocity; name another by --topic')
+        reference, temperature = self._reference(), self._temperature_topic()
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:
             self._notes.append('headers have no stamps: times are those at which messages were '
@@ -217,7 +222,13 @@ class _Reader:
         time = (gyro.stamps - gyro.stamps[0]) / NSEC_PER_SEC
         self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, '
                            f'time_s from {_seconds(gyro.stamps[0])} s on')
-        log = Log(output=self._output(gyro), time=time, specific_force=self._force(gyro))
+        output = gyro.values('rate').copy()
+        lost = ~np.isfinite(output)
+        if lost.any():
+            self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
+                               'as lost')
+            output[lost] = np.nan
+        log = Log(output=output, time=time, specific_force=self._force(gyro))
         if temperature is not None:
             times = temperature.timed(use_stamps and temperature.has_stamps)
             log = replace(log, temperature=self._temperature(times, gyro.stamps[0], time))
@@ -229,15 +240,6 @@ class _Reader:
         return replace(log, notes=(*self._notes, *self._contents.notes))
 
     # Which topics
-
-    def _gyro(self) -> _Course:
-        wanted = self._topics.gyro
-        found = self._named(wanted, 'gyro') if wanted else self._only_imu()
-        course = self._course(found)
-        if not course.reports('rate'):
-            raise LogError(f'{self._path}: {found} declares that it reports no angular velocity; '
-                           'name another by --topic')
-        return course
 
     def _only_imu(self) -> str:
         found = [topic for topic in self._of_kind((cdr.IMU,))
@@ -349,15 +351,6 @@ class _Reader:
                            'were left out')
         return gyro.taken(~doubled)
 
-    def _output(self, gyro: _Course) -> Array:
-        output = gyro.values('rate').copy()
-        lost = ~np.isfinite(output)
-        if lost.any():
-            self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
-                               'as lost')
-            output[lost] = np.nan
-        return output
-
     def _force(self, gyro: _Course) -> Array | None:
         """Return the specific force along z, or None if it is not reported or never filled in."""
         force = gyro.values('force')
@@ -404,7 +397,12 @@ class _Reader:
         rate = course.values('rate') if course.reports('rate') else None
         if rate is not None:
             rate = np.where(np.isfinite(rate), rate, np.nan)
-        heading = None if wrapped is None else self._continuous(at, wrapped, time, output)
+        heading = None
+        if wrapped is not None:  # without its jumps by whole turns
+            heading, by_gyro = unwrapped(at, wrapped, time, np.asarray(output))
+            if by_gyro:
+                self._notes.append('the reference turned by more than half a turn between two '
+                                   'values; the number of turns was taken from the gyro')
         if (rate is not None and heading is not None and not rate.any()
                 and np.nanmax(heading) - np.nanmin(heading) > 0.1):
             self._notes.append('the rates of the reference are all zero, and were left out')
@@ -421,14 +419,6 @@ class _Reader:
         self._notes.append(f'reference: {course.topic} ({course.kind}), {len(at)} values, '
                            f'lost for {100 * lost:.1f} % of the samples')
         return found
-
-    def _continuous(self, at: Array, wrapped: Array, time: Array, output: Array | None) -> Array:
-        """Return a heading without its jumps by whole turns, and note where the gyro helped."""
-        heading, by_gyro = unwrapped(at, wrapped, time, np.asarray(output))
-        if by_gyro:
-            self._notes.append('the reference turned by more than half a turn between two values; '
-                               'the number of turns was taken from the gyro')
-        return heading
 
 
 def _rising(course: _Course) -> _Course:

@@ -316,7 +316,10 @@ class _McapReader:
                 for inner, content in _records(io.BytesIO(data), len(data), self._contents):
                     yield from self.read(inner, content) if inner != _Code.CHUNK else ()
             elif code == _Code.MESSAGE:
-                yield from self._message(body)
+                number, _, received, _ = struct.unpack_from('<HIQQ', body)
+                if number in self._channels:
+                    yield Message(*self._channels[number], received,
+                                  _message_data(body[22:], self._budget))
             elif code == _Code.SCHEMA:
                 kind, place = _text(body, 2)
                 definition, _ = _text(body, _text(body, place)[1])
@@ -340,12 +343,6 @@ class _McapReader:
         self._contents.topics[topic] = kind = shown(kind)
         if encoding == 'cdr' and self._contents.is_useful(kind, definition):
             self._channels[number] = topic, kind
-
-    def _message(self, body: bytes) -> Iterator[Message]:
-        number, _, received, _ = struct.unpack_from('<HIQQ', body)
-        if number in self._channels:
-            yield Message(*self._channels[number], received,
-                          _message_data(body[22:], self._budget))
 
 
 class _Damaged(ValueError):

@@ -230,13 +230,10 @@ def simulate_noise(noise: Noise, count: int, interval: float,
     white = generator.standard_normal(count) * noise.angle_random_walk / math.sqrt(interval)
     innovations = generator.standard_normal(count) * noise.bias_instability
     response = np.cumprod(np.concatenate([[1.0], 1.0 - 0.5 / np.arange(1.0, count)]))
-    flicker = _convolved(innovations, response) if noise.bias_instability else innovations
+    flicker = innovations
+    if noise.bias_instability:  # through a causal response
+        length = next_fast_len(2 * count, real=True)
+        flicker = irfft(rfft(innovations, length) * rfft(response, length), length)[:count]
     walk = (np.cumsum(generator.standard_normal(count))
             * noise.rate_random_walk * math.sqrt(interval))
     return white + flicker + walk
-
-
-def _convolved(values: Array, response: Array) -> Array:
-    """Return values through a causal response of the same length, shape (n,)."""
-    length = next_fast_len(2 * len(values), real=True)
-    return np.asarray(irfft(rfft(values, length) * rfft(response, length), length)[:len(values)])

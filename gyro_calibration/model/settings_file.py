@@ -208,16 +208,8 @@ def _number(dumper: Any, value: float) -> Any:
     return yaml.SafeDumper.represent_float(dumper, value)
 
 
-def _numpy_scalar(dumper: Any, value: np.generic) -> Any:
-    return dumper.represent_data(float(value) if isinstance(value, np.floating) else value.item())
-
-
 def _refuse(problem: str, at: Any) -> None:
     raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
-
-
-def _float(loader: Any, node: Any) -> float:
-    return float(node.value.lower().replace('.inf', 'inf').replace('.nan', 'nan'))
 
 
 #: Name -> (pattern, first characters, constructor). A number of more than 400 digits is none, and
@@ -229,14 +221,16 @@ _KINDS: dict[str, tuple[str, list[str], Any]] = {
     'int': ('[-+]?[0-9]{1,400}', list('-+0123456789'), lambda loader, node: int(node.value)),
     'float': (r'[-+]?(?:[0-9]{1,400}(?:\.[0-9]{0,400})?|\.[0-9]{1,400})(?:[eE][-+]?[0-9]{1,9})?|'
               r'[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)',
-              list('-+.0123456789'), _float),
+              list('-+.0123456789'), lambda loader, node: float(
+                  node.value.lower().replace('.inf', 'inf').replace('.nan', 'nan'))),
     'str': ('', [], lambda loader, node: node.value),
     'seq': ('', [], yaml.SafeLoader.construct_yaml_seq),
     'map': ('', [], yaml.SafeLoader.construct_yaml_map),
 }
 _Dumper.add_representer(str, _Dumper.represent_str)
 _Dumper.add_representer(float, _number)
-_Dumper.add_multi_representer(np.generic, _numpy_scalar)
+_Dumper.add_multi_representer(np.generic, lambda dumper, value: dumper.represent_data(
+    float(value) if isinstance(value, np.floating) else value.item()))
 for _name, (_pattern, _first, _constructor) in _KINDS.items():
     _tag = f'tag:yaml.org,2002:{_name}'
     _Loader.add_constructor(_tag, _constructor)

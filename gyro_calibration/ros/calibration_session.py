@@ -378,18 +378,15 @@ class CalibrationSession:
                 return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but the gyro '
                         f'measures at most {limit / DEGREE:.0f} deg/s: correct '
                         'calibration.profile_file')
-        if drives and (obstacle := obstacle or self._commanded()):
+        if drives and obstacle:
             return obstacle
+        if drives and self._clock.steady() - self._others < 1.0:
+            return 'another node sends commands on cmd_vel: stop it, and run again'
         self._rules, self._suspected, self.warning = rules(values), False, ''
         self._begun = node_time(self._clock)
         self.run = run = Run(kind, duration, self._rules.after(kind), self._clock.steady(), motion)
         self._drive = Drive(run, self._clock, self._blind) if drives else None
         self._monitor.restart()
-        return ''
-
-    def _commanded(self) -> str:
-        if self._clock.steady() - self._others < 1.0:
-            return 'another node sends commands on cmd_vel: stop it, and run again'
         return ''
 
     def _blind(self) -> float:

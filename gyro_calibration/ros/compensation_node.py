@@ -45,7 +45,7 @@ from gyro_calibration.logs.cdr import (
 )
 from gyro_calibration.ros.calibration_session import Drive, REST
 from gyro_calibration.ros.compensation_report import calibration_status, CompensationReport
-from gyro_calibration.ros.diagnostics import Diagnostics, OK, Report, status_array
+from gyro_calibration.ros.diagnostics import Diagnostics, OK, status_array
 from gyro_calibration.ros.pipeline import Output, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
     answer_later,
@@ -114,8 +114,12 @@ class CompensationNode(Node):
         self._assumed_variance = values.assumed_bias ** 2
         self._connect()
         self._report = CompensationReport(self._pipeline, clock)
-        self._diagnostics = Diagnostics(self, 'heading', self._make_report)
-        self._offer_services()
+        self._diagnostics = Diagnostics(self, 'heading', lambda: self._report.make())
+        for name, callback in (
+                ('calibrate', self._on_calibrate), ('calibrate_bias', self._on_calibrate_bias),
+                ('finish_calibration', self._on_finish), ('cancel_calibration', self._on_cancel),
+                ('reset_heading', self._on_reset)):
+            answer_later(self.create_service(Trigger, f'~/{name}', callback))
         # Each timer, also a cancelled one, costs time at every sample: one for all.
         self._watched = 0
         call_every(self, _WATCH_INTERVAL, self._watch)
@@ -140,7 +144,9 @@ class CompensationNode(Node):
         for place in range(5):
             self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
             self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
-        subscribe_to(self, Temperature, 'imu/temperature', self._on_temperature)
+        subscribe_to(self, Temperature, 'imu/temperature',
+                     lambda message: self._pipeline.temperature(_stamp(message.header),
+                                                                message.temperature))
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
         subscribe_to(self, Odometry, 'odom', self._on_odometry)
         subscribe_to(self, TwistStamped if self._stamped else Twist, 'cmd_vel', self._on_command)
@@ -152,9 +158,6 @@ class CompensationNode(Node):
         self._pipeline.set(values)
 
     # Subscriptions
-
-    def _on_temperature(self, message: Temperature) -> None:
-        self._pipeline.temperature(_stamp(message.header), message.temperature)
 
     def _on_odometry(self, message: Odometry) -> None:
         heading = heading_of(message.pose.pose.orientation)
@@ -220,9 +223,6 @@ class CompensationNode(Node):
             rate.twist.covariance[35] = found.rate_variance
             self._yaw_rate.publish(rate)
 
-    def _make_report(self) -> Report:
-        return self._report.make()
-
     def _show_status(self) -> None:
         """Publish the latched state of the calibration."""
         status = calibration_status(self._pipeline.store, self._pipeline.session.run)
@@ -251,13 +251,6 @@ class CompensationNode(Node):
 
     # Services
 
-    def _offer_services(self) -> None:
-        for name, callback in (
-                ('calibrate', self._on_calibrate), ('calibrate_bias', self._on_calibrate_bias),
-                ('finish_calibration', self._on_finish), ('cancel_calibration', self._on_cancel),
-                ('reset_heading', self._on_reset)):
-            answer_later(self.create_service(Trigger, f'~/{name}', callback))
-
     def _on_calibrate(self, _: Trigger.Request,
                       response: Trigger.Response) -> Trigger.Response | Future:
         return self._calibrate(self._values.calibration_reference, response)
@@ -269,7 +262,9 @@ class CompensationNode(Node):
     def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
         """Begin a run, which `_answer_ended` answers; or change nothing and say why."""
         session = self._pipeline.session
-        obstacle = self._obstacle() if self._values.calibration_drive else ''
+        obstacle = ''
+        if self._values.calibration_drive:
+            obstacle = self._learn_to_drive() or self._pipeline.obstacle()
         if refusal := session.begin(kind, self._values, obstacle):
             return self._refuse(response, refusal)
         if session.drives:
@@ -320,12 +315,6 @@ class CompensationNode(Node):
         return self._fill(response, self._pipeline.reset())
 
     # Driving
-
-    def _obstacle(self) -> str:
-        """Return why the robot must not be driven now; ''."""
-        if forbidden := self._learn_to_drive():
-            return forbidden
-        return self._pipeline.obstacle()
 
     def _learn_to_drive(self) -> str:
         """Become a publisher of cmd_vel, or return why not; only before a first drive."""

@@ -50,10 +50,6 @@ def _checksum(frame: bytes) -> bytes:
     return sum(frame[1:6]).to_bytes(2, 'big')
 
 
-def _is_intact(frame: bytes) -> bool:
-    return _checksum(frame) == frame[6:]
-
-
 class _Parser:
     """Joins the halves of the values that are spread over two frames."""
 
@@ -99,7 +95,8 @@ FIZOPTIKA = Protocol(
     baud=921600,
     rate=1000.0,
     sensitivity=1.0,
-    splitter=partial(FrameSplitter, rb'\xdd.{7}', 8, _is_intact),
+    splitter=partial(FrameSplitter, rb'\xdd.{7}', 8,
+                     lambda frame: _checksum(frame) == frame[6:]),
     parser=_Parser,
     writer=_Writer,
     largest_count=0x800000,

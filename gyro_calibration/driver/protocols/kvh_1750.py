@@ -59,10 +59,6 @@ def _checksum(data: bytes) -> bytes:
     return mirrored.to_bytes(4, 'little').translate(_MIRRORED)
 
 
-def _is_intact(frame: bytes) -> bool:
-    return _checksum(frame[:32]) == frame[32:]
-
-
 def _parse(frame: bytes, settings: Settings) -> Reading:
     axis = 'xyz'.index(settings.axis)
     _, *values, status, sequence, temperature = _FRAME.unpack_from(frame)
@@ -99,7 +95,8 @@ KVH_1750 = Protocol(
     baud=921600,
     rate=1000.0,
     sensitivity=1.0,
-    splitter=partial(FrameSplitter, rb'\xfe\x81\xff\x55.{32}', 36, _is_intact),
+    splitter=partial(FrameSplitter, rb'\xfe\x81\xff\x55.{32}', 36,
+                     lambda frame: _checksum(frame[:32]) == frame[32:]),
     parser=stateless(_parse),
     writer=stateless(_write),
     full_scale=math.radians(500.0),  # the input range is 490 deg/s

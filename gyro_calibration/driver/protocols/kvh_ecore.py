@@ -43,10 +43,6 @@ def _content(frame: bytes) -> bytes:
     return bits.to_bytes(7, 'big')
 
 
-def _is_intact(frame: bytes) -> bool:
-    return sum(_content(frame)) % 256 == 0
-
-
 def _parse(frame: bytes, settings: Settings) -> Reading:
     return Reading(int.from_bytes(_content(frame)[5:], 'big', signed=True))
 
@@ -64,7 +60,8 @@ KVH_ECORE = Protocol(
     baud=9600,
     rate=10.0,
     sensitivity=_COUNT,
-    splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8, _is_intact),
+    splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8,
+                     lambda frame: sum(_content(frame)) % 256 == 0),
     parser=stateless(_parse),
     writer=stateless(_write),
     largest_count=0x8000,

@@ -45,10 +45,6 @@ _NUMBERS = struct.Struct('<2x4h')
 _ROOM_TEMPERATURE = 25.0  # degC; default of an emulated module
 
 
-def _is_intact(frame: bytes) -> bool:
-    return sum(frame[:10]) & 0xFF == frame[10]
-
-
 class _Parser:
     """Gives each rate with the acceleration of the frames before it."""
 
@@ -88,7 +84,8 @@ WITMOTION = Protocol(
     baud=9600,
     rate=10.0,
     sensitivity=_COUNT,
-    splitter=partial(FrameSplitter, rb'\x55[\x50-\x5f].{9}', 11, _is_intact),
+    splitter=partial(FrameSplitter, rb'\x55[\x50-\x5f].{9}', 11,
+                     lambda frame: sum(frame[:10]) & 0xFF == frame[10]),
     parser=_Parser,
     writer=stateless(_write),
     largest_count=0x8000,
