@@ -133,8 +133,7 @@ class Client:
         self.raw: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
         self._node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
-        self._node.create_subscription(Imu, 'imu/data_raw', lambda message: self.raw.append(
-            (_seconds(message), message.angular_velocity.z)), SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data_raw', self._add_raw, SENSOR_QOS)
         self._node.create_subscription(Imu, 'imu/data', self._add_heading, SENSOR_QOS)
         self._node.create_subscription(Twist, 'cmd_vel', robot.set_rate, 10)
         self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
@@ -143,6 +142,9 @@ class Client:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
+
+    def _add_raw(self, message: Imu) -> None:
+        self.raw.append((_seconds(message), message.angular_velocity.z))
 
     def _add_heading(self, message: Imu) -> None:
         yaw = 2.0 * math.atan2(message.orientation.z, message.orientation.w)

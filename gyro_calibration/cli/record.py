@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+import math
 import os
 import signal
 import sys
@@ -33,14 +34,16 @@ from gyro_calibration.driver.recorder import (
     DiskFull,
     KINDS,
     McapRecorder,
-    MessageLog,
     Notes,
     PIECE,
 )
-from gyro_calibration.driver.timestamps import steady
-from gyro_calibration.files import plain
+from gyro_calibration.driver.timestamps import ClockSteps, steady
+from gyro_calibration.files import InputError, plain
+from gyro_calibration.heading.gaps import Intervals
+from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
-from gyro_calibration.logs.log import DataRefused
+from gyro_calibration.logs.log import DataRefused, LogError, write_log
+from gyro_calibration.logs.recording import read_recording, Topics, wrong_kind
 from gyro_calibration.logs.ros_bag import Message
 from tqdm import tqdm
 
@@ -163,19 +166,24 @@ class _Session:
         """How many are known to be lost."""
         raise NotImplementedError
 
+    @property
+    def _path(self) -> str:
+        """The file that grows."""
+        return str(self._given.out)
+
     def _open(self) -> Recorder:
         raise NotImplementedError
 
     def _take(self, tick: Callable[[], None]) -> None:
         raise NotImplementedError
 
-    def _create(self, notes: Notes, expected: tuple[str, ...] = ()) -> Recorder:
+    @staticmethod
+    def _create(path: str, notes: Notes) -> Recorder:
         try:
-            return (McapRecorder(self._given.out, notes) if self._is_mcap
-                    else CsvRecorder(self._given.out, notes, expected))
+            return (McapRecorder if path.endswith('.mcap') else CsvRecorder)(path, notes)
         except FileExistsError:
-            raise UsageError(f'{self._given.out}: exists already, and recordings are never '
-                             'overwritten; give a new name') from None
+            raise UsageError(f'{path}: exists already, and recordings are never overwritten; '
+                             'give a new name') from None
 
     def run(self) -> None:
         """Record until it is to end, and close the file whatever happens."""
@@ -201,7 +209,7 @@ class _Session:
         """Return what was recorded."""
         seconds = time.monotonic() - self._begin
         if self._full is not None:
-            written = (f'{self._recorder.size} bytes remain in {self._given.out}, '
+            written = (f'{self._recorder.size} bytes remain in {self._path}, '
                        f'which is complete but for the last {PIECE:g} s')
             written = written if self._recorder.size else 'nothing was written'
             raise DataRefused(f'{self._full.strerror}; {written}: make room, then record again')
@@ -218,12 +226,12 @@ class _Session:
         return ''
 
     def _details(self) -> dict[str, Any]:
-        return {'bytes': self._recorder.size}
+        return {'bytes': os.path.getsize(self._given.out)}
 
     def _remarks(self) -> list[str]:
         missed = sorted(self._recorder.missed) if isinstance(self._recorder, CsvRecorder) else []
         return ([f'{", ".join(missed)} came too late for a column of a log; record into .mcap '
-                 'to keep temperature, acceleration and reference from any time on.']
+                 'to keep temperature and acceleration from any time on.']
                 if missed else [])
 
 
@@ -263,8 +271,7 @@ class _PortSession(_Session):
         return self._connection.counts().lost_samples
 
     def _open(self) -> Recorder:
-        # Whether and how often a gyro sends its temperature is not known before.
-        return self._create(self._about, ('temperature_degc',))
+        return self._create(self._given.out, self._about)
 
     def _about(self) -> dict[str, str]:
         found, protocol = self._connection, self._connection.protocol
@@ -348,32 +355,56 @@ class _TopicSession(_Session):
                  'temperature': given.temperature_topic or _TOPICS['temperature']}
         if given.reference_topic:
             roles['reference'] = given.reference_topic[0]
-        self._roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
-        if len(set(self._roles.values())) < len(roles):
-            raise UsageError(f'one topic was named twice, of {", ".join(self._roles.values())}; '
+        roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
+        self._roles = {topic: role for role, topic in roles.items()}
+        if len(self._roles) < len(roles):
+            raise UsageError(f'one topic was named twice, of {", ".join(roles.values())}; '
                              f'name one each for {", ".join(roles)}')
-        self._topics = [*self._roles.values(), *given.reference_topic[1:]]
-        self._messages, self._waiting = 0, True
-        self._missing, self._known = list(self._topics), list[str]()
+        self._topics = [*self._roles, *given.reference_topic[1:]]
+        self._messages, self._samples, self._damaged, self._waiting = 0, 0, 0, True
+        self._received: set[str] = set()
+        self._other_kinds: dict[str, str] = {}
         self._unknown: dict[str, str] = {}
+        self._stamp, self._intervals = 0, Intervals()
+        # s; a message may be late, and a recording be played faster
+        self._clock = ClockSteps(ahead=10.0, behind=math.inf, back=1.0)
         super().__init__(given, stop)
-        self._log = MessageLog(
-            self._recorder if isinstance(self._recorder, CsvRecorder) else None, self._roles)
 
     @property
     def samples(self) -> int:
-        return self._log.samples or (self._messages if self._is_mcap else 0)
+        return self._samples or (self._messages if self._is_mcap else 0)
 
     @property
     def lost(self) -> int:
-        return self._log.lost
+        return self._intervals.lost
 
     def _open(self) -> Recorder:
-        # A temperature or reference that was named belongs in the file; the usual temperature
-        # may be missing.
-        return self._create(
-            lambda: about(topics='everything' if self._given.all else ', '.join(self._topics)),
-            ('temperature_degc', *(['reference'] if 'reference' in self._roles else [])))
+        """Open a recording, of which a log is made at the end."""
+        def notes() -> dict[str, str]:
+            return about(topics='everything' if self._given.all else ', '.join(self._topics))
+        if not self._is_mcap:
+            self._create(self._given.out, notes)  # to see whether it can be
+        return self._create(self._path, notes)
+
+    @property
+    def _path(self) -> str:
+        return self._given.out if self._is_mcap else f'{self._given.out}.mcap'
+
+    def run(self) -> None:
+        """Record, and write the log that was asked for; without it the recording remains."""
+        super().run()
+        if self._is_mcap or self._full:
+            return
+        if self._samples:
+            topics = {self._roles[topic]: topic for topic in self._received}
+            try:
+                if os.path.exists(self._given.out):
+                    raise LogError(f'{self._given.out}: another program has created it meanwhile')
+                write_log(self._given.out, read_recording(self._path, Topics(**topics)))
+            except (InputError, OSError) as error:
+                raise DataRefused(f'{error}; what was recorded is in {self._path}') from None
+        with suppress(FileNotFoundError):
+            os.unlink(self._path)
 
     def _take(self, tick: Callable[[], None]) -> None:
         with _prints_on_standard_error():
@@ -381,35 +412,47 @@ class _TopicSession(_Session):
                                 lambda node: self._watch(node, tick), self._stop)
 
     def _add(self, message: Message, definition: str) -> None:
+        assert isinstance(self._recorder, McapRecorder)
+        role = self._roles.get(message.topic)
+        wrong = wrong_kind(role, message.topic, message.kind) if role else ''
+        if wrong and not self._is_mcap:
+            raise LogError(wrong)
         self._messages += 1
-        self._log.add(message)
-        if isinstance(self._recorder, McapRecorder):
-            self._recorder.add_message(message, definition)
+        self._recorder.add_message(message, definition)
+        if wrong:
+            self._other_kinds[message.topic] = wrong
+        elif role:
+            self._received.add(message.topic)
+            try:
+                stamp = cdr.parse(message.data, cdr.LAYOUTS[message.kind])[0] or message.received
+            except cdr.MessageError:
+                self._damaged += 1
+                return
+            if role == 'gyro':
+                self._samples += 1
+                was_set = self._clock.watch(message.received / NSEC_PER_SEC, stamp / NSEC_PER_SEC)
+                if self._stamp and not was_set and stamp > self._stamp:
+                    self._intervals.add((stamp - self._stamp) / NSEC_PER_SEC)
+                self._stamp = stamp
 
     def _watch(self, node: Any, tick: Callable[[], None]) -> None:
         tick()
         self._unknown = node.unknown
         if self._waiting and time.monotonic() - self._begin > _PATIENCE:
             self._waiting = False
-            self._missing, self._known = node.missing, node.known()
-            if self._missing:
-                verb.say(f'no publisher so far of {", ".join(self._missing)}; '
-                         f'there are {", ".join(self._known) or "none"}')
+            if missing := node.missing:
+                verb.say(f'no publisher so far of {", ".join(missing)}; '
+                         f'there are {", ".join(node.known()) or "none"}')
 
     def _details(self) -> dict[str, Any]:
         return {**super()._details(), 'messages': self._messages}
 
     def _remarks(self) -> list[str]:
-        log, remarks = self._log, [f'{topic}: {reason}; it was not recorded.'
-                                   for topic, reason in self._unknown.items()]
-        left_out = '' if self._is_mcap else ' and were left out'
-        remarks += [f'{wrong}; it was recorded as it is.'
-                    for wrong in log.of_another_kind.values()]
-        if log.damaged:
-            remarks.append(f'{log.damaged} messages could not be read.')
-        if log.left_out:
-            remarks.append(f'{log.left_out} samples had a repeated or an earlier stamp{left_out}.')
-        if log.clock_steps:
-            remarks.append(f'The clock of the stamps was set {log.clock_steps} times; '
-                           'the log continues by the time of reception.')
-        return [*remarks, *super()._remarks()]
+        remarks = [f'{topic}: {reason}; it was not recorded.'
+                   for topic, reason in self._unknown.items()]
+        remarks += [f'{wrong}; it was recorded as it is.' for wrong in self._other_kinds.values()]
+        if self._damaged:
+            remarks.append(f'{self._damaged} messages could not be read.')
+        if self._clock.count:
+            remarks.append(f'The clock of the stamps was set {self._clock.count} times.')
+        return remarks

@@ -20,7 +20,7 @@ early.
 
 `ClockSteps` detects clocks that are set. A computer without a battery begins in the wrong year and
 is set by months when it finds a time server; then stamps jump, and nothing else has happened.
-`NodeTime` gives stamps of such a clock, `HostClock` and `MessageClock` take them to an even axis.
+`NodeTime` gives stamps of such a clock, `HostClock` takes them to an even axis.
 
 No clock is read here, except by `steady`: the caller gives the time of arrival.
 
@@ -40,7 +40,6 @@ import math
 import time
 
 from gyro_calibration.driver.protocols import Sample
-from gyro_calibration.logs.cdr import NSEC_PER_SEC
 
 _Point = tuple[float, float]
 
@@ -65,7 +64,6 @@ _SET = 0.1  # s; a clock that differs by more was set, and was not slewed
 _MIXED = 10.0  # s; after a clock was set, stamps of before and after it may come for this long
 _TOGETHER = 0.05  # s; clocks that are read with more between them are not read at one time
 _FOLLOWING = 2.0  # s; in which the difference of two clocks is followed
-_BACK, _AHEAD = 1.0, 10.0  # s; a message may be late, and a recording be played faster
 
 
 class LowerLine:
@@ -683,37 +681,3 @@ class HostClock:
         shifts = [sign * step.size for step in self._recent for sign in (1.0, -1.0)]
         return min((there, *(there + shift for shift in shifts)),
                    key=lambda each: abs(each - sample))
-
-
-class MessageClock:
-    """
-    Lets stamps of messages go on by the time of receiving where their clock was set.
-
-    Any topic may be the first to show it, and the others follow by the same step; a message that
-    is still under way then has a stamp of the old clock.
-
-    Attributes
-    ----------
-    count : how often the clock was set
-
-    """
-
-    def __init__(self) -> None:
-        self.count, self._offset = 0, 0
-        self._topics: dict[str, tuple[ClockSteps, int, int, int]] = {}
-
-    def time(self, topic: str, stamp: int, received: int) -> int:
-        """Return a stamp by the clock as it was when the recording began; all in ns."""
-        first = ClockSteps(_AHEAD, math.inf, _BACK), stamp + self._offset, received, self._offset
-        steps, last, arrival, offset = self._topics.get(topic, first)
-        even = received / NSEC_PER_SEC
-        known = (each for each in (self._offset, offset)
-                 if not steps.step(even, (stamp + each) / NSEC_PER_SEC))
-        found = next(known, None)
-        if found is None:
-            self.count += 1
-            found = self._offset = last + received - arrival - stamp
-        if stamp + found >= last:
-            steps.watch(even, (stamp + found) / NSEC_PER_SEC)
-            self._topics[topic] = steps, stamp + found, received, found
-        return stamp + found

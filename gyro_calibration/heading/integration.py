@@ -19,6 +19,7 @@ stamps: the rectangle rule is half a sample late, and a nominal interval is a sc
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from gyro_calibration.heading.gaps import FASTEST, Gaps
@@ -60,18 +61,11 @@ class ThresholdFilter:
     def __init__(self, settings: Threshold):
         """Begin with an empty window."""
         self.settings = settings
-        # The window in two parts, oldest samples last in the first one, each sample with the sums
-        # from it to the border between them: nothing is subtracted, and what has left the window
-        # leaves no rounding error in its sums.
-        self._older: list[tuple[float, float, float]] = []
-        self._newer: list[tuple[float, float]] = []
-        self._sum = self._squares = 0.0
+        self._window = deque[tuple[float, float]]()
 
     def clear(self) -> None:
         """Forget the window, as after a gap."""
-        self._older.clear()
-        self._newer.clear()
-        self._sum = self._squares = 0.0
+        self._window.clear()
 
     def filter(self, time: float, rate: float) -> float:  # noqa: A003
         """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
@@ -80,38 +74,20 @@ class ThresholdFilter:
         return 0.0 if self._stands(time, rate) else rate
 
     def _stands(self, time: float, rate: float) -> bool:
-        rate, begin = min(max(rate, -FASTEST), FASTEST), time - self.settings.window
-        self._newer.append((time, rate))
-        self._sum += rate
-        self._squares += rate * rate
-        while self._first <= begin and len(self._older) + len(self._newer) > 1:
-            if not self._older:
-                self._border()
-            self._older.pop()
-        count = len(self._older) + len(self._newer)
-        _, total, squares = self._older[-1] if self._older else (0.0, 0.0, 0.0)
-        mean = (total + self._sum) / count
+        window = self._window
+        window.append((time, min(max(rate, -FASTEST), FASTEST)))
+        while window[0][0] <= time - self.settings.window and len(window) > 1:
+            window.popleft()
+        # summed anew, so that what has left the window leaves no rounding error
+        rates = [each for _, each in window]
+        mean = sum(rates) / len(rates)
         if not abs(mean) < self.settings.rate:
             return False
         # it shakes where the window varies by more than noise would
-        explained = 9.0 * self.settings.angle_random_walk ** 2 * count
+        explained = 9.0 * self.settings.angle_random_walk ** 2 * len(rates)
         return not 0.0 < explained < (
-            ((squares + self._squares) / count - mean * mean) * (time - self._first))
-
-    @property
-    def _first(self) -> float:
-        """Return the time of the oldest sample, s."""
-        return self._older[-1][0] if self._older else self._newer[0][0]
-
-    def _border(self) -> None:
-        """Bring all samples to the older part."""
-        total = squares = 0.0
-        for time, rate in reversed(self._newer):
-            total += rate
-            squares += rate * rate
-            self._older.append((time, total, squares))
-        self._newer.clear()
-        self._sum = self._squares = 0.0
+            (sum(each * each for each in rates) / len(rates) - mean * mean)
+            * (time - window[0][0]))
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:

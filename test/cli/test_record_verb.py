@@ -404,12 +404,13 @@ def test_a_log_and_a_recording_of_the_same_topics_hold_the_same(
     count = robot.drive()
     wait_until(robot.is_received, 60.0, 'the last message')
     # a busy machine takes them later, and a recorder that is stopped takes them for 10 s
-    wait_until(lambda: holds(tmp_path / 'a.csv', count - 200)
+    wait_until(lambda: holds(tmp_path / 'a.csv.mcap', count - 200)
                and holds(tmp_path / 'a.mcap', count - 200), 120.0, 'nearly all of them')
     answers = [each.end(signal.SIGINT) for each in both]
     for code, out, error in answers:
         assert (code == 0
                 and (json.loads(out)['samples'], json.loads(out)['lost']) == (count, 0)), error
+    assert not (tmp_path / 'a.csv.mcap').exists()
     log, recording = read(tmp_path / 'a.csv'), read(tmp_path / 'a.mcap', reference='odom')
     for name in ('output', 'time', 'temperature', 'reference_rate'):
         np.testing.assert_array_equal(getattr(log, name), getattr(recording, name), name)
@@ -481,7 +482,7 @@ def test_a_log_of_a_topic_of_another_kind_is_refused(ros, record, wait_until, tm
     code, out, error = recording.end()
     assert ((code, out) == (2, '')
             and '/odom is nav_msgs/msg/Odometry; --topic wants sensor_msgs/msg/Imu' in error)
-    assert not (tmp_path / 'a.csv').exists()
+    assert not list(tmp_path.glob('a.csv*'))
 
 
 @pytest.mark.parametrize(('topic', 'domain', 'sentence'), [
@@ -518,7 +519,7 @@ def test_topics_without_a_publisher_are_reported(ros_domain, record, tmp_path):
     code, out, error = record('record', '--out', tmp_path / 'a.csv', '--seconds', 2).end()
     assert (code, out) == (1, '')
     assert 'no sample was received in' in error and 'ROS_DOMAIN_ID' in error
-    assert not (tmp_path / 'a.csv').exists()
+    assert not list(tmp_path.glob('a.csv*'))
 
 
 def test_without_ros_the_remedy_is_reported(run, tmp_path, monkeypatch):
