@@ -175,7 +175,7 @@ def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
 
     Returns
     -------
-    the version that was written, as `version` returns it as long as nobody else writes
+    the version that was written, as `version` returns it as long as no other program writes
 
     Raises
     ------
@@ -216,7 +216,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     path, temporary = Path(path), None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        old = replaceable(path)
+        old = _replaceable(path)
         remove_leftovers(path)
         # only its owner may read it, as may be so of the old file; a new one gets what the umask
         # leaves
@@ -256,7 +256,7 @@ def _created(path: Path, mode: int) -> tuple[int, str]:
         os.close(handle)  # another writer took it for a leftover before it was locked
 
 
-def replaceable(path: str | Path) -> os.stat_result | None:
+def _replaceable(path: str | Path) -> os.stat_result | None:
     """
     Return the status of a regular file that is to be replaced; None for a new file or a link.
 

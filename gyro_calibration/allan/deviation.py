@@ -48,7 +48,7 @@ from scipy.stats import pearsonr
 #: The least number of samples for a noise figure.
 FEWEST = 100
 #: Largest share of lost samples in a window; the variance of its mean changes by at most as much.
-LOST_SHARE = 0.01
+_LOST_SHARE = 0.01
 #: At least so many spans show whether a reference turns with the output: it does if most of the
 #: variance is common to both, and is so by chance at rest with at most this probability.
 _SPANS, _FOLLOWS = 8, 1e-4
@@ -92,14 +92,14 @@ def even_record(time: Array, output: Array, moving: Array | None = None,
         lost, or motion
 
     """
-    refuse_few(len(output))
+    _refuse_few(len(output))
     known = np.isfinite(output) if moving is None else np.isfinite(output) & (moving == 0.0)
     _refuse_dead(time[known], output[known])
     stamps = number_stamps(time)
     rate = np.full(int(stamps.number[-1]) + 1, np.nan)
     rate[stamps.number[known]] = output[known]
     remarks = [*stamps.burst_remarks,
-               *(f'{remark} Windows with more than {100 * LOST_SHARE:g} % lost are not used.'
+               *(f'{remark} Windows with more than {100 * _LOST_SHARE:g} % lost are not used.'
                  for remark in stamps.loss_remarks)]
     left_out = int(np.count_nonzero(~known))
     if left_out:
@@ -121,7 +121,7 @@ def even_record(time: Array, output: Array, moving: Array | None = None,
     return Record(rate, stamps.interval, tuple(remarks))
 
 
-def refuse_few(count: int, samples: str = 'samples') -> None:
+def _refuse_few(count: int, samples: str = 'samples') -> None:
     """Refuse fewer samples than a noise figure needs."""
     if count < FEWEST:
         raise DataRefused(f'{count} {samples}; an Allan deviation needs at least {FEWEST}: '
@@ -150,7 +150,7 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
 
 def _refuse_dead(time: Array, output: Array) -> None:
     """Refuse an output that stays the same for a tenth of the record."""
-    refuse_few(len(output), 'samples at rest with an output')
+    _refuse_few(len(output), 'samples at rest with an output')
     changes = np.nonzero(np.concatenate([[True], np.diff(output) != 0.0, [True]]))[0]
     longest = int(np.argmax(np.diff(changes)))
     count = int(np.diff(changes)[longest])
@@ -187,7 +187,7 @@ def _scale(values: Array) -> float:
 
 def _refuse_motion(rate: Array, stamps: Stamps) -> None:
     """Refuse a record whose means change by more than noise; give the place and longest rest."""
-    angle, lost = angle_of(rate), lost_before(rate)
+    angle, lost = angle_of(rate), _lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / LONG)), 0))):
         # changes of the mean over `size` samples, times `size`
@@ -246,7 +246,7 @@ def _filled(rate: Array) -> Array:
     return values
 
 
-def lost_before(rate: Array) -> Integers | None:
+def _lost_before(rate: Array) -> Integers | None:
     """Return how many samples are lost before each one, shape (n + 1,), or None without losses."""
     lost = np.isnan(rate)
     return np.concatenate([[0], np.cumsum(lost)]) if lost.any() else None
@@ -256,11 +256,11 @@ def whole(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mas
     """
     Return which second differences over `size` samples, from `begin` to `end`, miss few samples.
 
-    `lost` is the result of `lost_before`.
+    `lost` is the result of `_lost_before`.
 
     """
     return np.asarray(lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step]
-                      <= LOST_SHARE * 2 * size)
+                      <= _LOST_SHARE * 2 * size)
 
 
 #: Samples in a block: its few arrays stay in the cache for all averaging times.
@@ -359,7 +359,7 @@ def allan_deviation(rate: Array, interval: float,
     DataRefused : too few samples, or an averaging time that does not fit twice into the record
 
     """
-    refuse_few(int(np.isfinite(rate).sum()))
+    _refuse_few(int(np.isfinite(rate).sum()))
     samples = len(rate)
     if times is None:
         sizes = averaging_sizes(samples)
@@ -387,7 +387,7 @@ def allan_deviation(rate: Array, interval: float,
 
 def _square_sums(rate: Array, sizes: Integers) -> tuple[Array, Integers]:
     """Return the sums of the squared second differences of the angle, and their numbers."""
-    angle, lost = angle_of(rate), lost_before(rate)
+    angle, lost = angle_of(rate), _lost_before(rate)
     twice, buffer = 2.0 * angle, np.empty(_BLOCK)
     sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
     for begin in range(0, len(angle), _BLOCK):

@@ -69,7 +69,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                       'instead; default: 3,2')
     parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='technology of the gyro; '
                         'selects between effects that the data do not distinguish, and the prior '
-                        'beside a reference heading (default there: mems)')
+                        'with a reference heading (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
                         help='name of the gyro, stored in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')

@@ -35,7 +35,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
-#: Lines that are told apart without colour.
+#: Lines that are distinguished without colour.
 _STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
 #: Of values with a sign, symmetric about zero, and of others; both are read by the colour-blind.
 _DIVERGING, _SEQUENTIAL = 'RdBu_r', 'cividis'

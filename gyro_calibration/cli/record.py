@@ -47,7 +47,7 @@ from gyro_calibration.logs.recording import read_recording, Topics, wrong_kind
 from gyro_calibration.logs.ros_bag import Message
 from tqdm import tqdm
 
-Recorder = CsvRecorder | McapRecorder
+_Recorder = CsvRecorder | McapRecorder
 
 _TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _INCREMENTS = {'always': True, 'never': False, 'default': None}
@@ -154,7 +154,7 @@ class _Session:
         self._is_mcap = bool(given.out.endswith('.mcap'))
         self._begin = self._flushed = time.monotonic()
         self._full: DiskFull | None = None
-        self._recorder: Recorder = self._open()
+        self._recorder: _Recorder = self._open()
 
     @property
     def samples(self) -> int:
@@ -171,14 +171,14 @@ class _Session:
         """The file that grows."""
         return str(self._given.out)
 
-    def _open(self) -> Recorder:
+    def _open(self) -> _Recorder:
         raise NotImplementedError
 
     def _take(self, tick: Callable[[], None]) -> None:
         raise NotImplementedError
 
     @staticmethod
-    def _create(path: str, notes: Notes) -> Recorder:
+    def _create(path: str, notes: Notes) -> _Recorder:
         try:
             return (McapRecorder if path.endswith('.mcap') else CsvRecorder)(path, notes)
         except FileExistsError:
@@ -270,7 +270,7 @@ class _PortSession(_Session):
     def lost(self) -> int:
         return self._connection.counts().lost_samples
 
-    def _open(self) -> Recorder:
+    def _open(self) -> _Recorder:
         return self._create(self._given.out, self._about)
 
     def _about(self) -> dict[str, str]:
@@ -378,7 +378,7 @@ class _TopicSession(_Session):
     def lost(self) -> int:
         return self._intervals.lost
 
-    def _open(self) -> Recorder:
+    def _open(self) -> _Recorder:
         """Open a recording, of which a log is made at the end."""
         def notes() -> dict[str, str]:
             return about(topics='everything' if self._given.all else ', '.join(self._topics))

@@ -87,7 +87,7 @@ def bar(items: Iterable[Any], what: str, total: int | None = None) -> Iterable[A
 
 
 @contextmanager
-def bytes_of(path: str) -> Iterator[Callable[[int], object]]:
+def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
     """Show on a terminal how many bytes of a log are read, and give the function that counts."""
     size = sum(os.path.getsize(file) for file in files_of(path) if os.path.isfile(file)) or None
     with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=DELAY, leave=False,
@@ -230,7 +230,7 @@ def _picture_file(text: str) -> str:
 
 def read(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, as its options say."""
-    with bytes_of(given.log) as on_progress:
+    with _bytes_of(given.log) as on_progress:
         if is_recording(given.log):
             topics = Topics(given.topic, given.reference_topic, given.temperature_topic,
                             given.axis)
@@ -296,7 +296,7 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     if is_recording(given.log) or given.unwrap:
         yield from blocks_of(read(given))
         return
-    with bytes_of(given.log) as on_progress:
+    with _bytes_of(given.log) as on_progress:
         blocks = read_log_blocks(given.log, sensitivity(given), given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _inside(given, blocks):

@@ -144,7 +144,7 @@ class Emulator:
         self._stop.set()
 
     def close(self) -> None:
-        """Unplug the gyro: its reader sees that the port is gone."""
+        """Unplug the gyro: its reader sees that the port is closed."""
         link = self.link
         if link is not None and link.is_symlink() and os.readlink(link) == self.path:
             link.unlink()

@@ -102,7 +102,7 @@ def slow_effects(log: Log, time_offset: float = 0.0, names: Collection[str] | No
             if math.isfinite(each['deviation']) and each['deviation'] > 0.0}
 
 
-def rest_bias(log: Log) -> tuple[float, float]:
+def _rest_bias(log: Log) -> tuple[float, float]:
     """
     Return the bias of a log at rest, rad/s, and its standard deviation with the wander.
 
@@ -314,7 +314,7 @@ def calibrate(log: Log, technology: str = 'mems'
         return found.method, found.model, offset
     refuse(log)
     if log.time is not None and rests(log):
-        bias, deviation = rest_bias(log)
+        bias, deviation = _rest_bias(log)
         walk = white_noise(log.output, order=1) * math.sqrt(float(np.median(np.diff(log.time))))
         return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
                                  noise=Noise(angle_random_walk=walk)), {}

@@ -54,9 +54,9 @@ ENTRIES = 80
 #: What a rest is averaged over, s, as far as flicker asks for it.
 DURATION = 10.0
 #: An estimate further off than so many standard deviations does not belong to the others.
-FAR = 4.5
+_FAR = 4.5
 #: So many estimates in a row that are off, and agree, are a jump.
-IN_A_ROW = 3
+_IN_A_ROW = 3
 #: Shortest time between two writes, s.
 INTERVAL = 600.0
 _YEAR = 365.25 * 86400.0
@@ -217,28 +217,29 @@ class BiasTable:
             return (f'a bias of {bias:g} rad/s at {temperature:g} degC with a variance of '
                     f'{variance:g} at {time:g} s is not used: that is beyond what a gyro has')
         before, known = self.predict(temperature, time)
-        if abs(bias - before) <= FAR * math.sqrt(known + variance):
+        if abs(bias - before) <= _FAR * math.sqrt(known + variance):
             self._held.clear()
             self._take(given)
             return ''
         self._held = [*(each for each in self._held if self._agree(each, given)), given]
         off = (f'{(bias - before) / DEGREE:.4f} deg/s off what is known at '
                f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
-        if len(self._held) < IN_A_ROW:
+        if len(self._held) < _IN_A_ROW:
             self.held_back += 1
             return f'a bias that is {off} is not used: check whether the robot turned slowly'
         self._jump((bias - before) ** 2)
-        return f'the bias jumped: {IN_A_ROW} rests in a row are {off}; earlier entries are shifted'
+        return (f'the bias jumped: {_IN_A_ROW} rests in a row are {off}; earlier entries are '
+                'shifted')
 
     def _agree(self, held: Entry, given: Entry) -> bool:
         variance = (held.variance + given.variance + self._wander(given.time - held.time)
                     + self._prior.coefficient ** 2
                     * _spread(given.temperature - held.temperature, self._prior.length))
-        return abs(given.bias - held.bias) <= FAR * math.sqrt(variance)
+        return abs(given.bias - held.bias) <= _FAR * math.sqrt(variance)
 
     def _jump(self, variance: float) -> None:
         """Let the curve step, and take what was held back for it."""
-        self.held_back -= IN_A_ROW - 1
+        self.held_back -= _IN_A_ROW - 1
         self.run += 1
         self.jumps.append(Jump(self.run, variance, self._held[0].time))
         if len(self.jumps) > ENTRIES:

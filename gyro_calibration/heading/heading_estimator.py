@@ -217,7 +217,7 @@ class HeadingEstimator:
         self._begun = now
         self._anchor(now)
         self._unknown_since = self._time if fresh and not self._anchored else math.inf
-        self._shift, self._astray, self._other_age = 0.0, 0.0, False
+        self._shift, self._unseen_distance, self._other_age = 0.0, 0.0, False
         self._sensitivity: Array = np.zeros(len(self.covariance))
         self._still: Array = self._sensitivity
         self._still_at, self._looked = -math.inf, (-math.inf, 0.0)
@@ -244,8 +244,8 @@ class HeadingEstimator:
         here = compensate(self.used, 0.0, self.temperature, around).modelled
         before = None if around is None else replace(around, temperature=self.last.temperature)
         held = compensate(self.used, 0.0, self.last.temperature, before).modelled
-        self._shift, self._astray = (float(here) - float(held),
-                                     _drifted_unseen(self._time - self._unknown_since))
+        self._shift = float(here) - float(held)
+        self._unseen_distance = _drifted_unseen(self._time - self._unknown_since)
         self._anchor(now)
 
     def _carried(self, now: float) -> tuple[GyroModel, float | None]:
@@ -428,7 +428,7 @@ class HeadingEstimator:
         change, distance = self._correction.at(self.temperature)
         late = abs(time - self._temperature_time) - self._timeout
         return (self._shift + change,
-                self._astray + distance + math.copysign(_drifted_unseen(late), distance))
+                self._unseen_distance + distance + math.copysign(_drifted_unseen(late), distance))
 
     def _look_around(self, interval: float, force: float | None,
                      supply: float | None) -> Channels:
@@ -521,7 +521,7 @@ class HeadingEstimator:
         if temperature is not None:
             self.temperature, self._temperature_time = float(temperature[-1]), self._time
             change += self._shift
-            distance += self._astray
+            distance += self._unseen_distance
             if self._correction is not None:
                 changed, far = self._correction.along(temperature)
                 change, distance = change + changed, distance + far

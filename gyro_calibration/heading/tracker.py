@@ -508,10 +508,10 @@ class HeadingTracker:
 
     def _end_block(self, driven: bool, wheels: bool | None) -> None:
         quiet = self._energy.add(self._block)
-        self._judge(False if driven else quiet, driven or wheels)
+        self._decide(False if driven else quiet, driven or wheels)
         self._block, self._driven = Block(), False
 
-    def _judge(self, quiet: bool | None, wheels: bool | None) -> None:
+    def _decide(self, quiet: bool | None, wheels: bool | None) -> None:
         """Decide at the end of a block; one that may still be a rest ends none."""
         part, self._part, self._known = self._part, self._none(), None
         self._open += part

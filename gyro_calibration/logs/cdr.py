@@ -208,8 +208,8 @@ def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
 
 #: Kind -> layout, of an Imu about and along z.
 LAYOUTS: Mapping[str, Layout] = {kind: layout_of(text) for kind, text in DEFINITIONS.items()}
-#: Places of quantities among the numbers of an Imu, whose quaternion x, y, z, w comes first.
-ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z, FORCE_COVARIANCE = LAYOUTS[IMU].kept[4:]
+#: Place of the rate among the numbers of an Imu.
+RATE_Z = LAYOUTS[IMU].quantities['rate']
 
 
 @cache

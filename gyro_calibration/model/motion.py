@@ -130,7 +130,7 @@ def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
 #: and back to the first heading.
 CALIBRATION = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30),
                      (1, 0)])
-#: 160 s of a robot on its way through rooms, half of it standing or going straight.
+#: 160 s of a robot on its way through a building, half of it standing or going straight.
 ROBOT = turns([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10), (6, 0), (9.5, 10),
                (6, 0), (5, 20), (8, 0), (5, -20), (7, 0), (5, -20), (8, 0), (5, 20), (7, 0),
                (9.5, 10), (6, 0), (9.5, -10), (8, 0), (9, 0)])

@@ -12,7 +12,7 @@
 The part of a gyro model that robot simulators can hold, in their own formats.
 
 Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from a Python configuration, MuJoCo from
-a `<gyro>` sensor. Each holds a few figures; what it cannot hold is listed, so that nobody takes
+a `<gyro>` sensor. Each holds a few figures; what it cannot hold is listed, so that no one takes
 the simulated gyro for the modelled one.
 
 """

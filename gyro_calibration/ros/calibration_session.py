@@ -63,7 +63,7 @@ import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
 #: Length of a calibration of the bias alone, s.
-REST_DURATION = 15.0
+_REST_DURATION = 15.0
 #: After whole turns are finished the robot rests for this time, s.
 MARKED = 2.5
 #: A run that waits for `finish` ends after this time, s.
@@ -71,7 +71,7 @@ LONGEST = 600.0
 #: A run that does not drive the robot ends after this time without a sample, s.
 SILENCE = 5.0
 #: A robot is driven on for this time, s, or this number of intervals, after the last sample.
-BLIND, BLIND_INTERVALS = 0.25, 4.0
+BLIND, _BLIND_INTERVALS = 0.25, 4.0
 #: Another node must receive the commands within this time, s; discovery may take 3 s.
 DISCOVERY = 5.0
 #: After the last command the robot may turn on for this time, s: latency and deceleration.
@@ -179,20 +179,18 @@ class Rules:
     ----------
     limits, odometry : of any run; how accurate the odometry is
     turns : whole turns; 0 takes the number that the gyro shows
-    check : whether a rest after the run decides
 
     """
 
     limits: Limits = Limits()
     odometry: Reference = Reference()
     turns: int = 0
-    check: bool = True
 
     def after(self, kind: str) -> float:
         """Return how long samples are wanted after the motion, s."""
         if kind in (TURNS, REST):
             return MARKED if kind == TURNS else 0.0
-        return self.limits.time_offset + (SETTLED + self.limits.rest if self.check else 0.0)
+        return self.limits.time_offset + SETTLED + self.limits.rest
 
 
 def rules(values: SimpleNamespace) -> Rules:
@@ -370,7 +368,7 @@ class CalibrationSession:
                 return str(error)
             duration = motion.duration
         elif kind != ODOMETRY:
-            duration = REST_DURATION if kind == REST else math.inf
+            duration = _REST_DURATION if kind == REST else math.inf
         drives = motion is not None and values.calibration_drive
         if drives and motion is not None:
             fastest, limit = _fastest(motion), self._estimator.used.rate_limit
@@ -390,7 +388,7 @@ class CalibrationSession:
         return ''
 
     def _blind(self) -> float:
-        usual = BLIND_INTERVALS * self._estimator.tracker.intervals.usual
+        usual = _BLIND_INTERVALS * self._estimator.tracker.intervals.usual
         return min(max(BLIND, usual), self._rules.limits.gap)
 
     # What comes in
@@ -653,14 +651,13 @@ def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion,
     remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
     if fit.goodness:
         remarks.append(str(fit.goodness))
-    if rules.check:
-        # After odometry the robot may drive on; a profile ends at rest.
-        begin = motion.duration + max(fit.time_offset, 0.0) + SETTLED
-        after = rest_after(time, rate, fit, motion, limits) if odometry else time > begin
-        if after is not None:
-            rest = check_rest(time[after], rate[after], fit, noise, limits)
-            fit = rest.fit
-            remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, limit '
-                           f'{rest.limit / DEGREE:.4f} deg/s')
+    # After odometry the robot may drive on; a profile ends at rest.
+    begin = motion.duration + max(fit.time_offset, 0.0) + SETTLED
+    after = rest_after(time, rate, fit, motion, limits) if odometry else time > begin
+    if after is not None:
+        rest = check_rest(time[after], rate[after], fit, noise, limits)
+        fit = rest.fit
+        remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, limit '
+                       f'{rest.limit / DEGREE:.4f} deg/s')
     method = 'odometry' if odometry else 'likelihood'
     return record(fit, method, when, run.temperature), '; '.join(remarks)

@@ -18,6 +18,7 @@ Corrected rates and the heading on a robot: joins `pipeline` to topics, services
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import math
 import os
 from pathlib import Path
@@ -115,11 +116,14 @@ class CompensationNode(Node):
         self._connect()
         self._report = CompensationReport(self._pipeline, clock)
         self._diagnostics = Diagnostics(self, 'heading', lambda: self._report.make())
-        for name, callback in (
-                ('calibrate', self._on_calibrate), ('calibrate_bias', self._on_calibrate_bias),
-                ('finish_calibration', self._on_finish), ('cancel_calibration', self._on_cancel),
-                ('reset_heading', self._on_reset)):
-            answer_later(self.create_service(Trigger, f'~/{name}', callback))
+        session = self._pipeline.session
+        self._offer('calibrate',
+                    lambda answer: self._calibrate(self._values.calibration_reference, answer))
+        self._offer('calibrate_bias', lambda answer: self._calibrate(REST, answer))
+        self._offer('finish_calibration', lambda answer: self._fill(answer, *session.finish()))
+        self._offer('cancel_calibration', self._cancel)
+        self._offer('reset_heading',
+                    lambda answer: self._fill(answer, True, self._pipeline.reset()))
         # Each timer, also a cancelled one, costs time at every sample: one for all.
         self._watched = 0
         call_every(self, _WATCH_INTERVAL, self._watch)
@@ -152,6 +156,11 @@ class CompensationNode(Node):
         subscribe_to(self, TwistStamped if self._stamped else Twist, 'cmd_vel', self._on_command)
         if self._values.calibration_drive:
             self._learn_to_drive()  # where it cannot, calibrate reports it
+
+    def _offer(self, name: str,
+               fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
+        answer_later(self.create_service(
+            Trigger, f'~/{name}', lambda _, response: fill(response)))
 
     def _set(self, values: SimpleNamespace) -> None:
         self._values = values
@@ -251,14 +260,6 @@ class CompensationNode(Node):
 
     # Services
 
-    def _on_calibrate(self, _: Trigger.Request,
-                      response: Trigger.Response) -> Trigger.Response | Future:
-        return self._calibrate(self._values.calibration_reference, response)
-
-    def _on_calibrate_bias(self, _: Trigger.Request,
-                           response: Trigger.Response) -> Trigger.Response | Future:
-        return self._calibrate(REST, response)
-
     def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
         """Begin a run, which `_answer_ended` answers; or change nothing and say why."""
         session = self._pipeline.session
@@ -282,18 +283,17 @@ class CompensationNode(Node):
             self.destroy_timer(self._timer)
         (response, future), self._waiting, self._timer = self._waiting, None, None
         success, message = session.conclude()
-        answer = self._fill if success else self._refuse
         self._show_status()
-        future.set_result(answer(response, message))
+        future.set_result(self._fill(response, True, message) if success
+                          else self._refuse(response, message))
 
     def _refuse(self, response: Trigger.Response, reason: str) -> Trigger.Response:
         journal = self._pipeline.journal
         journal.refused += 1
         journal.reasons.append(reason)
-        return self._fill(response, reason, False)
+        return self._fill(response, False, reason)
 
-    def _fill(self, response: Trigger.Response, text: str,
-              success: bool = True) -> Trigger.Response:
+    def _fill(self, response: Trigger.Response, success: bool, text: str) -> Trigger.Response:
         response.success, response.message = success, text if success else f'refused: {text}'
         self._pipeline.journal.event = response.message
         if success:  # rclpy wants each severity on a line of its own
@@ -302,17 +302,10 @@ class CompensationNode(Node):
             self.get_logger().warning(response.message)
         return response
 
-    def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        success, text = self._pipeline.session.finish()
-        return self._fill(response, text, success)
-
-    def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _cancel(self, response: Trigger.Response) -> Trigger.Response:
         success, text = self._pipeline.session.cancel()
         self._answer_ended()
-        return self._fill(response, text, success)
-
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._fill(response, self._pipeline.reset())
+        return self._fill(response, success, text)
 
     # Driving
 

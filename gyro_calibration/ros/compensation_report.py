@@ -57,7 +57,7 @@ class CompensationReport:
         pipeline = self._pipeline
         silent = self._clock.steady() - pipeline.journal.received
         if error := (pipeline.store.problem or pipeline.conflict or pipeline.several
-                     or pipeline.stuck):
+                     or pipeline.repeats):
             return ERROR, error
         if pipeline.ros_time.standing > max(BLIND, 1.0):
             return ERROR, STANDING_TIME

@@ -37,18 +37,18 @@ STRETCH, _PART, _BLOCK = 10.0, 1.0, 0.05
 #: Longest interval between samples, s.
 _GAP = 0.5
 #: Noise up to this many times the model's is accepted: figures are inexact and change with age.
-TOLERANCE = 1.25
+_TOLERANCE = 1.25
 #: Noise down to the model's divided by this is accepted: a gyro that filters its output has less
 #: noise in neighbouring blocks.
-QUIET = 3.0
+_QUIET = 3.0
 #: Limit of the variance of parts over the one that noise explains; with 9 degrees of freedom
 #: chance exceeds it once in a million stretches.
 _STEADY = 6.0
 #: Chance that a calibration is falsely reported to differ from the one before.
 CHANCE = 1e-3
-#: A value that comes so often, and for so long, s, is stuck: a gyro whose noise is QUIET times
+#: A value that comes so often, and for so long, s, is repeated: a gyro whose noise is _QUIET times
 #: less than that of the model, and 2 steps of its output, repeats a value with a chance of 0.2.
-_REPEATS, _STUCK = 20, 0.25
+_REPEATS, _REPEATED = 20, 0.25
 #: So many changes show the step of an output.
 _CHANGES = 100
 #: Odometry shows a turn from this rate on, rad/s.
@@ -87,9 +87,9 @@ class Rest:
     announced: bool
 
 
-class StuckOutput:
+class RepeatedOutput:
     """
-    Find out whether a gyro repeats one value: it is dead, saturated, or its driver stands.
+    Find out whether a gyro repeats one value: it is dead, saturated, or its driver has stopped.
 
     That is so where odometry shows another turn, and where its noise is larger than the steps of
     its output; apart from a value of zero, which some gyros report at rest.
@@ -103,7 +103,7 @@ class StuckOutput:
 
     def add(self, time: float, output: float, turning: float) -> bool:
         """
-        Take a sample; tell whether it is stuck.
+        Take a sample; tell whether it is repeated.
 
         Parameters
         ----------
@@ -118,13 +118,13 @@ class StuckOutput:
             return False
         self._count += 1
         lasts = time - self._since
-        if self._count < _REPEATS or lasts < _STUCK:
+        if self._count < _REPEATS or lasts < _REPEATED:
             return False
         if lasts > _PART and abs(turning) > _TURNS and abs(output - turning) > 0.5 * abs(turning):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
         return (output != 0.0 and self._changes > _CHANGES
-                and 2.0 * QUIET * self._step < sample)
+                and 2.0 * _QUIET * self._step < sample)
 
 
 class HealthMonitor:
@@ -286,8 +286,8 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     if not _steady(time, rate, largest * size * interval, noise):
         return None
     count = len(squares)
-    too_much = chdtrc(count, count * measured / ((claimed + rounding) * TOLERANCE ** 2)) < level
-    too_little = not hidden and chdtr(count, count * measured * QUIET ** 2 / claimed) < level
+    too_much = chdtrc(count, count * measured / ((claimed + rounding) * _TOLERANCE ** 2)) < level
+    too_little = not hidden and chdtr(count, count * measured * _QUIET ** 2 / claimed) < level
     return Rest(float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
                 *_bias(time, rate, largest * size * interval, noise, level, bias_variance, age,
                        0.5 * step if hidden else 0.0), announced)

@@ -42,7 +42,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import BLIND, CalibrationSession, REST, STANDING_TIME
 from gyro_calibration.ros.clock import Clock, RosTime, StampDelay
-from gyro_calibration.ros.health_monitor import HealthMonitor, StuckOutput
+from gyro_calibration.ros.health_monitor import HealthMonitor, RepeatedOutput
 from gyro_calibration.ros.parameters import Parameter
 from gyro_calibration.ros.state_store import StateStore
 from gyro_calibration.ros.wheels import COMMAND, FRESH, ODOMETRY, Velocity, Wheels
@@ -50,7 +50,7 @@ from gyro_calibration.ros.wheels import COMMAND, FRESH, ODOMETRY, Velocity, Whee
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
     Parameter('calibration_file', '',
-              'Where self-calibrations are kept, and beside it biases at rest; empty for a file '
+              'Where self-calibrations are kept, and next to it biases at rest; empty for a file '
               'in ROS_HOME named after the node.'),
     Parameter('heading_frame', 'odom', 'Fixed frame in which the heading is given.'),
     Parameter('wheels', 'none', 'What shows the tracker whether the robot moves.',
@@ -89,11 +89,11 @@ PARAMETERS = (
 )
 
 #: Rests taken for motion, in an hour at rest, 1/h.
-REST_FALSE_ALARMS = 0.1
+_REST_FALSE_ALARMS = 0.1
 #: False alarms of the monitor of noise and bias, in an hour at rest, 1/h.
-HEALTH_FALSE_ALARMS = 0.001
+_HEALTH_FALSE_ALARMS = 0.001
 #: A gyro that was silent for this time, s, may have been without power, with another bias since.
-POWER_OFF = 10.0
+_POWER_OFF = 10.0
 #: The mean rate over this time shows whether a robot turns that is to be driven, s.
 _LOOKED_BACK = 0.5
 #: A mean rate is a turn from this number of standard deviations of the bias on.
@@ -156,11 +156,11 @@ class Journal:
     channels: set[str] = field(default_factory=set)
 
 
-def tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
+def _tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
     """Return how the heading is tracked; without known noise the threshold filter finds rests."""
     rate = 0.0 if values.stationary_method == 'none' else values.stationary_threshold
     threshold = Threshold(rate, angle_random_walk=noise.angle_random_walk)
-    alarms = REST_FALSE_ALARMS if values.stationary_method == 'rest' else 0.0
+    alarms = _REST_FALSE_ALARMS if values.stationary_method == 'rest' else 0.0
     return Settings(alarms, threshold, values.maximum_gap)
 
 
@@ -174,7 +174,7 @@ class Pipeline:
     store, estimator, monitor, wheels, session, journal, ros_time : its parts
     conflict : why the samples cannot be used, in a sentence; ''
     several : the same for publishers that are there, of which perhaps one alone sends; ''
-    stuck : that the gyro repeats one value, in a sentence; ''
+    repeats : that the gyro repeats one value, in a sentence; ''
     pace : that the stamps of samples leave the clock, in a sentence; ''
     odometry_fault : why odometry is not taken for a standstill, in a sentence; ''
 
@@ -200,10 +200,10 @@ class Pipeline:
         prior = Prior(coefficient=values.assumed_bias_temperature_coefficient)
         self.store = store = StateStore(values.model_file, calibration_file, biases, prior)
         noise = store.model.noise
-        self._tracking = tracker_settings(values, noise)
+        self._tracking = _tracker_settings(values, noise)
         self.estimator = HeadingEstimator(store.model, store.table, self._assumed,
                                           self._tracking, TEMPERATURE_TIMEOUT, clock.date())
-        self.monitor = HealthMonitor(noise, HEALTH_FALSE_ALARMS, self._tracking.threshold.rate)
+        self.monitor = HealthMonitor(noise, _HEALTH_FALSE_ALARMS, self._tracking.threshold.rate)
         self.wheels, self.journal = Wheels(), Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host = RosTime(), HostClock()
@@ -221,8 +221,8 @@ class Pipeline:
         self._good = 0.0, 0.0
         # When samples with a repeated stamp began, s, and the fastest rate among them, rad/s.
         self._standing: tuple[float, float] | None = None
-        self.stuck, self._repeats = '', StuckOutput(noise)
-        self.pace, self._astray, self._stamps = '', '', StampDelay(clock, _INTERLEAVED)
+        self.repeats, self._repeated = '', RepeatedOutput(noise)
+        self.pace, self._pace_fault, self._stamps = '', '', StampDelay(clock, _INTERLEAVED)
         self._suspect = math.nan  # a temperature, degC
         # What odometry's heading was when its rate became zero, rad, and when both differed, s.
         self._stood, self._contradicted = math.nan, -math.inf
@@ -395,8 +395,8 @@ class Pipeline:
     def _was_silent(self, time: float, now: float) -> bool:
         """Tell whether the gyro may have been without power, and samples did not only wait."""
         since = time - self._last
-        silent = now - self.journal.received > POWER_OFF
-        return silent and since < math.inf and not 0.0 < since < POWER_OFF
+        silent = now - self.journal.received > _POWER_OFF
+        return silent and since < math.inf and not 0.0 < since < _POWER_OFF
 
     def _use(self, stamp: int, time: float, since: tuple[float, float], output: float,
              force: float | None, now: float, receivers: int) -> Output | None:
@@ -459,15 +459,15 @@ class Pipeline:
 
     def _look_for_repeats(self, time: float, output: float, now: float) -> None:
         """Take a turn for unknown while the gyro repeats one value."""
-        if not self._repeats.add(time, output, self.wheels.turning(now)):
-            self.stuck = ''
-        elif not self.stuck:
-            self.stuck = (f'the gyro reports {output:g} rad/s again and again: it is dead, '
-                          'saturated, or its driver stands')
-            self.journal.event = self.stuck
+        if not self._repeated.add(time, output, self.wheels.turning(now)):
+            self.repeats = ''
+        elif not self.repeats:
+            self.repeats = (f'the gyro reports {output:g} rad/s again and again: it is dead, '
+                            'saturated, or its driver stands')
+            self.journal.event = self.repeats
             self._add_unknown_turn(math.tau)
             if self.session.drives:
-                self.session.end(self.stuck)
+                self.session.end(self.repeats)
 
     @property
     def _sources(self) -> tuple[str, ...]:
@@ -550,7 +550,7 @@ class Pipeline:
     def set(self, values: SimpleNamespace) -> None:  # noqa: A003
         """Continue with other values of the parameters."""
         self.values = values
-        tracking = tracker_settings(values, self.store.model.noise)
+        tracking = _tracker_settings(values, self.store.model.noise)
         if tracking != self._tracking:
             self._tracking = tracking
             self.estimator.set(tracking)
@@ -568,8 +568,8 @@ class Pipeline:
         if not self.simulated:
             self._look_at_host_clock()
         # Twice in a row: samples that were held up come at once, and are late until they have.
-        before, self._astray = self._astray, self._stamps.fault()
-        self.pace = before and self._astray
+        before, self._pace_fault = self._pace_fault, self._stamps.fault()
+        self.pace = before and self._pace_fault
         date = self._clock.date()
         if event := self.estimator.learn(date, ending):
             self.journal.event = event

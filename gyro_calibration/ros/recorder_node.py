@@ -107,22 +107,18 @@ class RecorderNode(Node):
                 return
             self.destroy_subscription(before[1])
         try:
-            definition = definition_of(kind)
+            definition = _definition_of(kind)
         except (ImportError, AttributeError) as error:
             self.unknown[topic] = f'{kind} is not installed here ({error})'
             return
-        subscription = self.create_subscription(load(kind), topic,
-                                                self._taker(topic, kind, definition), quality,
-                                                raw=True)
-        self._subscriptions_of[topic] = offered, subscription
 
-    def _taker(self, topic: str, kind: str, definition: str) -> Callable[[bytes], None]:
         # By the steady clock: the time of receipt must not jump when the clock is set.
         def take(data: bytes) -> None:
             self.taken += 1
             self._take(Message(topic, kind, self._begin + round(steady() * NSEC_PER_SEC),
                                bytes(data)), definition)
-        return take
+        self._subscriptions_of[topic] = offered, self.create_subscription(
+            load(kind), topic, take, quality, raw=True)
 
 
 def _resolved(node: Node, topic: str) -> str:
@@ -165,7 +161,7 @@ def load(kind: str) -> Any:
     return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
-def definition_of(kind: str) -> str:
+def _definition_of(kind: str) -> str:
     """Return the fields of a type, and then those of all types in it, as ROS 2 writes them."""
     kinds, parts = [kind], []
     for each in kinds:

@@ -21,7 +21,7 @@ FRESH = 1.0
 #: A robot coasts for this time after its last command to move, s.
 COASTING = 0.5
 #: Wheels stand up to these speeds, m/s and rad/s.
-LINEAR, ANGULAR = 0.001, 0.0002
+LINEAR, _ANGULAR = 0.001, 0.0002
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
 
 
@@ -41,7 +41,7 @@ class Velocity:
     def moves(self) -> bool:
         """Tell whether it is more than wheels that stand show."""
         return (any(abs(part) > LINEAR for part in self.linear)
-                or any(abs(part) > ANGULAR for part in self.angular))
+                or any(abs(part) > _ANGULAR for part in self.angular))
 
 
 class Wheels:
