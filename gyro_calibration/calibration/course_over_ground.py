@@ -65,6 +65,9 @@ FEWEST_SPANS = 10
 DELAY, SMOOTHING = 0.2, 0.1
 #: A course that is bad is so for about this long, s; stretches of this length count as one.
 BURST, STRETCH = 5.0, 15.0
+#: The few errors within a burst hardly show its variance: a course has the errors of Student's
+#: distribution with so many degrees of freedom, more of them with each error that is seen.
+FREEDOM = 4.0
 #: The gyro's noises that are possible, rad/√s and rad/s/√s, and cosines for its wander.
 WHITE, WALK, COSINES = (1e-5, 1e-2), (1e-7, 1e-4), 8
 #: A gyro that follows leaves less of the course than this, rad, whatever the side slip.
@@ -264,8 +267,9 @@ def _point_errors(spans: _Spans, points: Array) -> Array:
 def _burst_variance(spans: _Spans, error: Array) -> Array:
     """Return the variance of each point relative to the usual one, by the errors around it."""
     around = np.abs(spans.time[:, None] - spans.time) <= 0.5 * BURST
-    square = around @ error**2 / around.sum(axis=1)
-    return np.maximum(square / max(float(np.median(square)), 1e-12), 1.0)
+    squares, count = around @ error**2, around.sum(axis=1)
+    usual = max(float(np.median(squares / count)), 1e-12)
+    return (FREEDOM + squares / usual) / (FREEDOM + count)
 
 
 def _refuse_other_motion(spans: _Spans) -> None:
