@@ -20,6 +20,7 @@ import gyro_calibration
 import pytest
 
 PACKAGE = Path(gyro_calibration.__file__).parent
+REPRODUCTION = PACKAGE.parent / 'gyro_calibration_reproduction'
 FILES = sorted(PACKAGE.rglob('*.py'))
 #: As the package's docstring gives it.
 ORDER = re.findall(r'`(\w+)`', gyro_calibration.__doc__.partition('Reading order:')[2])
@@ -33,11 +34,19 @@ OUTSIDE_WORLD = {'socket', 'serial', 'subprocess', 'time', 'threading', 'random'
 
 @cache
 def imports(path):
-    """Return the modules that a file imports, anywhere in it."""
+    """Return the modules that a file imports, anywhere in it, and names of them."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
-    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    return names + [f'{node.module}.{alias.name}'
-                    for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
+    found = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    origins = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+    return found | {node.module for node in origins} | {
+        f'{node.module}.{alias.name}' for node in origins for alias in node.names}
+
+
+@cache
+def calls(path):
+    """Return what a file calls, with its dots: ``yaml.load``."""
+    return {ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Call)}
 
 
 def own(names):
@@ -51,13 +60,6 @@ def files(module):
     """Return the files of a module: one, or those of its folder."""
     path = PACKAGE / f'{module}.py'
     return [path] if path.exists() else sorted((PACKAGE / module).rglob('*.py'))
-
-
-def calls(path):
-    """Return the names that a file calls without a dot."""
-    functions = [node.func
-                 for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
-    return {function.id for function in functions if isinstance(function, ast.Name)}
 
 
 def test_a_module_imports_only_what_is_read_before_it():
@@ -95,7 +97,8 @@ def test_only_the_nodes_know_ros():
 
 
 def test_the_core_only_computes():
-    for path in (path for module in [*CORE, 'files'] for path in files(module)):
+    core = [path for module in [*CORE, 'files'] for path in files(module)]
+    for path in [*core, *REPRODUCTION.glob('*.py')]:
         roots = {name.split('.')[0] for name in imports(path)}
         assert not re.search(r'\b(now|utcnow|today)\(\)', path.read_text()), path
         assert (not roots & OUTSIDE_WORLD
@@ -106,4 +109,6 @@ def test_no_random_number_comes_from_a_hidden_source():
     hidden = re.compile(r'np\.random\.(?!Generator)|default_rng')
     found = [path.name for module in CORE
              for path in files(module) if hidden.search(path.read_text())]
+    found += [path.name for path in REPRODUCTION.glob('*.py')
+              if 'default_rng' in path.read_text()]
     assert not found

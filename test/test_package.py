@@ -10,7 +10,6 @@
 
 """The package as installed by colcon and by pip, with data files and programs for `ros2 run`."""
 
-import ast
 import importlib.metadata
 import os
 from pathlib import Path
@@ -23,6 +22,7 @@ import zipfile
 import conftest
 import gyro_calibration
 import pytest
+from test_layers import imports
 
 ROOT = Path(__file__).parents[1]
 PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',
@@ -85,11 +85,8 @@ def test_bloom_finds_a_dated_section_of_the_version_in_the_changelog():
 
 def imported():
     """Return the libraries that the package and its launch files import, as rosdep calls them."""
-    nodes = [node for folder in ('gyro_calibration', 'launch')
-             for file in (ROOT / folder).rglob('*.py')
-             for node in ast.walk(ast.parse(file.read_text()))]
-    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and not node.level}
+    names = {name for folder in ('gyro_calibration', 'launch')
+             for file in (ROOT / folder).rglob('*.py') for name in imports(file)}
     roots = ({name.partition('.')[0] for name in names} - sys.stdlib_module_names
              - {'gyro_calibration', 'gyro_calibration_reproduction'})
     return {f'python3-{root}' if root in {'numpy', 'scipy', 'serial', 'yaml', 'tqdm', 'matplotlib'}

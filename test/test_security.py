@@ -11,14 +11,13 @@
 """The security policy: it equals what the nodes really have, and none drives unless asked."""
 
 import ast
-from functools import cache
 from pathlib import Path
 import re
 from xml.etree import ElementTree
 
-import gyro_calibration
 import pytest
 from rig import rested
+from test_layers import calls, FILES, imports, PACKAGE
 import yaml
 
 try:
@@ -30,24 +29,11 @@ try:
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
 
-ROOT, PACKAGE = Path(__file__).parents[1], Path(gyro_calibration.__file__).parent
+ROOT = Path(__file__).parents[1]
 POLICY = ElementTree.parse(ROOT / 'config/sros2/policy.xml').getroot()
 ENCLAVES = {enclave.get('path').rpartition('/')[2]: enclave for enclave in POLICY.iter('enclave')}
-FILES = sorted(PACKAGE.rglob('*.py'))
 
 # What the package may import, run and start
-
-
-@cache
-def names(path):
-    """Return what a file imports, and what it calls, with its dots: ``yaml.load``."""
-    nodes = list(ast.walk(ast.parse(path.read_text())))
-    imported = {alias.name for node in nodes if isinstance(node, ast.Import)
-                for alias in node.names}
-    imported |= {node.module or '' for node in nodes if isinstance(node, ast.ImportFrom)}
-    imported |= {f'{node.module}.{alias.name}'
-                 for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
-    return imported, {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}
 
 
 def belongs(name, roots):
@@ -71,21 +57,20 @@ PROCESSES = {'subprocess', 'pty.spawn', *(f'os.{start}{how}' for start in ('exec
     ({'multiprocessing'}, {'run.py'})],  # a fleet's processes on one machine, joined by pipes
     ids=['the network', 'code from data', 'processes', 'workers'])
 def test_no_file_but_those_excepted_uses(forbidden, excepted):
-    assert {path.name for path in FILES for name in set.union(*names(path))
+    assert {path.name for path in FILES for name in imports(path) | calls(path)
             if belongs(name, forbidden)} == excepted
 
 
 def test_only_the_command_line_runs_a_file_that_the_user_names():
     assert {path.name for path in FILES if any(
-        name.endswith('exec_module') for name in names(path)[1])} == {'main.py'}
+        name.endswith('exec_module') for name in calls(path))} == {'main.py'}
 
 
 def test_what_is_imported_late_is_named_in_the_code():
-    late = {path.name: path for path in FILES if 'importlib.import_module' in names(path)[1]}
+    late = {path.name: path for path in FILES if 'importlib.import_module' in calls(path)}
     assert set(late) <= {'ros_bag.py', 'recorder_node.py', 'main.py'}
-    calls = [node for node in ast.walk(ast.parse(late['ros_bag.py'].read_text()))
-             if isinstance(node, ast.Call)]
-    asked = [call.args[0] for call in calls if ast.unparse(call.func) == '_library']
+    asked = [node.args[0] for node in ast.walk(ast.parse(late['ros_bag.py'].read_text()))
+             if isinstance(node, ast.Call) and ast.unparse(node.func) == '_library']
     assert asked and all(isinstance(name, ast.Constant) for name in asked)
 
 
@@ -99,7 +84,7 @@ def test_a_kind_of_message_chooses_no_module_that_a_recorder_imports(kind):
 
 
 def test_yaml_is_read_as_plain_data_at_one_place():
-    assert {path.name for path in FILES if 'yaml.load' in names(path)[1]} <= {'settings_file.py'}
+    assert {path.name for path in FILES if 'yaml.load' in calls(path)} <= {'settings_file.py'}
     from gyro_calibration.model import settings_file
     assert 'yaml.load(text, _Loader)' in Path(settings_file.__file__).read_text()
     assert issubclass(settings_file._Loader, yaml.SafeLoader)

@@ -211,6 +211,8 @@ WRONG = {
     'emulate --protocol morse --model MODEL': "protocol 'morse' is not known",
     'emulate --protocol fizoptika --model MODEL': 'sensitivity is not set',
     'reproduce ojeda --seed -1': '-1 is below 0', 'dance': 'invalid choice', '': 'required',
+    'reproduce newton': 'hong_park', 'diagnose LOG --seed -1': '-1 is below 0',
+    'diagnose LOG --model missing.yaml --out found': 'missing.yaml: there is no such file',
     'simulate --model MODEL --motion waltz --out x.csv': 'waltz: there is no such motion',
     'simulate --model MODEL --motion rest --out ""': EMPTY,
     **{f'simulate --model MODEL --motion rest --out x.csv {option}': said for option, said in {

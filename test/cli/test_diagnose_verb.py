@@ -178,14 +178,6 @@ def test_a_model_of_other_units_is_the_finding_alone(log, diagnose, tmp_path):
     assert {gate['name']: gate['passed'] for gate in found['gates']}['model'] is False
 
 
-@pytest.mark.parametrize('words', [('--model', 'missing.yaml'), ('--seed', '-1'), ('--model',)],
-                         ids=' '.join)
-def test_a_wrong_use_is_one_sentence_and_writes_nothing(words, log, diagnose, tmp_path):
-    code, text, errors = diagnose(log, *words)
-    assert code in (1, 2) and not text and 'Traceback' not in errors and errors.strip()
-    assert not (tmp_path / 'found').exists()
-
-
 @pytest.mark.parametrize('taken', ['found', 'found/model.yaml'], ids=['folder', 'file'])
 def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, run, tmp_path):
     if taken == 'found':

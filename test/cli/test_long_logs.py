@@ -114,15 +114,6 @@ def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, run)
             and not (tmp_path / 'out.csv').exists())
 
 
-def test_a_log_may_come_through_a_pipe(model, tmp_path):
-    write_robot(tmp_path / 'log.csv', 1000)
-    words = ['-m', 'gyro_calibration', 'compensate', '/dev/stdin', '--model', model,
-             '--out', tmp_path / 'out.csv']
-    done = subprocess.run([sys.executable, *map(str, words)],
-                          input=(tmp_path / 'log.csv').read_bytes(), capture_output=True)
-    assert done.returncode == 0 and b'1000 rows compensated' in done.stdout, done.stderr
-
-
 def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(tmp_path, small_blocks, run):
     (tmp_path / 'model.yaml').write_text('effects: {}\nnoise: {angle_random_walk: 7.3e-4}')
     # A gap of 3 s, then only every other sample.

@@ -183,13 +183,6 @@ def test_what_a_sine_cannot_answer_has_a_large_but_finite_deviation():
     assert np.isfinite(variance).all() and variance[0] > 25.0 * variance[50]
 
 
-def test_the_sensitivity_of_one_sample_is_that_of_the_log():
-    model, rates = replace(MODEL, self_calibration=CALIBRATION), np.array([-1.0, 0.7])
-    at_once = rate_sensitivity(model, rates, rates, np.full(2, 25.0))
-    assert ([rate_sensitivity(model, rate, rate, 25.0).tolist() for rate in rates.tolist()]
-            == at_once.T.tolist())
-
-
 TOLERANT = replace(MODEL, tolerance=Tolerance(0.001, 0.0002, 1e-4, 2e-5, 0.003))
 
 

@@ -16,11 +16,9 @@ from dataclasses import replace
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import (
     GyroModel,
-    same_effects,
     SelfCalibration,
     Term,
     Tolerance,
-    with_self_calibration,
 )
 from gyro_calibration.model.model_file import ModelError, read_model, write_model
 from gyro_calibration.model.noise import Noise
@@ -198,11 +196,6 @@ def test_self_calibration_is_eq_3_of_hong_and_park():
     calibration = SelfCalibration(-0.1, 0.1)
     assert (round(calibration.scale, 3), round(calibration.offset, 3)) == (1.111, -0.111)
     assert calibration.correct((1 - 0.1) * 0.4 + 0.1) == pytest.approx(0.4, abs=1e-15)
-
-
-def test_models_compensate_alike_whatever_their_self_calibration():
-    assert same_effects(FULL, with_self_calibration(FULL, None))
-    assert not same_effects(FULL, GyroModel(TERMS[:3]))
 
 
 def test_a_person_may_give_the_standard_deviations_of_a_self_calibration_alone(tmp_path):
