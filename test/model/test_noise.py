@@ -29,38 +29,32 @@ def allan_variance(rate, size):
     return np.mean(np.diff(means) ** 2) / 2.0, len(means) - 1
 
 
-def assert_variance(noise, size, wanted, count=2 ** 18, runs=8):
+#: Noise, samples of the means, and the Allan variance of such means.
+PARTS = {
+    'white': (Noise(7e-4), (1, 10, 100, 1000), lambda size: 7e-4 ** 2 / (size * INTERVAL)),
+    'flicker': (Noise(bias_instability=1e-4), (100, 300, 1000),
+                lambda size: (ALLAN_FLOOR * 1e-4) ** 2),
+    'walk': (Noise(rate_random_walk=1e-5), (30, 100, 1000),  # exact in steps
+             lambda size: 1e-5 ** 2 * size * INTERVAL / 3.0 * (1.0 + 0.5 / size ** 2))}
+
+
+@pytest.mark.parametrize('noise, sizes, wanted', PARTS.values(), ids=PARTS)
+def test_simulated_noise_has_the_allan_variance_of_ieee_952(noise, sizes, wanted):
     """
-    Assert the Allan variance within four standard errors.
+    Allow four standard errors.
 
     The n differences of neighbours correlate by -1/2 or less, so that their mean square has a
     relative variance of at most 3 / n.
 
     """
     generator = np.random.default_rng(952)
-    found = [allan_variance(simulate_noise(noise, count, INTERVAL, generator), size)
-             for _ in range(runs)]
-    tolerance = 4.0 * math.sqrt(3.0 / (found[0][1] * runs))
-    assert tolerance < 0.25
-    assert (np.mean([variance for variance, _ in found]) / wanted
-            == pytest.approx(1.0, abs=tolerance))
-
-
-@pytest.mark.parametrize('size', [1, 10, 100, 1000])
-def test_white_noise_falls_with_the_square_root_of_time(size):
-    assert_variance(Noise(angle_random_walk=7e-4), size, 7e-4 ** 2 / (size * INTERVAL))
-
-
-@pytest.mark.parametrize('size', [100, 300, 1000])
-def test_flicker_has_a_floor_of_0_664_times_the_bias_instability(size):
-    assert round(ALLAN_FLOOR, 3) == 0.664
-    assert_variance(Noise(bias_instability=1e-4), size, (ALLAN_FLOOR * 1e-4) ** 2)
-
-
-@pytest.mark.parametrize('size', [30, 100, 1000])
-def test_a_random_walk_grows_with_the_square_root_of_time(size):
-    wanted = 1e-5 ** 2 * size * INTERVAL / 3.0 * (1.0 + 0.5 / size ** 2)  # exact in steps
-    assert_variance(Noise(rate_random_walk=1e-5), size, wanted)
+    records = [simulate_noise(noise, 2 ** 18, INTERVAL, generator) for _ in range(8)]
+    for size in sizes:
+        found = [allan_variance(record, size) for record in records]
+        tolerance = 4.0 * math.sqrt(3.0 / (found[0][1] * len(records)))
+        assert tolerance < 0.25
+        assert (np.mean([variance for variance, _ in found]) / wanted(size)
+                == pytest.approx(1.0, abs=tolerance)), size
 
 
 @pytest.mark.parametrize('noise', [Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-5)],
@@ -78,6 +72,7 @@ def test_means_wander_as_predicted(noise, apart):
 
 
 def test_the_allan_variance_is_the_sum_of_its_parts():
+    assert round(ALLAN_FLOOR, 3) == 0.664
     assert Noise(1.0, 2.0, 3.0).allan_variance(5.0) == pytest.approx(
         1.0 / 5.0 + (ALLAN_FLOOR * 2.0) ** 2 + 9.0 * 5.0 / 3.0)
 
