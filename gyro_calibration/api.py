@@ -303,7 +303,6 @@ class Fitted(_Answer):
     model: GyroModel
     selection: Selection | None = field(default=None, repr=False)
     encoder: EncoderCalibration | None = field(default=None, repr=False)
-    _log: Log | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
         if self.selection is not None:
@@ -315,8 +314,8 @@ class Fitted(_Answer):
         """Return a figure of the errors before and after the fit."""
         if self.selection is not None:
             return plots.draw_residuals(path, self.selection.calibration)
-        assert self._log is not None and self.encoder is not None
-        return draw_headings(path, self._log, self.encoder)
+        assert self.encoder is not None
+        return draw_headings(path, self.encoder)
 
 
 def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,
@@ -345,7 +344,7 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
         if len(logs) != 1:
             raise InputError('a reference heading is fitted in one log; give them one by one')
         found = calibrate_encoder(logs[0], method, technology=technology or 'mems')
-        return Fitted(_of(found.model, technology), encoder=found, _log=logs[0])
+        return Fitted(_of(found.model, technology), encoder=found)
     table = join([dwells(log, name=str(number) if len(logs) > 1 else '')
                   for number, log in enumerate(logs)])
     if method is None and not effects and is_motion(logs, table):

@@ -176,7 +176,7 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
     model, fit = _stored(given, found.model), found.fit
     if given.picture:
-        draw_headings(given.picture, log, found)
+        draw_headings(given.picture, found)
     remarks = list(found.remarks)
     if log.reference_heading is None:
         remarks.insert(
@@ -195,10 +195,9 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
          'largest_heading_after_rad': found.after.largest, 'remarks': remarks}, (given.out,))
 
 
-def draw_headings(path: str | Path | None, log: Log, found: EncoderCalibration) -> Any:
+def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
     """Draw the headings of a reference and of the gyro, and return the figure."""
-    name = ('course over ground' if found.method == 'course' else
-            'reference' if log.reference_heading is None else 'encoder')
+    name = 'course over ground' if found.method == 'course' else 'reference'
     motion = found.reference
     return plots.draw_reference(path, motion.time, motion.heading - motion.heading[0],
                                 found.before.heading, found.after.heading, name)

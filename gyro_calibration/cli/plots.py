@@ -58,7 +58,7 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
 
 
 def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
-                   after: Array, name: str = 'encoder') -> Any:
+                   after: Array, name: str = 'reference') -> Any:
     """
     Draw the heading of a reference, rad, and that of a gyro, and what lies between them.
 
@@ -70,12 +70,13 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
     above.plot(time, reference / DEGREE, color='tab:blue', linewidth=3, alpha=0.5, label=name)
     above.plot(time, (reference + before - before[0]) / DEGREE, color='black', linewidth=1,
                linestyle='--', label='gyro, not calibrated')
-    above.set(ylabel='heading [deg]', title=f'Heading by {name} and gyro')
+    above.set(ylabel='heading [deg]', title=f'Heading by the {name} and by the gyro')
     above.legend(loc='best')
     for axes, error, when in ((middle, before, 'not calibrated'), (below, after, 'calibrated')):
         axes.plot(time, error / DEGREE, color='black', linewidth=1)
         axes.axhline(0.0, color='black', linewidth=0.5)
-        axes.set(ylabel=f'gyro less {name} [deg]', title=f'Gyro {when}: rms {_rms(error):.3g} deg')
+        axes.set(ylabel='difference [deg]',
+                 title=f'Gyro {when}, less the {name}: rms {_rms(error):.3g} deg')
     below.set_xlabel('time [s]')
     return _save(figure, path, 'The lower panels show the difference about its mean, each on its '
                  'own scale. A slope is bias; what follows the turns is scale factor error; an '
