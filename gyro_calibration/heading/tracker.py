@@ -322,8 +322,10 @@ class HeadingTracker:
             self._part.noise += gap.noise
         if self._seeks:
             self._look(interval if gap is None else interval - gap.duration, last[1], wheels)
-        elif self._part.duration >= _STEP - CLOSE:
-            self._settle()
+        elif self._part.duration >= BLOCK - CLOSE:
+            self._open, self._part, self._known = self._open + self._part, self._none(), None
+            if self._open.duration >= _STEP - CLOSE:
+                self._advance()
         self.rate = 0.0 if self.resting or filtered != rate else rate - self._off(sensitivity)
         if not -math.inf < self.heading + self.rate < math.inf:
             self._rebuild()
@@ -535,6 +537,7 @@ class HeadingTracker:
         if quiet and self._stands(wheels):
             self._advance(self._settled())
             self._rest()
+            self._take()
             self._blocks.extend([*self._recent][1:])
 
     def _hold(self, part: RateIntegral) -> None:

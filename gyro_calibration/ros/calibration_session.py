@@ -83,6 +83,8 @@ _ECHOES = 256
 #: A node that was held up for this time, s, does not go on with a drive: the base itself has
 #: stopped, or turned on.
 _HELD_UP = 1.0
+#: In a drive stamps and clock are compared over this time, s: a jump of the stamps shows in it.
+_DRIVEN = 2.0
 #: The zero that ends a drive is repeated for this time, s: the link to the base may lose one.
 _REPEATED = 1.0
 
@@ -221,7 +223,7 @@ class Drive:
         self._received, self._suspected, self._due = False, False, -math.inf
         self._called = self._alone = False
         self._polled = self._begun
-        self._delay = StampDelay(clock, BLIND)
+        self._delay = StampDelay(clock, BLIND, _DRIVEN)
         self.command_lateness = self.sample_lateness = 0.0
 
     def see_sample(self, time: float) -> None:
@@ -270,7 +272,9 @@ class Drive:
         if self._due > -math.inf:
             self.command_lateness = max(self.command_lateness, now - self._due)
         self._due = now + self.INTERVAL
-        if self._suspected or not self._run.times:
+        # After a pause of this process the samples that waited may come before the next poll.
+        held_up = self._clock.steady() - self._polled > _HELD_UP
+        if self._suspected or held_up or not self._run.times:
             return 0.0
         # By the stamps, but samples that are held up do not hold up the motion.
         elapsed = max(now - self._delay.least - self._run.times[0], self._run.elapsed)

@@ -52,9 +52,9 @@ class StampDelay:
 
     """
 
-    def __init__(self, clock: Clock, tolerance: float):
-        """Begin with nothing seen; samples may be held up by a tolerance, s."""
-        self._clock, self._tolerance = clock, tolerance
+    def __init__(self, clock: Clock, tolerance: float, window: float):
+        """Begin with nothing seen; samples may be held up by a tolerance; window; both in s."""
+        self._clock, self._tolerance, self._window = clock, tolerance, window
         self.least = math.nan
         # Time of arrival and delay, s, of samples with less delay than any after them.
         self._prompt = deque[tuple[float, float]]()
@@ -82,7 +82,7 @@ class StampDelay:
             return (f'this computer was busy, or the clock of the driver is wrong: the stamps on '
                     f'imu/data_raw went on by {elapsed - grown:.2f} s in {elapsed:.2f} s; reduce '
                     'the load, or check that clock and use_sim_time')
-        if self._prompt and (self._before is None or elapsed > 4.0 * _PROMPT):
+        if self._prompt and (self._before is None or elapsed > self._window):
             self._before = now, self.least
         return ''
 

@@ -107,6 +107,8 @@ _LEAP = 5.0
 _CONTRADICTION, _DISTRUST = 1.0 * DEGREE, 600.0
 #: Stamps of ROS time are below it, ns: `builtin_interfaces/Time` has 31 bits for seconds.
 _END_OF_TIME = NSEC_PER_SEC << 31
+#: Stamps and clock are compared over this time, s, in which 9 % are beyond what is held up.
+_COMPARED = 30.0
 #: Stamps that jump back twice within this time, s, are those of several publishers.
 _INTERLEAVED = 1.0
 
@@ -222,7 +224,8 @@ class Pipeline:
         # When samples with a repeated stamp began, s, and the fastest rate among them, rad/s.
         self._standing: tuple[float, float] | None = None
         self.repeats, self._repeated = '', RepeatedOutput(noise)
-        self.pace, self._pace_fault, self._stamps = '', '', StampDelay(clock, _INTERLEAVED)
+        self.pace, self._pace_fault, self._stamps = '', '', StampDelay(
+            clock, _INTERLEAVED, _COMPARED)
         self._suspect = math.nan  # a temperature, degC
         # What odometry's heading was when its rate became zero, rad, and when both differed, s.
         self._stood, self._contradicted = math.nan, -math.inf
@@ -477,7 +480,7 @@ class Pipeline:
         self.monitor.restart()
         self.journal.counts['restarts'] += 1
         self.journal.event = f'{reason}: integration was restarted'
-        self._stamps = StampDelay(self._clock, _INTERLEAVED)
+        self._stamps = StampDelay(self._clock, _INTERLEAVED, _COMPARED)
         self._recent.clear()
         self.session.interrupt(reason)
 
@@ -531,8 +534,8 @@ class Pipeline:
         now = self._clock.steady()
         if self.ros_time.standing > BLIND:
             return STANDING_TIME
-        if conflict := self.conflict or self.several:
-            return conflict
+        if fault := self.conflict or self.several or self.repeats or self.pace:
+            return fault
         if not self._recent or now - self.journal.received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
         if self.wheels.moving(now):
@@ -570,6 +573,8 @@ class Pipeline:
         # Twice in a row: samples that were held up come at once, and are late until they have.
         before, self._pace_fault = self._pace_fault, self._stamps.fault()
         self.pace = before and self._pace_fault
+        if self.pace:
+            self._add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.learn(date, ending):
             self.journal.event = event
@@ -580,7 +585,7 @@ class Pipeline:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
         self._good = 0.0, 0.0
-        if self.conflict:  # turns are not measured
+        if self.conflict or self.repeats:  # turns are not measured
             self.estimator.rewind(0.0, math.tau ** 2)
         return 'the heading is zero here and now'
 

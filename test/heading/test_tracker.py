@@ -353,6 +353,16 @@ def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
     assert tracker.finish().mean[HEADING] == pytest.approx(0.0, abs=1.0 * DEGREE)
 
 
+@pytest.mark.parametrize('false_alarms', [0.0, 0.1])
+def test_the_variance_includes_the_bias_from_the_begin_on(false_alarms):
+    """It stands, and its bias is 1.5 standard deviations off."""
+    tracker = HeadingTracker(XV3500, np.diag([1e-4, (0.5 * DEGREE) ** 2]), Settings(false_alarms))
+    for index in range(100):
+        tracker.add(INTERVAL * index, 0.75 * DEGREE, np.array([0.0, -1.0]))
+        if index > 4:
+            assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance), index
+
+
 def test_another_calibration_and_a_reset_do_not_make_the_heading_jump():
     tracker = HeadingTracker(XV3500, KNOWN, Settings())
     for index in range(100):

@@ -231,6 +231,15 @@ def test_gyros_that_repeat_values_by_themselves_are_no_error(tmp_path, output):
     assert rig.pipeline.repeats == ''
 
 
+def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_nothing(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN)
+    rig.feed(noisy(10.0), SLOW)
+    rig.feed(np.full(50, BIAS), SLOW)
+    assert 'again and again' in rig.pipeline.obstacle()
+    rig.pipeline.reset()
+    assert rig.feed(noisy(1.0), SLOW)[-1].heading_variance > math.pi ** 2
+
+
 def test_a_gyro_of_zeros_beside_odometry_that_turns_is_an_error(tmp_path):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(np.zeros(50), SLOW, moving=0.3)
@@ -733,19 +742,21 @@ def test_the_diagnostics_name_what_is_wrong_within_two_seconds(
     assert (found, words in message) == (level, True), message
 
 
-@pytest.mark.parametrize('pace, warns', [(1e-6, True), (0.5, True), (2.0, True), (1.03, False),
-                                         (1.0, False)])
-def test_stamps_that_leave_the_clock_are_a_warning(tmp_path, reported, pace, warns):
+@pytest.mark.parametrize('pace, warns', [(1e-6, True), (0.85, True), (1.15, True), (2.0, True),
+                                         (1.03, False), (1.0, False)])
+def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothing(
+        tmp_path, reported, pace, warns):
     """What turns in the meantime is not what the stamps say."""
     rig = rested(tmp_path)
-    stamp, begin = rig.stamp, rig.clock.now
+    stamp, begin, first = rig.stamp, rig.clock.now, len(rig.outputs) - 1
     rig.stamp = lambda reading: stamp(reading) + round(1e9 * (pace - 1) * (rig.clock.now - begin))
     rig.robot.command(0.5)
-    rig.go(6.0)
+    rig.go(17.0)
     reported(rig)
     rig.go(1.0)
     level, message, _ = reported(rig)
     assert (level == WARN and 'the stamps on imu/data_raw went on by' in message) == warns, message
+    assert (rig.error(first)[1] > math.tau) == warns
 
 
 def test_samples_that_were_held_up_do_not_leave_the_clock(tmp_path, reported):
