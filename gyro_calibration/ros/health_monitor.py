@@ -53,6 +53,8 @@ _REPEATS, _REPEATED = 20, 0.25
 _CHANGES = 100
 #: Odometry shows a turn from this rate on, rad/s.
 _TURNS = 0.05
+#: No robot stops a turn faster, rad/s².
+_BRAKING = 20.0
 #: Number of stretches in a row that decide where the rest is not announced, since a robot that
 #: goes straight may shake for a while.
 _IN_A_ROW = 3
@@ -92,14 +94,15 @@ class RepeatedOutput:
     Find out whether a gyro repeats one value: it is dead, saturated, or its driver has stopped.
 
     That is so where odometry shows another turn, and where its noise is larger than the steps of
-    its output; apart from a value of zero, which some gyros report at rest.
+    its output. Some gyros report zero at rest: a repeated zero counts only after a stop that is too
+    sudden for a robot.
 
     """
 
     def __init__(self, noise: Noise):
         """Begin with nothing seen; `noise` of the model."""
         self._noise, self._step, self._changes = noise, math.inf, 0
-        self._value, self._since, self._count = math.nan, 0.0, 0
+        self._value, self._since, self._count, self._fell = math.nan, 0.0, 0, False
 
     def add(self, time: float, output: float, turning: float) -> bool:
         """
@@ -112,7 +115,9 @@ class RepeatedOutput:
 
         """
         if output != self._value:
-            self._step = min(abs(output - self._value), self._step)
+            step = abs(output - self._value)
+            self._step = min(step, self._step)
+            self._fell = step > _TURNS + _BRAKING * abs(time - self._since)
             self._value, self._since, self._count = output, time, 0
             self._changes += 1
             return False
@@ -123,7 +128,7 @@ class RepeatedOutput:
         if lasts > _PART and abs(turning) > _TURNS and abs(output - turning) > 0.5 * abs(turning):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
-        return (output != 0.0 and self._changes > _CHANGES
+        return ((output != 0.0 or self._fell) and self._changes > _CHANGES
                 and 2.0 * _QUIET * self._step < sample)
 
 

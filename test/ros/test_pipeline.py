@@ -231,6 +231,16 @@ def test_gyros_that_repeat_values_by_themselves_are_no_error(tmp_path, output):
     assert rig.pipeline.repeats == ''
 
 
+@pytest.mark.parametrize('acceleration, stuck', [(5.0, False), (100.0, True)])
+def test_zeros_are_those_of_a_dead_gyro_where_no_robot_stops_so_fast(
+        tmp_path, acceleration, stuck):
+    rig = Rig(tmp_path, model=KNOWN)
+    rig.feed(noisy(10.0, 0.9), SLOW)
+    stop = np.maximum(0.9 - acceleration * SLOW * np.arange(1.0, 60.0), 0.0)
+    rig.feed(np.where(stop > 0.0, noisy(59 * SLOW, stop), 0.0), SLOW)
+    assert bool(rig.pipeline.stuck) == stuck
+
+
 def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_nothing(tmp_path):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(noisy(10.0), SLOW)
