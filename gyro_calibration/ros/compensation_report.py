@@ -76,7 +76,7 @@ class CompensationReport:
         others = (pipeline.session.warning, pipeline.pace, pipeline.odometry_fault, store.hint,
                   store.shared_hint, monitor.bias_alarm, monitor.noise_alarm, estimator.sentence,
                   store.table_hint)
-        low, high = estimator.model.temperature_range
+        low, high = estimator.model.valid_temperatures
         event = pipeline.journal.event
         counted = {
             'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
