@@ -32,7 +32,6 @@ from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION, Motion, motion_by_name, NAMED
-from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration.model.settings_file import checked, number, read_settings, WrongValue
 import numpy as np
@@ -78,7 +77,11 @@ def _plan(given: argparse.Namespace) -> Answer:
     if given.seconds > LONGEST:
         raise UsageError(f'--seconds {given.seconds:g} is above {LONGEST:g}; '
                          'plan a shorter motion and repeat it')
-    ability, noise = read_limits(given.limits), _noise(given)
+    ability = read_limits(given.limits)
+    noise = read_model(given.model).noise if given.model else XV3500.noise
+    if not noise.angle_random_walk:
+        raise UsageError(f'{given.model}: has no angle_random_walk; '
+                         'run allan on a log at rest, with --model and --out')
     drive = motion_by_name(given.motion)
     given.drive = given.drive or drive.duration
 
@@ -139,14 +142,6 @@ def read_limits(path: str) -> Ability:
 def _limit(place: str, value: Any) -> float:
     name = place.rpartition('.')[2]
     return number(name, value, *LIMITS[name][2:])
-
-
-def _noise(given: argparse.Namespace) -> Noise:
-    noise = read_model(given.model).noise if given.model else XV3500.noise
-    if not noise.angle_random_walk:
-        raise UsageError(f'{given.model}: has no angle_random_walk; '
-                         'run allan on a log at rest, with --model and --out')
-    return noise
 
 
 def write_motion(path: str, motion: Motion) -> None:

@@ -34,7 +34,6 @@ from gyro_calibration.driver.protocols import Protocol, Sample, Settings
 _POLL = 0.05  # s; how soon a reader, or the wish to stop, is noticed
 _SETTLING = 0.2  # s; a reader that opens a port drops what is in it just afterwards
 _LINGERING = 1.0  # s; closing a pseudo-terminal throws away what its reader has not yet taken
-_BATCH = 0.0005  # s; samples due within it are written together, as waiting takes too long
 
 #: When bytes are sent, s, and the bytes.
 _Piece = tuple[float, bytes]
@@ -63,8 +62,6 @@ class Emulator:
     link : a symbolic link to the pseudo-terminal, whose own name differs from run to run. It is
         removed at the end.
     wait_for_reader : whether to send the first sample only after a reader has opened the port
-    line : takes the time, s, and the bytes of each sample, and gives those that arrive, as a line
-        with faults changes them
 
     Raises
     ------
@@ -72,6 +69,9 @@ class Emulator:
     FileExistsError : the place of the link is taken by a file that is no link
 
     """
+
+    #: s; samples due within it are written together, as waiting takes too long
+    _BATCH = 0.0005
 
     def __init__(
         self,
@@ -81,7 +81,6 @@ class Emulator:
         speed: float = 1.0,
         link: str | Path | None = None,
         wait_for_reader: bool = False,
-        line: Callable[[Iterable[_Piece]], Iterable[_Piece]] | None = None,
     ):
         if not speed > 0.0:
             raise ValueError(f'speed is {speed}, but must be above 0; 1 is real time')
@@ -91,7 +90,7 @@ class Emulator:
         self._samples = samples
         self._speed = speed
         self.link = None if link is None else Path(link)
-        self._wait_for_reader, self._line = wait_for_reader, line
+        self._wait_for_reader = wait_for_reader
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name='emulator')
         self._master, self._reader_poll = -1, select.poll()
@@ -127,7 +126,7 @@ class Emulator:
                 pass
             self._stop.wait(_SETTLING)
         self._send(self._protocol.preamble)
-        self._send_in_time(self._line(self._frames()) if self._line else self._frames())
+        self._send_in_time(self._frames())
         if self.is_read():
             self._stop.wait(_LINGERING)
 
@@ -192,17 +191,16 @@ class Emulator:
     def _send_in_time(self, pieces: Iterable[_Piece]) -> None:
         """Send each piece at its time, or with others that are due at once."""
         start, pending, sent = time.monotonic(), b'', -math.inf
-        batch = 0.0 if self._line else _BATCH
         for due, data in pieces:
             if pending and start + due > time.monotonic():
                 self._send(pending)
                 pending, sent = b'', time.monotonic()
             now = time.monotonic()
-            if (self._stop.wait(max(start + due, sent + batch) - now) if start + due > now
+            if (self._stop.wait(max(start + due, sent + self._BATCH) - now) if start + due > now
                     else self._stop.is_set()):
                 return
             pending += data
-            if time.monotonic() >= sent + batch:
+            if time.monotonic() >= sent + self._BATCH:
                 self._send(pending)
                 pending, sent = b'', time.monotonic()
         self._send(pending)

@@ -327,11 +327,8 @@ class Gaps:
         """Return lengths, s, and the part of the variance by curvature without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual
         points = [(usual, _OF_POINTS * max(self._curved - 1.5 * density / usual, 0.0))]
-        if usual > 0.5 * _BLOCK:
-            return points + [(each.length, _OF_MEANS * each.without_noise(density)[0])
-                             for each in self._levels[1:]]
         return points + [(each.length, _OF_MEANS * each.without_noise(density)[0])
-                         for each in self._levels]
+                         for each in self._levels[usual > 0.5 * _BLOCK:]]
 
     def _steps_seen(self) -> list[tuple[float, float]]:
         """Return lengths, s, and the mean squares of steps there, without noise, (rad/s)²."""

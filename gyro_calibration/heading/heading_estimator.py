@@ -35,7 +35,7 @@ from gyro_calibration.heading.assumptions import (
 from gyro_calibration.heading.bias_table import BiasTable, propagated
 from gyro_calibration.heading.gaps import CLOSE
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.compensation import (
     compensate,
     Compensated,
@@ -378,7 +378,8 @@ class HeadingEstimator:
         if change:
             rate -= change * (1.0 if calibration is None else calibration.scale)
         if abs(time - self._still_at) > _STILL + CLOSE:
-            self._still, self._still_at = self._sensitive(output, 0.0, around, distance), time
+            self._still, self._still_at = self._sensitive(
+                output, 0.0, self.last.temperature, around, distance), time
         self._look_at(time, output, float(result.rate), around, distance)
         message = tracker.add(time, rate, self._sensitivity, wheels, self._still)
         self.corrected, self.rate = rate, tracker.rate
@@ -408,16 +409,14 @@ class HeadingEstimator:
             self._sensitivity = self._still
             return
         if self._held is None:
-            seen, known, temperature, surroundings, far = self._held_at
-            self._held = sensitive(self.used, rate_sensitivity(
-                self.used, seen, known, temperature, surroundings), far)
+            self._held = self._sensitive(*self._held_at)
         self._sensitivity = self._held
 
-    def _sensitive(self, output: float, rate: float, around: Channels | None,
+    def _sensitive(self, output: float, rate: float, temperature: Number, around: Channels | None,
                    distance: float) -> Array:
         """Return what the rate changes by for each uncertain value, shape (m,)."""
         return sensitive(self.used, rate_sensitivity(
-            self.used, output, rate, self.last.temperature, around), distance)
+            self.used, output, rate, temperature, around), distance)
 
     def _bias_change(self, time: float) -> tuple[float, float]:
         """Return the change of the bias with temperature, rad/s, and the distance, K."""
@@ -572,9 +571,7 @@ class HeadingEstimator:
                 places.append(place)
                 at, looked = now, rate
         if self._held is None and (not places or places[0]) and self._looked[0] > -math.inf:
-            seen, known, temperature, surroundings, far = self._held_at
-            self._held = sensitive(self.used, rate_sensitivity(
-                self.used, seen, known, temperature, surroundings), far)
+            self._held = self._sensitive(*self._held_at)
         held = self._still if self._held is None else self._held
         rows = self._rows(places, output, rates, result, distance)
         self._looked = at, looked

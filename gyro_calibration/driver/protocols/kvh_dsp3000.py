@@ -34,7 +34,6 @@ from gyro_calibration.driver.protocols.protocol import (
     Reading,
     Settings,
     stateless,
-    Written,
 )
 
 _LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
@@ -45,10 +44,6 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
     return match and Reading(float(match[1]), valid=match[2] == b'1')
 
 
-def _write(reading: Written, settings: Settings) -> bytes:
-    return b'%15.6f   %d\r\n' % (reading.value, reading.valid)
-
-
 KVH_DSP3000 = Protocol(
     name='kvh_dsp3000',
     description='KVH DSP-3000 fibre-optic gyro, text with deg/s',
@@ -57,7 +52,7 @@ KVH_DSP3000 = Protocol(
     sensitivity=math.radians(1.0),
     splitter=partial(LineSplitter, 64, (b' ',)),
     parser=stateless(_parse),
-    writer=stateless(_write),
+    writer=lambda settings: lambda reading: b'%15.6f   %d\r\n' % (reading.value, reading.valid),
     invert=True,
     full_scale=math.radians(500.0),
     noise_density=math.radians(4.0 / 3600.0),  # data sheet: 4 deg/h/√Hz, 0.067 deg/√h

@@ -43,10 +43,6 @@ def _content(frame: bytes) -> bytes:
     return bits.to_bytes(7, 'big')
 
 
-def _parse(frame: bytes, settings: Settings) -> Reading:
-    return Reading(int.from_bytes(_content(frame)[5:], 'big', signed=True))
-
-
 def _write(reading: Written, settings: Settings) -> bytes:
     count = min(max(round(reading.value), -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)
     bits = int.from_bytes(bytes([-sum(count) % 256, 0, 0, 0, 0]) + count, 'big')
@@ -62,7 +58,8 @@ KVH_ECORE = Protocol(
     sensitivity=_COUNT,
     splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8,
                      lambda frame: sum(_content(frame)) % 256 == 0),
-    parser=stateless(_parse),
+    parser=lambda settings: lambda frame: Reading(
+        int.from_bytes(_content(frame)[5:], 'big', signed=True)),
     writer=stateless(_write),
     largest_count=0x8000,
 )
