@@ -14,9 +14,8 @@ import heapq
 import itertools
 import math
 
-from gyro_calibration.driver.connection import Connection
+from gyro_calibration.driver.connection import Connection, PortError
 from gyro_calibration.driver.protocols import find, Sample, Settings
-from gyro_calibration.driver.serial_port import PortError
 
 BEGIN = 100.0  # s
 STEP = 0.1  # s; what `SerialPort.read` waits for a first byte

@@ -11,7 +11,7 @@
 """
 From bytes on a serial port to stamped samples, whatever happens to the port.
 
-Reading order: `protocols` (wire formats), `serial_port`, `timestamps`, `connection`, `recorder`,
+Reading order: `protocols` (wire formats), `timestamps`, `connection`, `recorder`,
 `emulator`.
 
 """

@@ -16,10 +16,9 @@ import random
 import threading
 
 from fake_port import BEGIN, Reading, World
-from gyro_calibration.driver.connection import Connection, resolve
+from gyro_calibration.driver.connection import Connection, PortError, resolve
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.serial_port import PortError
 import numpy as np
 import pytest
 from serial_faults import damaged

@@ -17,9 +17,9 @@ import os
 import threading
 import time
 
+from gyro_calibration.driver.connection import PortError, SerialPort
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.serial_port import PortError, SerialPort
 import pytest
 from serial_faults import bursts
 

@@ -15,7 +15,7 @@ import os
 import termios
 import tty
 
-from gyro_calibration.driver.serial_port import PortError, SerialPort
+from gyro_calibration.driver.connection import PortError, SerialPort
 import pytest
 
 
