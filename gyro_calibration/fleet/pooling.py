@@ -43,7 +43,7 @@ it, for two that stand out hide each other; the last one below the level counts,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
@@ -542,10 +542,9 @@ def _quantile(mean: Array, variance: Array, weight: Array, chance: float) -> Arr
     deviation = np.sqrt(variance)
     # beyond this a mixture has no more of its weight than the chance
     low, high = (mean - 40.0 * deviation).min(axis=0), (mean + 40.0 * deviation).max(axis=0)
-    within: Callable[[Array], Array] = lambda at: weight @ ndtr((at - mean) / deviation)  # noqa: E731,E501
     for _ in range(70):
         middle = 0.5 * (low + high)
-        below = within(middle) < chance
+        below = weight @ ndtr((middle - mean) / deviation) < chance
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return np.asarray(0.5 * (low + high))
 

@@ -253,7 +253,13 @@ class HeadingEstimator:
         model = assumed(self.model, self._assumptions)
         calibration = model.self_calibration
         if calibration is None:
-            return self._from_table(model, now)
+            here = self._known_temperature
+            if here is None or not self.table.entries:
+                return model, None
+            # the bias of earlier runs
+            bias, variance = self.table.predict(here, now)
+            return with_self_calibration(
+                model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
         worth = propagated(calibration, self.table, self.age(now), now, self._known_temperature,
@@ -264,15 +270,6 @@ class HeadingEstimator:
                               'the clock of this computer: its age is not known and taken for a '
                               'year; set the clock, or calibrate again')
         return with_self_calibration(model, worth.calibration), 0.0
-
-    def _from_table(self, model: GyroModel, now: float) -> tuple[GyroModel, float | None]:
-        """Return a calibrated model with the bias of earlier runs on top."""
-        here = self._known_temperature
-        if here is None or not self.table.entries:
-            return model, None
-        bias, variance = self.table.predict(here, now)
-        return with_self_calibration(
-            model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
 
     @property
     def sentence(self) -> str:

@@ -25,7 +25,7 @@ from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import Drift, HEADING, smoothed
 from gyro_calibration.heading.tracker import ACCELERATION, HeadingTracker, JUMP, Settings
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, QUANTITIES
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, part
 from gyro_calibration.model.compensation import compensate, Compensated, rate_sensitivity
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
@@ -166,9 +166,7 @@ def compensate_log(model: GyroModel, log: Log) -> Array:
 
 def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
     """Return some rows of a log, by their numbers or by a mask, without unknown columns."""
-    arrays = {quantity: getattr(log, quantity) for quantity in QUANTITIES}
-    return Log(**{quantity: values[rows] for quantity, values in arrays.items()
-                  if values is not None}, notes=log.notes)
+    return part(replace(log, others={}), rows)
 
 
 def _bridged(time: Array, heading: Array | None) -> Array | float:

@@ -475,7 +475,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     return Log(**arrays)
 
 
-def part(log: Log, rows: slice | Mask) -> Log:
+def part(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
     """Return some rows of a log."""
     which = np.arange(len(log))[rows]
     arrays: dict[str, Any] = {name: getattr(log, name)[which] for name in QUANTITIES

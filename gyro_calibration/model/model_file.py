@@ -242,7 +242,15 @@ def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
 def model_text(model: GyroModel) -> str:
     """Return what a model file holds."""
     content: dict[str, Any] = {'format': FORMAT, 'version': VERSION}
-    content['effects'] = {term.effect.name: _term_content(term) for term in model.terms}
+    content['effects'] = effects = dict[str, Any]()
+    for term in model.terms:
+        named: dict[str, Any] = {parameter.name: value for parameter, value in zip(
+            term.effect.parameters, term.values)}
+        if term.effect.name == POLYNOMIAL:
+            temperature_order, rate_order = map(
+                int, term.effect.coefficients[-1].name[1:].split('w'))
+            named = {'orders': [rate_order, temperature_order], **named}
+        effects[term.effect.name] = named
     if model.covariance is not None:
         content['covariance'] = model.covariance.tolist()
     ranges = {'rate': model.rate_range, 'temperature': model.temperature_range}
@@ -264,13 +272,3 @@ def model_text(model: GyroModel) -> str:
     if model.tolerance != Tolerance():
         content['tolerance'] = dict(vars(model.tolerance))
     return settings_text(content)
-
-
-def _term_content(term: Term) -> dict[str, Any]:
-    named = {parameter.name: value
-             for parameter, value in zip(term.effect.parameters, term.values)}
-    if term.effect.name != POLYNOMIAL:
-        return named
-    temperature_order, rate_order = (
-        int(text) for text in term.effect.coefficients[-1].name[1:].split('w'))
-    return {'orders': [rate_order, temperature_order], **named}

@@ -603,7 +603,12 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
     if run.kind == REST:
         bias, deviation = calibrate_bias(time - time[0], rate, rules.limits, noise, output)
-        if abs(turned := _turned(run.odometry)) > _TURNED:
+        turned = 0.0  # by the headings of odometry or by its rates
+        if len(run.odometry) > 1:
+            at, headings, rates = np.array(run.odometry).T
+            turned = max(float(np.mean(rates) * np.ptp(at)),
+                         float(np.unwrap(headings)[-1] - headings[0]), key=abs)
+        if abs(turned) > _TURNED:
             raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
                               f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap '
                               'odom to an odometry of the wheels')
@@ -616,16 +621,6 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
     begin, motion = (time[0], run.motion) if run.motion is not None else _odometry_motion(run)
     return _compared(run, time - begin, rate, output, motion, rules, noise, when, prior)
-
-
-def _turned(odometry: list[tuple[float, float, float]]) -> float:
-    """Return the angle that odometry shows by its headings or its rates, rad."""
-    if len(odometry) < 2:
-        return 0.0
-    time, heading, rate = np.array(odometry).T
-    by_rates = float(np.mean(rate) * np.ptp(time))
-    by_headings = float(np.unwrap(heading)[-1] - heading[0])
-    return max(by_rates, by_headings, key=abs)
 
 
 def _odometry_motion(run: Run) -> tuple[float, Motion]:
