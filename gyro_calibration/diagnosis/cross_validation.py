@@ -145,6 +145,9 @@ def shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
     """
     Return which part of the mean square of the heading error over a minute each cause explains.
 
+    What a cause adds like a bias or a scale factor error is of these: they are refitted in any
+    case, and take it up without the cause.
+
     Parameters
     ----------
     logs : of each, what causes add to the change of heading between times, with what is 'left',
@@ -155,8 +158,17 @@ def shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
     over: dict[str, list[Array]] = {name: [] for parts, _ in logs for name in parts}
     for parts, time in logs:
         window = min(WINDOW, WITHIN * float(time[-1] - time[0]))
-        for name, of_all in over.items():  # a cause may be in one of the logs
-            of_all.append(over_windows(parts.get(name, 0.0 * parts['left']), time, window))
+        # a cause may be in one of the logs
+        turned = {name: over_windows(parts.get(name, 0.0 * parts['left']), time, window)
+                  for name in over}
+        plain = np.column_stack([np.ones(len(turned['left'])), turned['scale_factor_error']])
+        for name in over.keys() - {'bias', 'scale_factor_error', 'left'}:
+            alike = plain * np.linalg.lstsq(plain, turned[name], rcond=None)[0]
+            turned[name] -= alike.sum(axis=1)
+            turned['bias'] += alike[:, 0]
+            turned['scale_factor_error'] += alike[:, 1]
+        for name, each in turned.items():
+            over[name].append(each)
     found = {name: np.concatenate(each) for name, each in over.items()}
     total = sum(found.values(), np.zeros(len(found['left'])))
     square = float(np.mean(total ** 2)) if len(total) else 0.0

@@ -389,12 +389,13 @@ def limits(log: Log, reference: Reference) -> bool:
             rate_noise_share(log) > _NOISY or heading_errors(log).larger)
     if reference.kind == 'course' or reference.known == 'as given':
         return True
-    found = heading_errors(log)
-    if not found.larger:
+    found, step = heading_errors(log), encoder_step(log.reference_heading)
+    # while a shaft rests, which may be most of a log, the error of its encoder does not show
+    rounding = step / math.sqrt(12.0)
+    if not (found.larger or replace(found, error=rounding).larger):
         return False
-    step = encoder_step(log.reference_heading)
     return (reference.kind != 'encoder' or step > _FINE
-            or found.error > _EXPLAINED * step / math.sqrt(12.0))
+            or found.error > _EXPLAINED * rounding)
 
 
 @dataclass(frozen=True)

@@ -273,8 +273,7 @@ def _finding(each: Confirmed, extended: SpanFit, plain: SpanFit) -> Finding:
         name, parameters, each.p_value, [other for other in each.probability if other != name],
         minimum_detectable=(SEEN * float(half[0]) / 1.96
                             if len(values) == 1 and name != 'bandwidth' else None),
-        evidence=f'it {"adds" if each.predicted > 0.0 else "takes"} {abs(each.predicted):.1f} '
-        f'{"to" if each.predicted > 0.0 else "from"} the log-likelihood of stretches that took no '
+        evidence=f'it adds {each.predicted:.1f} to the log-likelihood of stretches that took no '
         f'part in choice and fit, and is chosen in {100.0 * each.chosen:.0f} % of them',
         probability=each.probability,
         where=(each.column.shapes[0], float(plain.spans.time[-1])) if each.column.once else None)
@@ -495,6 +494,7 @@ def search(done: SpanFit, level: float, on_part: OnPart) -> tuple[SpanFit, list[
         if best is None:
             break
         found.append(best)
+    found = [each for each in found if each.predicted > 0.0]
     extended = done
     while inside := [each.column for each in found if each.established]:
         extended = fit_spans(done.spans, inside)

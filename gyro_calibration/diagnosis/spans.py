@@ -40,7 +40,7 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
     wander,
 )
-from gyro_calibration.diagnosis.data_quality import heading_errors, rate_noise_share
+from gyro_calibration.diagnosis.data_quality import encoder_step, heading_errors, rate_noise_share
 from gyro_calibration.diagnosis.expected_output import angle_of, bridged, integral_of
 from gyro_calibration.logs.log import Array, DEGREE, Log
 from gyro_calibration.logs.quality import robust_deviation, white_noise
@@ -148,8 +148,8 @@ class Spans:
     ----------
     log : with output, time and reference heading
     channels : what effects look at; the rate is that of the gyro, as corrected so far
-    place : point of each known row of the reference
-    known : these rows
+    place : point of each known value of the reference
+    at : times of these values, s
     time, heading : of the points, s and rad, shape (n + 1,)
     rests : begin and end row of each stretch at rest
     treatment : of the kind of the reference
@@ -162,7 +162,7 @@ class Spans:
 
     log: Log
     channels: Channels
-    known: NDArray[np.intp]
+    at: Array
     place: NDArray[np.intp]
     time: Array
     heading: Array
@@ -188,7 +188,7 @@ class Spans:
     def points(self, values: Array) -> Array:
         """Return the means of a signal at the points, its delay taken off, shape (n + 1,)."""
         assert self.log.time is not None
-        moved = np.interp(self.log.time[self.known] + self.delay, self.log.time, values)
+        moved = np.interp(self.at + self.delay, self.log.time, values)
         return np.bincount(self.place, moved) / np.bincount(self.place)
 
     def integrals(self, rate: Array) -> Array:
@@ -227,7 +227,7 @@ class Spans:
         assert self.log.time is not None and self.log.output is not None
         turned = (np.asarray(self.channels.heading) if self.fine
                   else angle_of(self.log.time, self.log.output))
-        at, half = self.log.time[self.known] + self.delay, float(np.median(np.diff(self.log.time)))
+        at, half = self.at + self.delay, float(np.median(np.diff(self.log.time)))
         while True:
             forth, back = (np.interp(at + way, self.log.time, turned) for way in (half, -half))
             change = np.diff(np.bincount(self.place, (forth - back) / (2.0 * half))
@@ -370,8 +370,16 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
     if treatment.relative and not treatment.of_heading and heading_errors(log).larger:
         treatment = replace(treatment, of_heading=True)  # a heading that was differentiated
+    at = time
+    if kind == 'encoder' and encoder_step(reference):
+        # between two samples with different codes the shaft was in the middle between both; of
+        # one code only a range is known, and its error where the shaft rests or turns back is the
+        # same each time that it does so there: no noise, which averages out
+        at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
+        reference = np.append(np.where(np.diff(reference) != 0.0,
+                                       0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
     known = np.flatnonzero(np.isfinite(reference))
-    stamps = time[known]
+    stamps = at[known]
     length = max(treatment.span, float(stamps[-1] - stamps[0]) / treatment.most,
                  2.0 * float(np.median(np.diff(time))))
     # a gap begins a new point
@@ -383,7 +391,7 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
         place = np.arange(len(known))
     count = np.bincount(place)
     channels = replace(channels_of(log), rate=output, time=time, heading=integral_of(time, output))
-    return Spans(log, channels, known, place, np.bincount(place, time[known]) / count,
+    return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, _rests(time, output, known),
                  treatment, _walk(log, white, treatment), noisier)
 

@@ -10,7 +10,7 @@
 
 """The stated improvement by an extended model on held-out blocks: the state before, and limits."""
 
-from gyro_calibration.diagnosis.cross_validation import change_over, gain
+from gyro_calibration.diagnosis.cross_validation import change_over, gain, shares
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin
@@ -116,3 +116,18 @@ def test_intervals_of_the_improvement_hold_the_truth_for_few_parts(parts, shared
         inside += low <= np.hypot(1.0, 0.2) - np.hypot(shared, 0.2) <= high
     # Few squares are skew, which costs some per cent; resampled blocks cover 62 to 86 of 100.
     assert inside > 0.86 * runs, inside / runs
+
+
+def test_what_a_cause_adds_like_a_bias_or_a_scale_factor_error_is_not_its_share():
+    # a quadratic term at nearly one speed and a bias of the other sign, each 70 times the error
+    time = np.arange(601.0)
+    rate = 1.0 + 0.1 * np.sin(0.2 * time[1:])
+    parts = {'scale_factor_error': 0.02 * rate, 'quadratic_nonlinearity': 0.5 * rate ** 2,
+             'bias': np.full(600, -0.5), 'left': 1e-4 * np.cos(time[1:])}
+    found = shares([(parts, time)])
+    assert abs(found['quadratic_nonlinearity']) < 0.01
+    assert sum(found.values()) == pytest.approx(1.0)
+    # what no bias and no scale factor error makes is its own
+    own = {**parts, 'quadratic_nonlinearity': 1e-3 * np.sin(0.01 * time[1:]),
+           'bias': 0.0 * rate, 'scale_factor_error': 0.0 * rate}
+    assert shares([(own, time)])['quadratic_nonlinearity'] > 0.5

@@ -235,6 +235,18 @@ def test_a_fine_encoder_and_an_exact_rate_are_taken_as_they_are():
     assert not limits(exact, reference_of(exact))
 
 
+def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always():
+    # standing still, it adds nothing to the differences that its error is seen in
+    generator, time = np.random.default_rng(3), np.arange(0.0, 300.0, 0.02)
+    heading = np.interp(time, [100.0, 104.0, 200.0, 204.0], [0.0, 2.0, 2.0, -1.0])
+    walk = 0.8 * DEGREE / 60.0 / np.sqrt(0.02)
+    log = Log(time=time, output=np.gradient(heading, time)
+              + walk * generator.standard_normal(len(time)),
+              reference_heading=np.floor(heading / 0.002) * 0.002)
+    assert reference_of(log).kind == 'encoder' and limits(log, reference_of(log))
+    assert not heading_errors(log).larger
+
+
 @pytest.mark.parametrize('begins, ends', [(0.03, 0.03), (1.5, 0.5)])
 def test_odometry_that_begins_after_the_gyro_is_no_course(begins, ends):
     # 20 Hz, interpolated at 100 Hz as of a bag, with a gyro that is late and has a scale error
