@@ -94,8 +94,8 @@ class RepeatedOutput:
     Find out whether a gyro repeats one value: it is dead, saturated, or its driver has stopped.
 
     That is so where odometry shows another turn, and where its noise is larger than the steps of
-    its output. Some gyros report zero at rest: a repeated zero counts only after a stop that is too
-    sudden for a robot.
+    its output. Some gyros report zero at rest: a repeated zero counts only after a stop that is
+    too sudden for a robot.
 
     """
 

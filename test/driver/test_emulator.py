@@ -174,9 +174,18 @@ def test_samples_are_numbered():
     assert sent == list(range(100))
 
 
+class Adapter(Emulator):
+    """Sends what arrives behind an adapter, in bursts."""
+
+    _BATCH = 0.0
+
+    def _frames(self):
+        return bursts(super()._frames())
+
+
 def test_an_adapter_hands_over_in_bursts():
     """Sixteen samples of 1 ms each come together; a busy machine may take several at once."""
-    gyro = Emulator(find('csv'), samples(320, 1000.0), wait_for_reader=True, line=bursts)
+    gyro = Adapter(find('csv'), samples(320, 1000.0), wait_for_reader=True)
     with gyro:
         port, decoder = SerialPort(gyro.path, 9600, timeout=0.5), find('csv').decoder()
         port.open()

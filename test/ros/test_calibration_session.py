@@ -127,7 +127,7 @@ def test_who_drives_on_after_a_run_by_odometry_is_not_checked():
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0, drift=20.0 * DEGREE)
     run.odometry = [each for each in run.odometry if each[0] <= BEGIN + 20.0]
     assert 'at rest after it' not in calibrated(
-        run, Rules(Limits(time_offset=0.5), Reference(0.01), 2, True), Noise(), '')[1]
+        run, Rules(Limits(time_offset=0.5), Reference(0.01), 2), Noise(), '')[1]
 
 
 def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature():
