@@ -299,16 +299,11 @@ def _curved(time: Array, heading: Array) -> float:
     return float(np.median(joined)) if len(joined) else 0.0
 
 
-def _stretch_sums(values: Array, spans: _Spans) -> Array:
-    """Return the sums of values of the spans over stretches of the drive."""
-    number = np.floor((spans.time[1:] - spans.time[0]) / STRETCH).astype(np.intp)
-    return np.array([np.bincount(number, column) for column in np.atleast_2d(values.T)]).squeeze()
-
-
 def _covariance(found: GridFit, spans: _Spans) -> Array:
     """Return the covariance of (p, q): by the noise, or by the scatter of stretches if larger."""
     covariance = found.covariance[:2, :2]
-    sums = _stretch_sums(found.influence[:, :2], spans)
+    number = np.floor((spans.time[1:] - spans.time[0]) / STRETCH).astype(np.intp)
+    sums = np.array([np.bincount(number, column) for column in found.influence[:, :2].T])
     stretches = max(sums.shape[1], 2)
     scatter = np.diag(sums @ sums.T) * stretches / (stretches - 1.0)
     larger = np.sqrt(np.maximum(scatter / np.diag(covariance), 1.0))

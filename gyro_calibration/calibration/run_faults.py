@@ -150,7 +150,7 @@ def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str =
 
     """
     ways = {name: _best(way(run, motion, largest_offset)) for name, way in _WAYS.items()}
-    name = min(ways, key=lambda each: ways[each][0] * _PENALTIES.get(each, 1.0))
+    name = min(ways, key=lambda each: ways[each][0] * (_SIMPLER if each == 'slip' else 1.0))
     left, value = ways[name]
     if _SIMPLER * left > followed(run, motion, largest_offset)[0] <= EXPLAINED:
         return
@@ -216,7 +216,6 @@ def _slip(run: Pieces, motion: Motion, largest: float) -> Tried:
 
 _WAYS: dict[str, Callable[[Pieces, Motion, float], Tried]] = {
     'early': _early, 'speed': _speed, 'late': _late, 'slip': _slip}
-_PENALTIES = {'slip': _SIMPLER}
 _SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
     'early': lambda value, motion: (
         f"the robot stopped at about {value[0]:.1f} s of the profile's {motion.duration:.1f} s: "

@@ -386,13 +386,13 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
                           f'wanted {limits.rest:g} s: leave the robot at rest after it')
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
     noise, white, mean = noise or Noise(), _deviation_of_mean(corrected), float(corrected.mean())
-    variance = rest_variance(noise, duration, white, _change_at_rest(corrected))
+    change = _change_at_rest(corrected)
+    variance = rest_variance(noise, duration, white, change)
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
     scale = 1.0 + fit.scale_factor_error
     check = RestCheck(mean, deviation,
                       max(limits.drift, -float(ndtri(0.5 * false_refusals)) * deviation),
                       _with_rest(fit, scale * mean, scale ** 2 * variance))
-    change = _change_at_rest(corrected)
     if change > 2.0 * max(CHANCE * white, _DRIVING):
         raise DataRefused('after the run the robot still moved, its rate changed by '
                           f'{change / DEGREE:.2f} deg/s: leave it at rest after the run')
