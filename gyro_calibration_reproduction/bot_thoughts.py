@@ -123,22 +123,22 @@ def _slopes() -> list[Contradiction]:
                        'kelvin': abs(null / slope) / BIAS_TEMPERATURE,
                        'speed': (rates[2] - rates[1]) * (1.0 - first / second),
                        'interval': interval},
-                      'Part 1: the slopes {first:.3f} and {second:.3f} differ by {percent:.2f} %. '
-                      'A strobe that is off changes both alike. It takes a middle point that is '
-                      '{off:.2f} deg/s off a line, or 45 turns a minute off by {speed:.2f} deg/s, '
-                      'or a null that drifted by {null:.2f} deg/s, as {kelvin:.0f} K would do; '
-                      'three points cannot say which, and leave the slope uncertain by '
-                      '{interval:.2f}.'),
+                      'Part 1: the slopes {first:.3f} and {second:.3f} differ by {percent:.2f} '
+                      '%. An error of the strobe changes both slopes equally. One of these '
+                      'explains the difference: a middle point {off:.2f} deg/s off a line, an '
+                      'error of {speed:.2f} deg/s at 45 turns a minute, or a null that drifted '
+                      'by {null:.2f} deg/s, as by {kelvin:.0f} K. Three points do not '
+                      'distinguish them, and determine the slope to +- {interval:.2f}.'),
         Contradiction({'mean': (first + second) / 2.0,
                        'rounded': (round(first, 3) + round(second, 3)) / 2.0},
-                      'Part 1: the mean of the slopes is {mean:.4f}, that of the printed slopes '
-                      '{rounded:.4f}; it is printed as -14.309.'),
+                      'Part 1: the mean of the slopes is {mean:.4f}, and that of the printed '
+                      'slopes {rounded:.4f}; the printed mean is -14.309.'),
         Contradiction({'wrong': 2.0 * abs(MEANS[0] / SCALE_FACTOR),
                        'offsets': abs(SOLVED_OFFSET - NULL),
                        'hour': 3600.0 * abs(SOLVED_OFFSET - NULL)},
-                      'Part 2: the solver subtracts its offset, so the start [-14.309, 0.1793] '
-                      'has the wrong sign, {wrong:.2f} deg/s off; the offset that it finds and N '
-                      'of part 1 differ by {offsets:.3f} deg/s, {hour:.0f} deg/h.'),
+                      'Part 2: the solver subtracts its offset, so the initial value [-14.309, '
+                      '0.1793] has the wrong sign, an error of {wrong:.2f} deg/s. The fitted '
+                      'offset and N of part 1 differ by {offsets:.3f} deg/s, {hour:.0f} deg/h.'),
     ]
 
 
@@ -170,12 +170,12 @@ def _strobe() -> Contradiction:
                'crystal': 100.0 * 80e-6, 'left': 100.0 * (1.0 - corrected / SOLVED_SCALE),
                'nominal': 100.0 * (-SENSITIVITY * first - 1.0)}
     return Contradiction(numbers,
-                         'Part 1: a strobe at 59.8 Hz is {off:.2f} % off, as much as the slopes '
-                         'differ ({slopes:.2f} %), while the crystal explains {crystal:.3f} %. '
-                         'Seen at one scale, reference and gyro cannot be told apart: if the '
-                         'strobe was slow, SF is {corrected:.3f} and the solver differs by '
-                         "{left:.2f} %; the first slope alone is the data sheet's to "
-                         '{nominal:.3f} %.')
+                         'Part 1: a strobe at 59.8 Hz has an error of {off:.2f} %, as much as '
+                         'the slopes differ ({slopes:.2f} %); the tolerance of the crystal is '
+                         '{crystal:.3f} %. A scale error of the reference and one of the gyro '
+                         'are not distinguishable: if the strobe was slow, SF is '
+                         '{corrected:.3f}, and the solver differs by {left:.2f} %; the first '
+                         'slope alone agrees with the data sheet to {nominal:.3f} %.')
 
 
 # an encoder of 2 deg
@@ -214,10 +214,10 @@ def _solver(found: Array) -> list[Comparison]:
         Comparison("scale by the solver's way on a gyro with this SF", 'counts/(deg/s)',
                    SCALE_FACTOR * (1.0 + means[0]), '-14.49787', 'part 2',
                    3.0 * abs(SCALE_FACTOR) * deviations[0],
-                   'the way itself does not err so; a scale of encoder, strobe or time'),
+                   'not by the method; a scale error of encoder, strobe or time'),
         Comparison("offset by the solver's way on a gyro with this N", 'deg/s',
                    NULL + means[1] / DEGREE, '-0.20168', 'part 2',
-                   3.0 * deviations[1] / DEGREE, 'nor here; a null of another time'),
+                   3.0 * deviations[1] / DEGREE, 'not by the method; possibly another null'),
         Comparison("error of scale, solver's way: mean", '%', 100.0 * means[0]),
         Comparison("error of scale, solver's way: standard deviation", '%', 100.0 * deviations[0]),
         Comparison('error of scale, likelihood: mean', '%', 100.0 * means[2]),
@@ -238,13 +238,14 @@ def _method(found: Array) -> Contradiction:
                           'slow': 100.0 * error_by_increments(CALIBRATION),
                           'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0),
                           'late': late_enough()},
-                         "Part 2: the two methods differ by {turntable:.2f} % of the turntable's "
-                         'SF. Fitting the gradient of a 2 deg encoder at 50 Hz errs by '
+                         "Part 2: the two methods differ by {turntable:.2f} % of the turntable's"
+                         ' SF. Fitting the gradient of a 2 deg encoder at 50 Hz errs by '
                          '{solver:.4f} +- {solver_scatter:.4f} % only, the likelihood by '
-                         '{likely:.4f} +- {likely_scatter:.4f} %; the gyro would have to be '
-                         '{late:.2f} s late. The other way round, the gyro fitted to the '
-                         'gradient, the steps of the encoder make it {reverse:.1f} %, and '
-                         'increment by increment on a motion up to 45 deg/s {slow:.0f} %.')
+                         '{likely:.4f} +- {likely_scatter:.4f} %; a delay of the gyro of '
+                         '{late:.2f} s would explain the difference. In the reverse regression, '
+                         'of the gyro on the gradient, the steps of the encoder give an error of'
+                         ' {reverse:.1f} %, and of increments on a motion up to 45 deg/s one of '
+                         '{slow:.0f} %.')
 
 
 def error_by_increments(motion: Motion) -> float:

@@ -159,11 +159,11 @@ def _rectangle_rule() -> Contradiction:
                'trapezoid': max(map(abs, errors_by_trapezoids(motion)))}
     return Contradiction(numbers,
                          'Figures 6 and 7: data without noise gave errors of 4.8 and 20.26 % by '
-                         'the heading and 0 % by the rate, which no consistent estimator does. '
-                         'The rectangle rule of eq. 4 does: on a turn at {speed:.2f} rad/s for '
-                         '{turn:.2f} s at 20 Hz it errs by {s:.2f} % in s and {b:.2f} % in b, '
-                         'with the gyro one sample later by {late_s:.2f} and {late_b:.2f} %, '
-                         'and the trapezoid rule by {trapezoid:.2f} %.')
+                         'the heading and 0 % by the rate, which no consistent estimator can '
+                         'give. The rectangle rule of eq. 4 explains it: on a turn at '
+                         '{speed:.2f} rad/s for {turn:.2f} s at 20 Hz it errs by {s:.2f} % in s '
+                         'and {b:.2f} % in b, with the gyro one sample later by {late_s:.2f} and'
+                         ' {late_b:.2f} %, and the trapezoid rule by {trapezoid:.2f} %.')
 
 
 def _short_move() -> Contradiction:
@@ -183,8 +183,8 @@ def _exchanged_columns() -> Contradiction:
     printed, exchanged = equation_8(CALIBRATION, True), equation_8(CALIBRATION, False)
     return Contradiction({'first': printed[0], 'second': printed[1], 'right_first': exchanged[0],
                           'right_second': exchanged[1]},
-                         'Eq. 8: the columns of the matrix are exchanged. As printed it gives '
-                         '[s_bar, b_bar] = [{first:.4f}, {second:.4f}], put right '
+                         'Eq. 8: the columns of the matrix are exchanged. The printed form gives'
+                         ' [s_bar, b_bar] = [{first:.4f}, {second:.4f}], the corrected form '
                          '[{right_first:.4f}, {right_second:.4f}].')
 
 
@@ -222,26 +222,26 @@ def _bias_unit() -> Contradiction:
     drift = PRINTED_BIAS * DRIVE
     return Contradiction({'drift': drift, 'mean': drift / 2.0, 'published': PURE[0],
                           'fits': drift / 60.0},
-                         'Section 4.2: b = 0.75 deg/s drifts by {drift:.0f} deg in 160 s, by '
-                         '{mean:.0f} deg in the mean, where table 1 has a mean error of '
-                         '{published:.2f} deg without any compensation; 0.75 deg/min drifts by '
-                         '{fits:.0f} deg.')
+                         'Section 4.2: b = 0.75 deg/s drifts by {drift:.0f} deg in 160 s, with a'
+                         ' mean of {mean:.0f} deg; table 1 has a mean error of {published:.2f} '
+                         'deg without any compensation; 0.75 deg/min drifts by {fits:.0f} deg.')
 
 
 def _percentages() -> Contradiction:
     return Contradiction({'table': _off(CALIBRATED[0]), 'mean': _off(PROPOSED[0]),
                           'deviation': 100.0 - 100.0 * PROPOSED[1] / PURE[1]},
-                         'Section 4.2: the text has 41 % less error by self-calibration, table 1 '
-                         'has {table:.0f} %. Both methods together take {mean:.0f} % off the mean '
-                         'error, but {deviation:.0f} % off its standard deviation.')
+                         'Section 4.2: the text states that self-calibration reduces the error '
+                         'by 41 %, table 1 by {table:.0f} %. Both methods together reduce the '
+                         'mean error by {mean:.0f} %, and its standard deviation by '
+                         '{deviation:.0f} %.')
 
 
 def _half_an_hour() -> Contradiction:
     drift = drift_in_half_an_hour()
     return Contradiction({'sum': sum(drift), 'squares': math.hypot(*drift)},
-                         'Section 1: 18 deg/h and 2.5 deg/sqrt(h) over 30 min are {sum:.1f} deg '
-                         'as a sum, but {squares:.1f} deg as the standard deviation that it is '
-                         'called.')
+                         'Section 1: 18 deg/h and 2.5 deg/sqrt(h) over 30 min give {sum:.1f} deg'
+                         ' as a sum. The paper calls it a standard deviation, which is '
+                         '{squares:.1f} deg.')
 
 
 # table 1
@@ -249,8 +249,8 @@ def _half_an_hour() -> Contradiction:
 #: The filters of table 1: single samples as published, and the mean of 0.2 s.
 FILTERS = {'single samples': Threshold(THRESHOLD * DEGREE, 0.0),
            'mean of 0.2 s': Threshold(THRESHOLD * DEGREE, 0.2)}
-_FILTER = ('below the noise of a sample', 'knowing exactly when it stands does no better',
-           's and b act while it turns')
+_FILTER = ('below the noise of a sample', 'the exact times of rest give no more',
+           's and b act during turns')
 _OTHER = 'their error held more than s, b and noise'
 #: The methods of `drive_errors`: words, the row of table 1, its reduction of the error of pure
 #: integration, %, and why it differs here, where only s, b and noise are simulated.
@@ -331,20 +331,20 @@ def _noise_over_threshold(errors: Array) -> Contradiction:
                'mean': off['threshold filter, mean of 0.2 s'], 'known': off['rest known exactly'],
                'both': off['likelihood and filter, mean of 0.2 s']}
     return Contradiction(numbers,
-                         'Eq. 12: 2.5 deg/sqrt(h) is {sigma:.3f} deg/s in a white sample at '
-                         '100 Hz, so 0.3 deg/s is {ratio:.2f} sigma and lets {passes:.0f} % of '
-                         'the samples of a robot at rest through. In simulation the filter alone '
-                         'takes {single:.1f} % off, not 53 %; decided on the mean of 0.2 s '
-                         '{mean:.0f} %, as knowing exactly when the robot stands does '
-                         '({known:.0f} %), and with self-calibration {both:.0f} %.')
+                         'Eq. 12: 2.5 deg/sqrt(h) is {sigma:.3f} deg/s in a white sample at 100 '
+                         'Hz, so 0.3 deg/s is {ratio:.2f} sigma, and {passes:.0f} % of the '
+                         'samples of a robot at rest pass. In simulation the filter alone '
+                         'reduces the error by {single:.1f} %, not 53 %. On the mean of 0.2 s it'
+                         ' reduces it by {mean:.0f} %, the exact times of rest by {known:.0f} %,'
+                         ' and the filter with self-calibration by {both:.0f} %.')
 
 
 def _slow_turns() -> Contradiction:
     return Contradiction({'lost': 60.0 * 0.99 * THRESHOLD - _kept_heading(0.99),
                           'kept': _kept_heading(1.01), 'limit': 60.0 * THRESHOLD},
-                         'Eq. 12: the threshold deletes true turns. Of a minute at 99 % of it '
-                         '{lost:.1f} deg are lost, at 101 % {kept:.1f} deg are kept: turns below '
-                         '{limit:.0f} deg/min are invisible.')
+                         'Eq. 12: the threshold deletes true turns. One minute at 99 % of the '
+                         'threshold loses {lost:.1f} deg, one minute at 101 % keeps {kept:.1f} '
+                         'deg: turns below {limit:.0f} deg/min are not measured.')
 
 
 def _kept_heading(part: float) -> float:
@@ -370,7 +370,7 @@ def _efficiency(generator: np.random.Generator, runs: int, progress: Progress) -
     ratios = np.std(found, axis=0, ddof=1).reshape(2, 2) / bound
     return Contradiction({'s': ratios[0, 0], 'b': ratios[0, 1], 'likely_s': ratios[1, 0],
                           'likely_b': ratios[1, 1]},
-                         'Eq. 7: least squares on headings takes a random walk for independent '
-                         'errors. Its standard deviations are {s:.2f} (s) and {b:.2f} (b) of the '
-                         'Cramer-Rao bound, those of the likelihood {likely_s:.2f} and '
+                         'Eq. 7: least squares on headings treats a random walk as independent '
+                         'errors. Its standard deviations are {s:.2f} (s) and {b:.2f} (b) times '
+                         'the Cramer-Rao bound, those of the likelihood {likely_s:.2f} and '
                          '{likely_b:.2f}.')

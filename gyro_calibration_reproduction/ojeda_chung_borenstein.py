@@ -238,8 +238,8 @@ def _order_of_magnitude(found: Array) -> Contradiction:
                           'more': math.sqrt((before / 10.0) ** 2 - after ** 2)},
                          'Abstract: the figures of Table I allow more than one order of '
                          'magnitude, {before:.3f} to {after:.4f} deg/s, {ratio:.0f} times. One '
-                         'order is left if what is in neither table nor polynomial makes '
-                         '{more:.3f} deg/s rms.')
+                         'order of magnitude remains if errors outside the table and the '
+                         'polynomial are {more:.3f} deg/s rms.')
 
 
 def _percent(found: Array) -> Contradiction:
@@ -248,11 +248,12 @@ def _percent(found: Array) -> Contradiction:
     return Contradiction({'specified': NONLINEARITY + SCALE_OVER_TEMPERATURE / 2.0,
                           'before': before, 'after': after,
                           'left': 100.0 * float((found[:, -1, 0] / found[:, 0, 0]).mean())},
-                         'Section 5: less than 2 % of what? Of the rate, Table I allows '
-                         '{specified:.1f} % before any calibration (0.5 % and half of 2 %), and '
-                         'the synthetic gyro has {before:.2f} % of a turn before and '
-                         '{after:.2f} % after. Of the error, one order of magnitude leaves 10 %; '
-                         'the synthetic gyro keeps {left:.1f} %.')
+                         'Section 5: "less than 2 %" does not state of which quantity. As a '
+                         'share of the rate, Table I allows {specified:.1f} % before any '
+                         'calibration (0.5 % and half of 2 %), and the synthetic gyro has '
+                         '{before:.2f} % of a turn before and {after:.2f} % after. As a share of'
+                         ' the error, one order of magnitude is 10 %; {left:.1f} % of the error '
+                         'of the synthetic gyro remains.')
 
 
 # misprints, and properties of the method
@@ -270,9 +271,10 @@ def _index() -> Contradiction:
                'cubic': columns_of_equation_10(p, p, p),
                'cubic_right': columns_of_equation_10(p, p, p + 1)}
     return Contradiction(numbers,
-                         'Eq. 10: the index i + (j-1)p collides. With p = 3 and q = 2 it gives '
-                         '{printed:d} different columns of {right:d}, with p = q = 3 {cubic:d} of '
-                         '{cubic_right:d}; i + (j-1)(p+1) gives all.')
+                         'Eq. 10: the index i + (j-1)p is the same for several pairs of i and j.'
+                         ' With p = 3 and q = 2 it gives {printed:d} different columns of '
+                         '{right:d}, with p = q = 3 {cubic:d} of {cubic_right:d}; the index i + '
+                         '(j-1)(p+1) gives all columns.')
 
 
 def _data_sets() -> Contradiction:
@@ -280,10 +282,10 @@ def _data_sets() -> Contradiction:
                            ((-FULL_SCALE, FULL_SCALE, 10.0), (COLDEST, WARMEST, 2.0)))
     return Contradiction({'rates': rates, 'temperatures': temperatures,
                           'sets': rates * temperatures, 'step': 2.0 * FULL_SCALE / 10.0},
-                         'Section 3.3: every 10 deg/s over +-100 deg/s are {rates:d} rates, with '
-                         '{temperatures:d} temperatures {sets:d} data sets and not 121; 11 rates '
-                         'are every {step:.0f} deg/s. There p and q count rates and temperatures, '
-                         'in eq. 10 they are orders.')
+                         'Section 3.3: steps of 10 deg/s over +-100 deg/s give {rates:d} rates, '
+                         'and with {temperatures:d} temperatures {sets:d} data sets, not 121. 11'
+                         ' rates correspond to steps of {step:.0f} deg/s. p and q are numbers of'
+                         ' rates and temperatures there, and orders in eq. 10.')
 
 
 def condition_numbers() -> tuple[float, float]:
@@ -304,8 +306,9 @@ def _condition() -> Contradiction:
     return Contradiction({'raw': raw, 'scaled': scaled, 'digits': math.log10(raw),
                           'normal': 2.0 * math.log10(raw)},
                          'Eq. 10: raw powers of deg/s and degC have the condition number '
-                         '{raw:.1e}, centred and scaled ones {scaled:.0f}. That costs '
-                         '{digits:.0f} of 16 digits, and all by normal equations ({normal:.0f}).')
+                         '{raw:.1e}, centred and scaled ones {scaled:.0f}. The raw powers lose '
+                         '{digits:.0f} of 16 digits, and by normal equations {normal:.0f}, which'
+                         ' is all.')
 
 
 def error_by_regressor(deviation: float, averaged: int, generator: np.random.Generator,
@@ -335,11 +338,11 @@ def _regressor(generator: np.random.Generator) -> Contradiction:
         for kind, averaged in (('single', 1), ('mean', SAMPLES)):
             numbers[f'{name}_{kind}'] = error_by_regressor(deviation, averaged, generator) / DEGREE
     return Contradiction(numbers,
-                         'Eq. 9: the error is regressed on an output that holds the same noise. '
-                         'With samples that scatter by {white:.4f} deg/s the error at 100 deg/s '
-                         'is wrong by {white_single:.0e} deg/s, with means of 100 by '
-                         '{white_mean:.0e}; on a table that shakes by {vibration:.0f} deg/s by '
-                         '{vibration_single:.3f} and {vibration_mean:.4f} deg/s.')
+                         'Eq. 9: the regressor is the output, which contains the same noise as '
+                         'the error. With samples that scatter by {white:.4f} deg/s the error at'
+                         ' 100 deg/s is wrong by {white_single:.0e} deg/s, with means of 100 by '
+                         '{white_mean:.0e}; on a table that vibrates by {vibration:.0f} deg/s by'
+                         ' {vibration_single:.3f} and {vibration_mean:.4f} deg/s.')
 
 
 def extrapolation(sagnac: float, generator: np.random.Generator) -> tuple[float, float]:
@@ -366,10 +369,11 @@ def _sine(generator: np.random.Generator, runs: int, progress: Progress) -> Cont
     (weak, weak_sine), (strong, strong_sine) = np.mean(found, axis=0) / DEGREE
     return Contradiction({'k': SAGNAC, 'weak': weak, 'weak_sine': weak_sine,
                           'strong_k': STRONG_SAGNAC, 'strong': strong, 'strong_sine': strong_sine},
-                         'Eq. 3: a cubic is the start of a sine. Calibrated up to 60 deg/s, the '
-                         'polynomial (3, 2) errs between 70 and 100 deg/s by {weak:.4f} deg/s, '
-                         'five effects with a sine by {weak_sine:.4f} (k = {k:.2f} s); with k = '
-                         '{strong_k:.2f} s by {strong:.3f} and {strong_sine:.4f}.')
+                         'Eq. 3: a cubic approximates a sine at low rates only. Calibrated up to'
+                         ' 60 deg/s, the polynomial (3, 2) errs between 70 and 100 deg/s by '
+                         '{weak:.4f} deg/s, five effects with a sine by {weak_sine:.4f} (k = '
+                         '{k:.2f} s); with k = {strong_k:.2f} s by {strong:.3f} and '
+                         '{strong_sine:.4f}.')
 
 
 def _full_turn() -> Contradiction:
@@ -377,15 +381,16 @@ def _full_turn() -> Contradiction:
     duration = 360.0 / rate
     return Contradiction({'error': error, 'rate': rate, 'right': error * duration,
                           'printed': error * OUTPUT_RATE * duration},
-                         'Eq. 14: error times output rate times time is no angle. {error:.1f} '
-                         'deg/s in a turn at {rate:.0f} deg/s are {right:.0f} deg, as printed '
-                         '{printed:.0f}; the samples have to be divided by the output rate.')
+                         'Eq. 14: error times output rate times time does not have the unit of '
+                         'an angle. {error:.1f} deg/s in a turn at {rate:.0f} deg/s give '
+                         '{right:.0f} deg, and {printed:.0f} deg by the printed formula; the '
+                         'samples must be divided by the output rate.')
 
 
 def _earth() -> Contradiction:
     earth = EARTH_RATE * math.sin(LATITUDE * DEGREE)
     return Contradiction({'earth': earth, 'stability': 3600.0 * STABILITY,
                           'ratio': earth / (3600.0 * STABILITY)},
-                         'Eq. 1: the static bias holds the rate of the Earth, in Ann Arbor '
-                         '{earth:.1f} deg/h on a level floor, {ratio:.1f} times the bias '
+                         'Eq. 1: the static bias includes the rate of the Earth, {earth:.1f} '
+                         'deg/h on a level floor in Ann Arbor, {ratio:.1f} times the bias '
                          'stability of {stability:.1f} deg/h.')

@@ -139,7 +139,7 @@ def test_eq_10_as_printed_puts_several_powers_into_one_column():
     for i in range(1, 5):
         for j in range(1, 4):
             columns.setdefault(i + (j - 1) * 3, []).append((3 - i + 1, 2 - j + 1))
-    found = numbers('ojeda', 'collides')
+    found = numbers('ojeda', 'same for several pairs')
     assert found['printed'] == len(columns) == 10 and columns[4] == [(3, 1), (0, 2)]
     assert (found['right'], found['cubic'], found['cubic_right']) == (12, 13, 16)
 
@@ -195,7 +195,7 @@ def test_the_calibration_takes_the_error_down_to_what_noise_leaves():
 def test_noise_in_the_regressor_does_what_the_expected_normal_equations_say():
     nodes, weights = np.polynomial.hermite_e.hermegauss(12)
     rates, weights = np.linspace(-100, 100, 21)[:, None] / 100, weights / weights.sum()
-    found = numbers('ojeda', 'regressed on an output')
+    found = numbers('ojeda', 'the regressor is the output')
     for name, deviation in (('vibration_single', 1.0), ('vibration_mean', 0.1)):
         noise = deviation / 100 * nodes
         powers = np.array([(rates + noise) ** i for i in range(4)])
@@ -215,7 +215,7 @@ def test_the_cubic_fails_beyond_its_range_as_without_noise():
         return np.array([np.sin(0.25 * rates) / 0.25 + (slope - 1) * rates for slope in slopes])
     left = [output - rates - np.polyval(np.polyfit(known, known - inside, 3), output)
             for known, output, rates in zip(output(inside), output(beyond), [beyond] * 11)]
-    found = numbers('ojeda', 'start of a sine')
+    found = numbers('ojeda', 'approximates a sine')
     assert found['strong'] == pytest.approx(np.sqrt(np.mean(np.square(left))) / DEGREE, rel=0.05)
     assert (found['strong_sine'] < 0.1 * found['strong']
             and found['weak_sine'] < found['weak'] < 0.1 * found['strong'])
@@ -224,11 +224,11 @@ def test_the_cubic_fails_beyond_its_range_as_without_noise():
 def test_the_other_numbers_of_ojeda_follow_by_hand():
     assert numbers('ojeda', 'Ann Arbor')['earth'] == pytest.approx(10.12, abs=0.01)
     assert numbers('ojeda', 'Ann Arbor')['ratio'] == pytest.approx(10.12 / 7.2, abs=0.01)
-    assert numbers('ojeda', 'data sets and not 121') == {'rates': 21, 'temperatures': 11,
-                                                         'sets': 231, 'step': 20.0}
-    assert (numbers('ojeda', 'no angle')['printed']
-            == 10 * numbers('ojeda', 'no angle')['right'] == 10.0)
-    assert numbers('ojeda', 'of what?')['specified'] == 1.5
+    assert numbers('ojeda', 'data sets, not 121') == {'rates': 21, 'temperatures': 11,
+                                                      'sets': 231, 'step': 20.0}
+    assert (numbers('ojeda', 'unit of an angle')['printed']
+            == 10 * numbers('ojeda', 'unit of an angle')['right'] == 10.0)
+    assert numbers('ojeda', 'of which quantity')['specified'] == 1.5
     order = numbers('ojeda', 'more than one order')
     assert math.hypot(order['more'], order['after']) == pytest.approx(order['before'] / 10)
     assert ours('ojeda', 'angle random walk of 5 (deg/h)/sqrt(Hz)').ours == pytest.approx(1 / 12)
@@ -330,7 +330,7 @@ def test_the_other_numbers_of_hong_and_park_follow_by_hand():
         {'drift': 120, 'mean': 60, 'published': 1.6675, 'fits': 2})
     assert numbers('hong_park', 'as a sum') == pytest.approx(
         {'sum': 10.77, 'squares': 9.17}, abs=0.01)
-    assert numbers('hong_park', 'the text has 41 %') == pytest.approx(
+    assert numbers('hong_park', 'by 41 %') == pytest.approx(
         {'table': 30.97, 'mean': 64.11, 'deviation': 13.78}, abs=0.01)
     assert numbers('hong_park', 'deletes true turns') == pytest.approx(
         {'lost': 17.82, 'kept': 18.18, 'limit': 18.0}, rel=1e-6)
@@ -346,13 +346,14 @@ def test_the_slopes_come_out_of_the_means():
     assert ours('bot_thoughts', 'N, line through three points').ours == pytest.approx(rest / slope)
     left = np.array([2.5654, -2854.5, -3857.9]) - rest - slope * np.array([0, 200, 270])
     deviation = math.sqrt(left @ left / np.square(np.array([0, 200, 270]) - 470 / 3).sum())
-    found = numbers('bot_thoughts', 'A strobe that is off')
+    found = numbers('bot_thoughts', 'An error of the strobe')
     assert (found['interval'] == pytest.approx(12.706 * deviation, rel=1e-4)
             and found['off'] == pytest.approx(abs(left[1] / slope)))
 
 
 def test_each_cause_that_is_named_makes_the_slopes_equal():
-    found, (first, second) = numbers('bot_thoughts', 'A strobe that is off'), bot_thoughts.slopes()
+    found = numbers('bot_thoughts', 'An error of the strobe')
+    first, second = bot_thoughts.slopes()
     assert (-2854.5 - 2.5654 + first * found['null']) / 200 == pytest.approx(second, rel=1e-4), (
         'the null')
     assert (-3857.9 + 2854.5) / (70 + found['speed']) == pytest.approx(first, rel=1e-4), (
