@@ -276,8 +276,8 @@ def test_pure_integration_errs_by_s_and_b_alone():
 
 
 @pytest.mark.evidence
-def test_calibration_and_filter_take_off_the_heading_error_what_the_first_page_says():
-    text = (Path(__file__).parents[1] / 'README.md').read_text()
+def test_calibration_and_filter_take_off_the_heading_error_what_the_page_on_results_says():
+    text = (Path(__file__).parents[1] / 'docs/explanation/scope.md').read_text()
     for row, name in (
             ('self-calibration', 'self-calibration by likelihood'),
             ('threshold filter, single samples, as published', 'threshold filter, single samples'),
