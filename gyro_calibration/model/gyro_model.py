@@ -223,9 +223,10 @@ class GyroModel:
 
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
-        """Return plausible temperatures, degC: usual ones, and three times the valid range."""
+        """Return plausible temperatures, degC: usual ones, and three times a stated range."""
         low, high = self.valid_temperatures
-        return min(2.0 * low - high, _TEMPERATURES[0]), max(2.0 * high - low, _TEMPERATURES[1])
+        reach = high - low if math.isfinite(sum(map(abs, self.temperature_range))) else 0.0
+        return min(low - reach, _TEMPERATURES[0]), max(high + reach, _TEMPERATURES[1])
 
     @cached_property
     def valid_temperatures(self) -> tuple[float, float]:

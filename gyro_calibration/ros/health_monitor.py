@@ -49,6 +49,9 @@ CHANCE = 1e-3
 #: A value that comes so often, and for so long, s, is repeated: a gyro whose noise is _QUIET times
 #: less than that of the model, and 2 steps of its output, repeats a value with a chance of 0.2.
 _REPEATS, _REPEATED = 20, 0.25
+#: Also a gyro of larger steps is dead where this is exceeded by the logarithm of the chance of so
+#: many repeated values: e^-25 for a gyro that sends each sample four times.
+_IMPROBABLE = 100.0
 #: So many changes show the step of an output.
 _CHANGES = 100
 #: Odometry shows a turn from this rate on, rad/s.
@@ -94,8 +97,8 @@ class RepeatedOutput:
     Find out whether a gyro repeats one value: it is dead, saturated, or its driver has stopped.
 
     That is so where odometry shows another turn, and where its noise is larger than the steps of
-    its output. Some gyros report zero at rest: a repeated zero counts only after a stop that is
-    too sudden for a robot.
+    its output, or chance is excluded. Some gyros report zero at rest: a repeated zero counts only
+    after a stop that is too sudden for a robot.
 
     """
 
@@ -128,8 +131,12 @@ class RepeatedOutput:
         if lasts > _PART and abs(turning) > _TURNS and abs(output - turning) > 0.5 * abs(turning):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
-        return ((output != 0.0 or self._fell) and self._changes > _CHANGES
-                and 2.0 * _QUIET * self._step < sample)
+        if output == 0.0 and not self._fell or self._changes <= _CHANGES or not sample:
+            return False
+        # the chance of one more sample with the value, where the noise is low and lies around it
+        repeats = math.erf(_QUIET * self._step / (2.0 * math.sqrt(2.0) * sample))
+        return (2.0 * _QUIET * self._step < sample
+                or -self._count * math.log(max(repeats, 1e-9)) > _IMPROBABLE)
 
 
 class HealthMonitor:

@@ -241,6 +241,17 @@ def test_zeros_are_those_of_a_dead_gyro_where_no_robot_stops_so_fast(
     assert bool(rig.pipeline.repeats) == stuck
 
 
+@pytest.mark.parametrize('step, stuck', [(0.002, True), (0.02, False)])
+def test_a_saturated_gyro_of_coarse_steps_is_an_error_as_soon_as_chance_is_ruled_out(
+        tmp_path, step, stuck):
+    rig = Rig(tmp_path, model=KNOWN)
+    outputs = np.round(noisy(60.0, 0.5 * np.sin(np.arange(1500) / 50.0)) / step) * step
+    rig.feed(outputs, SLOW)
+    assert not rig.pipeline.stuck
+    rig.feed(np.full(500, 0.3), SLOW)
+    assert bool(rig.pipeline.stuck) == stuck
+
+
 def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_nothing(tmp_path):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(noisy(10.0), SLOW)
@@ -468,12 +479,14 @@ def test_a_temperature_that_leaps_is_not_used(tmp_path, odd):
     assert rig.journal.counts['refused_temperatures'] == odd.count(60.0)
 
 
-def test_a_temperature_that_stays_where_it_has_leapt_is_used(tmp_path):
+@pytest.mark.parametrize('last, used', [(61.0, 61.0), (-239.0, 25.0)])
+def test_a_temperature_that_stays_where_it_has_leapt_is_used_where_it_is_possible(
+        tmp_path, last, used):
     rig = Rig(tmp_path, model=THERMAL)
     rig.feed(noisy(5.0), SLOW, temperature=25.0)
-    for each in (60.0, 61.0):
+    for each in (last - 1.0, last):
         rig.pipeline.temperature(rig.fed, each)
-    assert rig.pipeline.estimator.temperature == 61.0
+    assert rig.pipeline.estimator.temperature == used
 
 
 def test_a_temperature_of_the_future_is_one_of_now(tmp_path):
