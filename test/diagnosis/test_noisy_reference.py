@@ -21,6 +21,7 @@ from gyro_calibration.diagnosis.data_quality import (
 )
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.spans import fit_spans, spans_of
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.logs.recording import interpolated
@@ -245,6 +246,20 @@ def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always
               reference_heading=np.floor(heading / 0.002) * 0.002)
     assert reference_of(log).kind == 'encoder' and limits(log, reference_of(log))
     assert not heading_errors(log).larger
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_a_coarse_encoder_shows_the_noise_of_the_gyro_and_no_delay(seed):
+    # the error of a code that stands while the shaft rests was taken for a random walk
+    hidden = hide_beside([], 0.0, np.random.default_rng(seed), Imperfect('encoder', 0.5))
+    found = fit_spans(spans_of(log_of(hidden), 'encoder'))
+    true = hidden.truth.expected
+    assert found.size('angle_random_walk') < 3.0 * true['angle_random_walk']
+    log, scale = log_of(hidden), 1.0 + true['scale_factor_error']
+    for value, sought in ((found.values[0], scale - 1.0), (found.values[2], 0.0),
+                          (found.values[1], np.mean(log.output - scale * hidden.truth.rate))):
+        place = int(np.flatnonzero(found.values == value)[0])
+        assert abs(value - sought) < 2.0 * found.half(place), (place, value, sought)
 
 
 @pytest.mark.parametrize('begins, ends', [(0.03, 0.03), (1.5, 0.5)])
