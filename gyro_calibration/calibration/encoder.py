@@ -34,6 +34,7 @@ from gyro_calibration.calibration.course_over_ground import (
     fit_course,
     is_course,
     PRIORS,
+    ROUNDED,
     WHITE,
 )
 from gyro_calibration.calibration.dwells import Dwells
@@ -176,6 +177,10 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
                      _after(time, output, motion, fit))
     walk = fit.angle_random_walk if method == 'likelihood' else drift.angle_random_walk
     model = _model(output, log.temperature, fit, noise or Noise(walk))
+    # the steps of an encoder hide white noise
+    if noise is None and method == 'likelihood' and quantization_step(motion.heading) < ROUNDED:
+        low, high = walk / np.sqrt(stats.chi2.ppf([0.975, 0.025], fit.freedom) / fit.freedom)
+        model = replace(model, noise_bounds={'angle_random_walk': (float(low), float(high))})
     return EncoderCalibration(model, method, fit, drift, motion, before, after, _lost(time),
                               _remarks(fit, method))
 

@@ -209,11 +209,15 @@ class HeadingEstimator:
         self.used, age = ((assumed(self.model, self._assumptions), 0.0) if fresh
                           else self._carried(now))
         self.covariance = uncertain(self.used, self._assumptions)
+        temperature = self.model.reference_temperature
+        per_rate = None if self.used.looks_around else np.subtract(*(
+            self._sensitive(rate, rate, temperature, None, 0.0)
+            for rate in (DEGREE, 0.0))) / DEGREE
         if self._tracker is None:
             self._tracker = HeadingTracker(self.used.noise, self.covariance, self._settings, age,
-                                           self._keep)
+                                           self._keep, per_rate)
         else:
-            self._tracker.use(self.used.noise, self.covariance, age)
+            self._tracker.use(self.used.noise, self.covariance, age, per_rate)
         self._begun = now
         self._anchor(now)
         self._unknown_since = self._time if fresh and not self._anchored else math.inf

@@ -130,7 +130,7 @@ class HeadingTracker:
     """
 
     def __init__(self, noise: Noise, covariance: Array, settings: Settings,
-                 age: float | None = 0.0, keep: bool = False):
+                 age: float | None = 0.0, keep: bool = False, per_rate: Array | None = None):
         """
         Begin at heading zero.
 
@@ -140,8 +140,11 @@ class HeadingTracker:
         covariance : of the calibration, shape (m, m), from `compensation.covariance`
         age : of the self-calibration, whose s and b are the last values, s; None without one
         keep : the `steps`, for `smoothed`
+        per_rate : by which the sensitivity changes with the rate, shape (m,): the rates that are
+            added include the bias that rests have shown, on which a scale factor error does not act
 
         """
+        self._per_rate = per_rate
         self.heading = self.rate = self.deleted = 0.0
         self.resting, self.steps, self._keep, self._interval = False, list[Step](), keep, math.inf
         self.renewed = list[tuple[int, Drift]]()
@@ -196,7 +199,8 @@ class HeadingTracker:
             self._recognize()
         self._take()
 
-    def use(self, noise: Noise, covariance: Array, age: float | None = 0.0) -> None:
+    def use(self, noise: Noise, covariance: Array, age: float | None = 0.0,
+            per_rate: Array | None = None) -> None:
         """
         Go on with other noise figures and another calibration.
 
@@ -210,7 +214,7 @@ class HeadingTracker:
             self._go_on(self._at_rest(turn) if self.resting else turn, self._reached)
             self.renewed.append((len(self.steps), self._drift))
             self._drift = drift
-        self._still = None
+        self._still, self._per_rate = None, per_rate
         if self._last is not None:
             self._last = (*self._last[:3], np.zeros(len(covariance)))
         self._energy.clear()
@@ -244,7 +248,7 @@ class HeadingTracker:
         if self.resting:
             return float(self._drift.covariance[HEADING, HEADING]) + self._pending ** 2
         if self._known is None:
-            self._known = self._drift.heading_variance(self._open)
+            self._known = self._drift.heading_variance(self._moving(self._open))
         part = self._part
         return (self._known + self._drift.noise.angle_random_walk ** 2 * part.duration
                 + part.lost + part.noise + self._pending ** 2)
@@ -400,7 +404,7 @@ class HeadingTracker:
                         piece.close(until - 1)
                         piece.epochs.append(self._epoch(until - 1))
                     elif not self.resting:
-                        piece.epochs[-1].opens.append((until - 1, self._open))
+                        piece.epochs[-1].opens.append((until - 1, self._moving(self._open)))
                     continue
                 piece.close(piece.begins[number])
                 for place in range(piece.begins[number], until):
@@ -422,7 +426,7 @@ class HeadingTracker:
 
     def _epoch(self, place: int) -> Epoch:
         return Epoch(place, self._taken, self._drift, self.resting, self.heading, self._pending,
-                     [(place, self._open)])
+                     [(place, self._moving(self._open))])
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, where it ends a rest within."""
@@ -786,9 +790,17 @@ class HeadingTracker:
 
     def _go_on(self, turn: RateIntegral, end: float) -> None:
         """Take the state on over a turn that ends at a time, s."""
+        turn = turn if self.resting else self._moving(turn)
         if self._keep:
             self.steps.append(Step(self._drift, turn, self.resting, end))
         self._drift = self._drift.rested(turn) if self.resting else self._drift.moved(turn)
+
+    def _moving(self, turn: RateIntegral) -> RateIntegral:
+        """Return what rates came to, with the sensitivity at the rates without their bias."""
+        if self._per_rate is None or self._still is None or turn.unseen:
+            return turn
+        bias, _ = self._drift.bias(self._still)
+        return replace(turn, sensitivity=turn.sensitivity - turn.duration * bias * self._per_rate)
 
     def _at_rest(self, turn: RateIntegral) -> RateIntegral:
         """Return what the rates of a rest came to, without their noise in the sensitivity."""

@@ -71,6 +71,16 @@ def test_a_reference_rate_is_integrated():
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=2e-5)
 
 
+def test_bounds_of_the_angle_random_walk_hold_it_and_are_written_beside_a_fine_reference_alone():
+    noise, held = Noise(angle_random_walk=5e-4), 0
+    for seed in range(12):
+        log = log_of(SWING, 100.0, noise, np.random.default_rng([seed, 61]), step=1e-5)
+        low, high = calibrate_encoder(log).model.noise_bounds['angle_random_walk']
+        held += low <= noise.angle_random_walk <= high < 1.5 * low
+    assert held >= fewest(12, 0.95)
+    assert not calibrate_encoder(CLEAN).model.noise_bounds, 'its steps hide white noise'
+
+
 def test_the_model_has_the_angle_random_walk_that_is_stated_and_it_is_right():
     noise = Noise(angle_random_walk=5e-4)
     found = calibrate_encoder(log_of(SWING, 100.0, noise, np.random.default_rng(8)))

@@ -171,6 +171,14 @@ def test_an_uncalibrated_gyro_learns_its_bias_at_rest_but_not_its_scale():
             and gyro.deviation == pytest.approx(5.0 * 0.03, rel=0.1))
 
 
+@pytest.mark.parametrize('sense', [1.0, -1.0])
+def test_the_scale_factor_error_acts_on_the_turn_and_not_on_the_bias_that_rests_show(sense):
+    """With one sense the bias turns as far as the robot, and back, in the output."""
+    gyro = Gyro(begun(GyroModel(noise=NOISE)), bias=DEGREE).go(60.0, wheels=False)
+    gyro.go(60.0, DEGREE * sense, wheels=True)
+    assert gyro.deviation == pytest.approx(60.0 * DEGREE * 0.03, rel=0.35)
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_drive_with_stops_stands_at_rest_and_stays_inside_what_it_says(seed):
     gyro = Gyro(begun(), seed)
