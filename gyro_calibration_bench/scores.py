@@ -135,14 +135,14 @@ def held(causes: Iterable[Cause], findings: Sequence[Named],
 
     """
     by_name = {each.effect: each for each in findings}
-    told = {}
+    holds = {}
     for cause in causes:
         found = None if cause.name in WITHOUT_SIZE else by_name.get(cause.name)
         if found is not None and found.size is not None and found.interval is not None:
             half = 0.5 * (found.interval[1] - found.interval[0]) * deviations / 1.96
             size = abs(cause.size) if 'phase' in cause.shapes else cause.size
-            told[cause.name] = bool(abs(found.size - size) <= half)
-    return told
+            holds[cause.name] = bool(abs(found.size - size) <= half)
+    return holds
 
 
 # the table of a set of answers

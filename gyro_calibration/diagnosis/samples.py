@@ -36,7 +36,7 @@ from scipy.special import ndtr
 _NEIGHBOURS, _WITHIN = 4, 0.05
 #: Codes finer than this part of the white noise hardly ever repeat by chance.
 _FINE = 0.1
-#: A code that is reached in so many separate runs is none that was stuck.
+#: A code that is reached in so many separate runs is not repeated by a fault.
 _SEPARATE = 3
 #: An output below this part of the fastest is that of a rest: no limit is as low, and a dead band
 #: is about a rest.
@@ -209,7 +209,7 @@ def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
 _CLASSES = 8
 #: From this share of repeats on, single ones of so coarse an output mean nothing; runs may.
 _COARSE = 0.3
-#: Single repeats are believed to be stuck where explained ones are as rare as this.
+#: Single repeats count as a fault where explained ones are as rare as this.
 _RARE = 0.02
 #: Excess of repeats over the explained ones, as a part of these, below which their number is not
 #: known well enough.
@@ -239,11 +239,11 @@ class RepeatedSamples:
 
     @property
     def runs(self) -> int:
-        """Return how often it stuck."""
+        """Return how often it was repeated."""
         return len(runs(self.repeats))
 
     def has_one_more(self, at_limit: Mask) -> bool:
-        """Tell whether samples at a limit are one run like the others: an extreme value stuck."""
+        """Tell whether samples at a limit are one run like the others, of an extreme value."""
         lengths, usual = ([run.stop - run.start for run in runs(each)]
                           for each in (at_limit, self.repeats))
         return len(lengths) == 1 and lengths[0] - 1 <= _ALIKE * max(usual)
@@ -252,7 +252,7 @@ class RepeatedSamples:
 def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mask,
                      level: float) -> RepeatedSamples | None:
     """
-    Find samples that are stuck, or return None.
+    Find repeated samples, or return None.
 
     Parameters
     ----------
@@ -289,7 +289,7 @@ def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: 
         if chance[start:stop].max() < _COARSE:
             unlikely = math.exp(max(product[stop] - product[start], -700.0))
         else:
-            # Repeats of a coarse code depend on each other: stuck only if it should have left.
+            # Repeats of a coarse code depend on each other: a fault only if it should have left.
             left = abs(due[stop] - due[start]) - width[start]
             unlikely = (float(2.0 * stats.norm.sf(left / (math.sqrt(2.0) * deviation_of(seen))))
                         if left > 0.0 else 1.0)
@@ -409,8 +409,8 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
     Parameters
     ----------
     seen : output and expectation
-    good : samples that count; next to three and more of six that do not, as after a stuck run, one
-        is not tested
+    good : samples that count; next to three and more of six that do not, as after a run of
+        repeats, one is not tested
     floor : the scatter is at least this, rad/s: half a code
     level : chance of a false alarm
 

@@ -141,7 +141,7 @@ class HeadingTracker:
         age : of the self-calibration, whose s and b are the last values, s; None without one
         keep : the `steps`, for `smoothed`
         per_rate : by which the sensitivity changes with the rate, shape (m,): the rates that are
-            added include the bias that rests have shown, on which a scale factor error does not act
+            added include the bias that rests have shown; a scale factor error does not act on it
 
         """
         self._per_rate = per_rate

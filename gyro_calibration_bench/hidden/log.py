@@ -497,8 +497,8 @@ def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Gen
         good[rows] = False
     if gyro.has('stuck_samples'):
         for start in _turning_rows(each, int(gyro.value('stuck_samples')), generator):
-            stuck = slice(start + 1, start + int(generator.integers(4, 20)))
-            output[stuck], good[stuck] = output[start], False
+            repeated = slice(start + 1, start + int(generator.integers(4, 20)))
+            output[repeated], good[repeated] = output[start], False
     if gyro.has('dropped_samples'):
         for start in _turning_rows(each, int(gyro.value('dropped_samples')), generator):
             kept[start:start + int(generator.integers(1, 6))] = False

@@ -239,7 +239,7 @@ def _slow(generator: np.random.Generator, duration: float, top: float) -> np.nda
 
 
 def _smooth(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
-    """Swing so slowly that no lag and no delay can be told apart."""
+    """Swing so slowly that lag and delay cannot be distinguished."""
     shape = gaussian_filter1d(generator.standard_normal(round(duration / KNOT)), 6.0 / KNOT)
     edge = 0.5 - 0.5 * np.cos(np.pi * np.minimum(1.0, np.arange(len(shape)) * KNOT / 30.0))
     return top * shape / np.abs(shape).max() * edge * edge[::-1]

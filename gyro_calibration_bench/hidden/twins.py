@@ -30,10 +30,10 @@ class Twins:
 
     Attributes
     ----------
-    alike : words for `session`, so that they cannot be parted
+    alike : words for `session`, so that they cannot be distinguished
     apart : words for `session`, so that they can; None where no recording with this reference can
     given : recordings -> shapes and signs of effects, where only these are alike
-    multiple : of the minimum detectable effect, at which they are alike there and parted here
+    multiple : of the minimum detectable effect, at which they are alike there and distinct here
     figures : of a gyro whose noise makes it so; any where it is None
     longer : the parting recording is so many times as long
     against_a_model : they show only beside a model that knows bias and scale
@@ -104,7 +104,7 @@ def twin(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *,
          multiple: float | None = None, noise: str = 'white',
          duration: float = 900.0, sample_rate: float = 50.0) -> HiddenLog:
     """
-    Hide one of a pair where it cannot be told from the other.
+    Hide one of a pair where it cannot be distinguished from the other.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def part(pair: tuple[str, str], log: HiddenLog, generator: np.random.Generator) 
     """
     twins, first = TWINS[pair], log.session
     if twins.apart is None:
-        raise ValueError(f'{pair[0]} and {pair[1]} are parted by another reference alone')
+        raise ValueError(f'{pair[0]} and {pair[1]} are distinguished by another reference alone')
     duration = twins.longer * len(first.time) * first.interval
     return record(log.truth.gyro,
                   session(generator, duration, 1.0 / first.interval, **twins.apart), generator,
