@@ -220,6 +220,7 @@ class Pipeline:
         # Of a driver that was started again, which may send faster than before: when the last
         # sample arrived, s, and the longest interval since a silence, ns.
         self._same_name, self._arrived, self._longest = False, clock.steady(), 0
+        self._behind = 0.0  # by which the last samples came late, ns
         self._good = 0.0, 0.0
         # When samples with a repeated stamp began, s, and the fastest rate among them, rad/s.
         self._standing: tuple[float, float] | None = None
@@ -518,13 +519,18 @@ class Pipeline:
 
         A sample of another one divides an interval, so that one part is at most half of it. A
         driver that was started again sends alone, although the middleware lists its dead
-        predecessor for up to 20 s; it may send at another rate.
+        predecessor for up to 20 s; it may send at another rate. Samples that were held up come
+        too soon after each other as well, until they have caught up.
 
         """
-        usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual
+        usual, interval = (NSEC_PER_SEC * self.estimator.tracker.intervals.usual,
+                           stamp - self._newest)
+        behind, begins = self._behind, self._clock.steady() - self._arrived > BLIND
+        self._behind = 0.0 if begins else min(max(behind + interval - usual, 0.0),
+                                              NSEC_PER_SEC * BLIND)
         if self._same_name:
             usual = min(usual, self._longest)
-        if not 2.0 * (stamp - self._newest) > usual:
+        if not (2.0 * interval > usual or behind):
             self._switches += 1
         if self._switches > 1:
             self._refuse_all(self.several)

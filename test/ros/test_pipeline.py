@@ -430,6 +430,19 @@ def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path, paus
     assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
 
 
+def test_samples_that_a_new_driver_sends_late_at_first_are_not_those_of_a_second_one(tmp_path):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(300, 0.5))
+    rig.publishers = ['/driver_node', '/driver_node']
+    rig.pipeline.publishers(rig.publishers)
+    for seconds in (1.5, 0.04):
+        rig.skip(seconds)
+        rig.feed([0.5])
+    rig.feed(np.full(3, 0.5), interval=3e-4)
+    rig.feed(np.full(100, 0.5))
+    assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
+
+
 @pytest.mark.parametrize('names', [('/a', '/b'), ('/a', '/a')], ids=['two names', 'one name'])
 @pytest.mark.parametrize('offset', [1, 3, 5, 9], ids=lambda offset: f'{offset} ms apart')
 def test_two_publishers_that_both_send_are_found_by_their_stamps(tmp_path, offset, names):
