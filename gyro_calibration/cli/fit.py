@@ -34,7 +34,6 @@ from gyro_calibration.cli.verb import Answer, under_way, UsageError, wrapped
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_95
 from gyro_calibration.model.effects import (
     Effect,
-    Parameter,
     polynomial_to_matrix,
     rate_temperature_polynomial,
     STEADY,
@@ -208,7 +207,7 @@ def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
 def _model_data(model: GyroModel) -> dict[str, Any]:
     """Return the fitted values with their intervals, covariance, ranges and technology."""
     values: dict[str, dict[str, Any]] = {}
-    for effect, parameter, value, deviation in _fitted(model):
+    for effect, parameter, value, deviation in model.estimates():
         values.setdefault(effect, {})[parameter.name] = {
             'estimate': value, 'standard_deviation': deviation,
             'ci95': [value - NORMAL_95 * deviation, value + NORMAL_95 * deviation]
@@ -219,17 +218,6 @@ def _model_data(model: GyroModel) -> dict[str, Any]:
             'temperature_range_degc': model.temperature_range,
             'reference_temperature_degc': model.reference_temperature,
             'technology': model.gyro.get('technology')}
-
-
-def _fitted(model: GyroModel) -> Iterator[tuple[str, Parameter, float, float]]:
-    """Give effect name, parameter, value and standard deviation of each fitted value."""
-    count = sum(len(term.fitted) for term in model.terms)
-    deviations = iter([math.nan] * count if model.covariance is None
-                      else np.sqrt(np.diag(model.covariance)).tolist())
-    for term in model.terms:
-        for place in term.fitted:
-            yield (term.effect.name, term.effect.parameters[place], term.values[place],
-                   next(deviations))
 
 
 def _dwell_data(selection: Selection) -> dict[str, Any]:
@@ -297,7 +285,7 @@ def _sentences(remarks: Iterable[str]) -> Iterator[str]:
 def _value_lines(model: GyroModel) -> Iterator[str]:
     """Give the table of fitted values."""
     yield f'{"value":38s} {"estimate":>12s} {"std. dev.":>10s}   {"95 % interval":27s} unit'
-    for effect, parameter, value, deviation in _fitted(model):
+    for effect, parameter, value, deviation in model.estimates():
         unit, factor = _UNITS.get(parameter.unit, (parameter.unit, 1.0))
         name = effect if parameter.name == effect else f'{effect} {parameter.name}'
         low, high = ((value + sign * NORMAL_95 * deviation) * factor for sign in (-1, 1))

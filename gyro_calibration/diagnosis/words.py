@@ -27,8 +27,8 @@ from gyro_calibration.diagnosis.findings import (
     LEAST_PROBABILITY,
     Unexplained,
 )
-from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.gyro_model import same_effects
+from gyro_calibration.logs.log import DEGREE, NORMAL_95
+from gyro_calibration.model.gyro_model import GyroModel, same_effects
 
 _HOUR = 3600.0
 
@@ -98,8 +98,10 @@ def _joined(*parts: str) -> str:
 def quantity(estimate: Estimate, parameter: str = '') -> Quantity:
     """Return an estimate as people read it."""
     unit, factor = for_people(estimate.unit, parameter)
-    unit, factor = _finer(unit, factor, estimate.estimate, parameter)
-    numbers = [factor * number for number in (estimate.estimate, *estimate.interval)]
+    given = estimate.estimate, *estimate.interval
+    unit, factor = _finer(unit, factor, max(filter(math.isfinite, map(abs, given)), default=0.0),
+                          parameter)
+    numbers = [factor * number for number in given]
     power = _power(max((abs(number) for number in numbers if math.isfinite(number)), default=0.0))
     value, low, high = (number / 10.0 ** power for number in numbers)
     width = high - low
@@ -126,7 +128,7 @@ def _fixed(value: float, decimals: int | None) -> str:
     if not math.isfinite(value):
         return 'not known' if math.isnan(value) else '∞' if value > 0.0 else '−∞'
     text = f'{value:.4g}' if decimals is None else f'{value:.{decimals}f}'
-    return text.replace('-', '−')
+    return text.replace('-', '−' if float(text) else '')
 
 
 def _times(power: int) -> str:
@@ -306,10 +308,8 @@ def _gained(diagnosis: Diagnosis) -> str:
     if not offered(diagnosis) and (gain is None or gain.models.get('given')
                                    == gain.models.get('extended')):
         return 'No extended model is offered: the model is unchanged.'
-    plain = {term.effect.name: term.values[0] for term in diagnosis.model.terms}
-    model = ('The extended model' if offered(diagnosis) else 'The model, '
-             f'bias {amount(plain.get("bias", 0.0), "rad/s", "bias")} and scale factor error '
-             f'{amount(plain.get("scale_factor_error", 0.0), "1", "scale_factor_error")} alone,')
+    model = ('The extended model' if offered(diagnosis) else
+             f'The model, {_values(diagnosis.model)} alone,')
     if gain is None:
         return 'An extended model is offered; its gain was not measured.'
     if gain.heading is None:
@@ -318,6 +318,14 @@ def _gained(diagnosis: Diagnosis) -> str:
     what = f'the heading error over {gain.window:g} s'
     return (f'{model} {change(gain.heading, "rad", what)}, measured on '
             f'{clean(gain.held_out)}.')
+
+
+def _values(model: GyroModel) -> str:
+    """Return the fitted values of a model with their intervals of 95 %."""
+    return ' and '.join(
+        f'{spoken(effect)} {quantity(Estimate.about(value, half, parameter.unit), effect)}'
+        for effect, parameter, value, deviation in model.estimates()
+        for half in [NORMAL_95 * deviation if math.isfinite(deviation) else 0.0])
 
 
 def change(errors: Change, unit: str, what: str) -> str:

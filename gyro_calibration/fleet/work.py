@@ -327,16 +327,9 @@ def calibrate(log: Log, technology: str = 'mems'
 
 def _values(model: GyroModel) -> dict[str, dict[str, Any]]:
     """Return the fitted values of a model, by parameter where it is named as its effect."""
-    values: dict[str, dict[str, Any]] = {}
-    variances = iter([math.nan] * 1000 if model.covariance is None
-                     else np.diag(model.covariance).tolist())
-    for term in model.terms:
-        for place in term.fitted:
-            parameter = term.effect.parameters[place]
-            name = (parameter.name if parameter.name == term.effect.name
-                    else f'{term.effect.name}.{parameter.name}')
-            values[name] = _value(term.values[place], math.sqrt(next(variances)), parameter.unit)
-    return values
+    return {parameter.name if parameter.name == effect else f'{effect}.{parameter.name}':
+            _value(value, deviation, parameter.unit)
+            for effect, parameter, value, deviation in model.estimates()}
 
 
 def _value(value: float, deviation: float, unit: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,7 +21,7 @@ from typing import Any
 
 from gyro_calibration.logs.log import Array, DEGREE, Mask, Number
 from gyro_calibration.model.channels import clip, History
-from gyro_calibration.model.effects import Channels, Effect
+from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
@@ -193,6 +193,14 @@ class GyroModel:
     self_calibration: SelfCalibration | None = None
     tolerance: Tolerance = Tolerance()
     noise_bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def estimates(self) -> Iterator[tuple[str, Parameter, float, float]]:
+        """Give effect name, parameter, value and standard deviation of each fitted value."""
+        fitted = [(term, place) for term in self.terms for place in term.fitted]
+        deviations = ([math.nan] * len(fitted) if self.covariance is None
+                      else np.sqrt(np.diag(self.covariance)).tolist())
+        for (term, place), deviation in zip(fitted, deviations):
+            yield term.effect.name, term.effect.parameters[place], term.values[place], deviation
 
     def error(self, channels: Channels) -> Number:
         """Return the sum of all effects, rad/s."""
