@@ -55,36 +55,25 @@ class PortError(OSError):
 
 class SerialPort:
     """
-    A port that can be lost and opened again.
+    A port that can be lost and opened again, with 8 data bits, no parity and 1 stop bit.
+
+    Each method raises `PortError` where the device cannot do it or was disconnected; the port is
+    then closed.
 
     Parameters
     ----------
     path : str
-    baud : bits per second, with 8 data bits, no parity and 1 stop bit
+    baud : bits per second
     timeout : how long `read` waits for the first byte, in seconds
 
     """
 
     def __init__(self, path: str, baud: int, timeout: float = 0.1):
-        self.path = path
-        self.baud = baud
-        self._timeout = timeout
+        self.path, self.baud, self._timeout = path, baud, timeout
         self._port: serial.Serial | None = None
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open, as far as is known."""
-        return self._port is not None
-
     def open(self) -> None:  # noqa: A003
-        """
-        Open the port for this program alone, and drop what came before.
-
-        Raises
-        ------
-        PortError : it cannot be opened
-
-        """
+        """Open the port for this program alone, and drop what came before."""
         self.close()
         try:
             self._port = serial.Serial(self.path, self.baud, timeout=self._timeout,
@@ -93,38 +82,24 @@ class SerialPort:
             raise PortError(f'cannot open {self.path}: {_reason(error)}') from error
 
     def read(self) -> bytes:
-        """
-        Return the bytes that are there, waiting a short time for the first; none, if none came.
+        """Return the bytes that are there, after a short time for the first; none if none came."""
+        def take(port: serial.Serial) -> bytes:
+            # pyserial's own read gives the first byte alone, and needs two more calls for the rest
+            if not select.select([port], [], [], self._timeout)[0]:
+                return b''
+            data = os.read(port.fileno(), 65536)
+            if not data:
+                raise OSError(errno.EIO, 'end of file')
+            return data
 
-        Raises
-        ------
-        PortError : the device was disconnected; the port is then closed
-
-        """
-        return self._guarded(self._read)
+        return self._guarded(take)
 
     def write(self, data: bytes) -> None:
-        """
-        Send bytes to the device.
-
-        Raises
-        ------
-        PortError : the device was disconnected; the port is then closed
-
-        """
+        """Send bytes to the device."""
         self._guarded(lambda port: port.write(data))
 
     def set_baud(self, baud: int) -> None:
-        """
-        Change the speed of the open port, and drop what came before.
-
-        The device does not see it opened anew.
-
-        Raises
-        ------
-        PortError : the device was disconnected, or lacks that speed; the port is then closed
-
-        """
+        """Change the speed of the port and drop what came; the device sees no opening."""
         self.baud = baud
 
         def change(port: serial.Serial) -> None:
@@ -138,15 +113,6 @@ class SerialPort:
         port, self._port = self._port, None
         if port is not None:
             port.close()
-
-    def _read(self, port: serial.Serial) -> bytes:
-        # pyserial's own read gives the first byte alone, and needs two more calls for the rest
-        if not select.select([port], [], [], self._timeout)[0]:
-            return b''
-        data = os.read(port.fileno(), 65536)
-        if not data:
-            raise OSError(errno.EIO, 'end of file')
-        return data
 
     def _guarded(self, action: Callable[[serial.Serial], _Result]) -> _Result:
         if self._port is None:
@@ -246,11 +212,7 @@ def resolve(port: str) -> str:
     """
     Return the port that a pattern such as ``/dev/serial/by-id/*A9003XYZ*`` stands for now.
 
-    What is no pattern stands for itself.
-
-    Raises
-    ------
-    PortError : none matches, or several do that are not the same device
+    What is no pattern stands for itself. `PortError` says that none matches, or several devices.
 
     """
     if os.path.exists(port) or not glob.has_magic(port):
@@ -259,8 +221,8 @@ def resolve(port: str) -> str:
     if not matches:
         raise PortError(f'no port matches {port}: plug the gyro in, or set another port')
     if len({os.path.realpath(match) for match in matches}) > 1:
-        names = ', '.join(matches)
-        raise PortError(f'{len(matches)} ports match {port}: {names}; set port to one of them')
+        raise PortError(f'{len(matches)} ports match {port}: {", ".join(matches)}; set port to '
+                        'one of them')
     return matches[0]
 
 
@@ -268,19 +230,9 @@ class _Silence:
     """
     The time without a sample, since the port was opened or since the last one came.
 
-    It ends with the port being opened anew, after `timeout`. Until the second sample, which shows
-    how far they are apart, it takes 5 s more: a board that the opening restarts must have begun to
-    send, for it would be restarted again.
-
-    Parameters
-    ----------
-    period : from one sample to the next, s
-    now : when the port was opened, s
-
-    Attributes
-    ----------
-    timeout : seconds
-    end : when the port is to be opened anew, s
+    It ends with the port being opened anew, at `end`, after `timeout`, s. Until the second sample,
+    which shows the period from one to the next, it takes 5 s more: a board that the opening
+    restarts must have begun to send, for it would be restarted again.
 
     """
 
@@ -339,11 +291,9 @@ class Connection:
     Attributes
     ----------
     state : State
-    protocol : None until it is known
-    baud : 0 until it is known
+    protocol, clock, baud : None and 0 until the protocol is known
     path : the device behind the port when it was last opened, links followed
     detected : what was recognized by listening, in a sentence
-    clock : None until the protocol is known
     openings : how often the port was opened
     waited : seconds that were waited for the port altogether
     longest_gap : longest time between two samples, s; 0 where it was never more than 1.5 periods
@@ -390,14 +340,11 @@ class Connection:
         past, decoder, clock = self._past, self._decoder, self.clock
         if decoder is None or clock is None:
             return replace(past, samples=self._samples)
-        return Counts(
-            samples=self._samples,
-            lost_samples=past.lost_samples + clock.lost,
-            refused_samples=past.refused_samples + decoder.refused_samples,
-            refused_temperatures=past.refused_temperatures + decoder.refused_temperatures,
-            device_faults=past.device_faults + decoder.faults,
-            discarded_bytes=past.discarded_bytes + decoder.discarded_bytes,
-        )
+        return Counts(self._samples, past.lost_samples + clock.lost,
+                      past.refused_samples + decoder.refused_samples,
+                      past.refused_temperatures + decoder.refused_temperatures,
+                      past.device_faults + decoder.faults,
+                      past.discarded_bytes + decoder.discarded_bytes)
 
     def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
         """
@@ -583,14 +530,7 @@ class Mean(NamedTuple):
 
 
 class Decimation:
-    """
-    Joins samples in groups; where samples are lost, a group has fewer and is not longer.
-
-    Parameters
-    ----------
-    size : samples of a group; 1 leaves them as they are
-
-    """
+    """Joins so many samples in a group; where some are lost, it has fewer and is not longer."""
 
     def __init__(self, size: int):
         self._size = size

@@ -35,9 +35,6 @@ _POLL = 0.05  # s; how soon a reader, or the wish to stop, is noticed
 _SETTLING = 0.2  # s; a reader that opens a port drops what is in it just afterwards
 _LINGERING = 1.0  # s; closing a pseudo-terminal throws away what its reader has not yet taken
 
-#: When bytes are sent, s, and the bytes.
-_Piece = tuple[float, bytes]
-
 
 class Emulator:
     """
@@ -86,17 +83,13 @@ class Emulator:
             raise ValueError(f'speed is {speed}, but must be above 0; 1 is real time')
         self._settings = settings or Settings()
         protocol.check(self._settings)
-        self._protocol = protocol
-        self._samples = samples
-        self._speed = speed
+        self._protocol, self._samples, self._speed = protocol, samples, speed
         self.link = None if link is None else Path(link)
         self._wait_for_reader = wait_for_reader
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name='emulator')
         self._master, self._reader_poll = -1, select.poll()
-        self.path = ''
-        self.sent_bytes = 0
-        self.lost_bytes = 0
+        self.path, self.sent_bytes, self.lost_bytes = '', 0, 0
 
     def open(self) -> None:  # noqa: A003
         """Make the pseudo-terminal and the link to it; `path` is then its name."""
@@ -113,20 +106,13 @@ class Emulator:
             raise
 
     def run(self) -> None:
-        """
-        Send the samples until they end or `stop` is called.
-
-        Raises
-        ------
-        ValueError : a sample has no time
-
-        """
+        """Send the samples, which must have times, until they end or `stop` is called."""
         if self._wait_for_reader:
             while not self.is_read() and not self._stop.wait(_POLL):
                 pass
             self._stop.wait(_SETTLING)
         self._send(self._protocol.preamble)
-        self._send_in_time(self._frames())
+        self._send_in_time()
         if self.is_read():
             self._stop.wait(_LINGERING)
 
@@ -175,7 +161,7 @@ class Emulator:
         os.symlink(self.path, temporary)
         os.replace(temporary, self.link)
 
-    def _frames(self) -> Iterator[_Piece]:
+    def _frames(self) -> Iterator[tuple[float, bytes]]:
         """Give when each sample is due after the first, in the time of the host, and its bytes."""
         begin, encode = None, self._protocol.encoder(self._settings)
         for number, sample in enumerate(self._samples):
@@ -188,10 +174,10 @@ class Emulator:
                 sample = replace(sample, sequence=number)
             yield due - begin, encode(sample)
 
-    def _send_in_time(self, pieces: Iterable[_Piece]) -> None:
-        """Send each piece at its time, or with others that are due at once."""
+    def _send_in_time(self) -> None:
+        """Send each sample at its time, or with others that are due at once."""
         start, pending, sent = time.monotonic(), b'', -math.inf
-        for due, data in pieces:
+        for due, data in self._frames():
             if pending and start + due > time.monotonic():
                 self._send(pending)
                 pending, sent = b'', time.monotonic()
@@ -221,15 +207,7 @@ class Emulator:
 
 
 def emulate(emulator: Emulator, announce: Callable[[str], None] = lambda path: None) -> None:
-    """
-    Send all samples of an emulator from this thread, and clean up also after an interrupt.
-
-    Parameters
-    ----------
-    emulator : Emulator
-    announce : gets the path to open, once it is there
-
-    """
+    """Send all samples from this thread, and clean up at the end; `announce` gets the path."""
     try:
         emulator.open()
         announce(emulator.path if emulator.link is None else str(emulator.link))

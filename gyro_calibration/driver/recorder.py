@@ -75,15 +75,7 @@ class AtomicAppender:
         os.unlink(path)
 
     def append(self, piece: bytes) -> None:
-        """
-        Write a piece, or take back what of it was written.
-
-        Raises
-        ------
-        DiskFull : it cannot be written
-        LogError : meanwhile another program has made the file
-
-        """
+        """Write a piece, or take back what of it was written and raise `DiskFull`."""
         left = memoryview(piece)
         try:
             file = self._file = self._file or FileIO(self.path, 'xb')

@@ -144,14 +144,7 @@ class Layout:
 
 @cache
 def layout_of(definition: str, axis: str = 'z') -> Layout:
-    """
-    Return the layout of a kind of message by its definition, of rates about an axis.
-
-    Raises
-    ------
-    MessageError : it cannot be read
-
-    """
+    """Return the layout of a kind of message by its definition, of rates about an axis."""
     if len(definition) > _LONGEST:
         raise MessageError(f'it has more than {_LONGEST} characters')
     parts: dict[str, list[re.Match[str]]] = {}
@@ -227,14 +220,7 @@ _LENGTHS = {order: struct.Struct(f'{order}I').unpack_from for order in '<>'}
 
 
 def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
-    """
-    Return the stamp of a message, in ns since 1970, and its numbers.
-
-    Raises
-    ------
-    MessageError : the bytes are no such message
-
-    """
+    """Return the stamp of a message, in ns since 1970, and its numbers, or raise MessageError."""
     if data[:2] not in (b'\0\0', b'\0\1'):
         raise MessageError(f'a message begins with {data[:4].hex()}, which is not plain CDR')
     order = '<' if data[1] else '>'

@@ -518,14 +518,7 @@ def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Ar
 
 
 def refuse_wrapped(log: Log) -> None:
-    """
-    Refuse a reference heading that jumps by full turns, as one that is wrapped does.
-
-    Raises
-    ------
-    DataRefused : it does, faster than anything turns
-
-    """
+    """Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped."""
     if log.time is None or log.reference_heading is None:
         return
     known = np.isfinite(log.reference_heading)

@@ -150,10 +150,7 @@ def outliers(values: Array, limit: float) -> Mask:
     """
     Mark single samples far from their neighbours and the median; not drift or vibration.
 
-    Parameters
-    ----------
-    values : shape (n,)
-    limit : in robust standard deviations
+    The limit is in robust standard deviations.
 
     """
     if len(values) < 4:

@@ -124,13 +124,9 @@ def is_recording(path: str | Path) -> bool:
 
 def files_of(path: str | Path) -> list[Path]:
     """
-    Return the files of a recording, in their order.
+    Return the files of a recording, in their order, or raise `LogError` where there are none.
 
     The list in metadata.yaml is not asked for: a recorder that was killed leaves none.
-
-    Raises
-    ------
-    LogError : a folder without any
 
     """
     path = Path(path)
@@ -212,14 +208,7 @@ class _Budget:
         self._path, self._left = path, GROWN + GROWTH * path.stat().st_size
 
     def spend(self, size: int) -> None:
-        """
-        Take some bytes.
-
-        Raises
-        ------
-        LogError : there are too many
-
-        """
+        """Take some bytes, or raise `LogError` where there are too many."""
         self._left -= size
         if self._left < 0:
             raise LogError(f'{self._path}: decompresses to more than {GROWTH} times its size, '
@@ -367,14 +356,7 @@ def _metadata(body: bytes) -> tuple[str, dict[str, str]]:
 
 
 def metadata_of(path: str | Path) -> dict[str, str]:
-    """
-    Return all metadata of an MCAP file, without those that are damaged.
-
-    Raises
-    ------
-    OSError : it cannot be opened
-
-    """
+    """Return all metadata of an MCAP file, without those that are damaged."""
     found: dict[str, str] = {}
     with opened(path) as file:
         if file.read(len(_MAGIC)) == _MAGIC:

@@ -87,14 +87,7 @@ class Stamps:
 
 
 def number_stamps(time: Array) -> Stamps:
-    """
-    Find the even grid that stamps belong to.
-
-    Raises
-    ------
-    DataRefused : there is none
-
-    """
+    """Find the even grid that stamps belong to, or raise `DataRefused` where there is none."""
     steps = np.diff(time)
     usual = _usual_interval(time, steps)
     bursts = float((steps < _WAITING * usual).mean()) > _BURSTS

@@ -100,14 +100,7 @@ def checked(place: str, value: Any, schema: Any) -> Any:
 
 def refuse_others(place: str, given: Mapping[str, Any],
                   known: Sequence[str] | Mapping[str, Any]) -> None:
-    """
-    Refuse names that are not known.
-
-    Raises
-    ------
-    WrongValue : there is one
-
-    """
+    """Raise `WrongValue` for a name that is not known."""
     for name in given:
         if name not in known:
             raise WrongValue(f'{place}.{name}', given[name], f'one of {", ".join(known)}')
@@ -140,9 +133,7 @@ def settings_text(content: Any) -> str:
     """
     Return names, texts, numbers and lists as YAML, which `read_settings` reads as they were.
 
-    Raises
-    ------
-    ArithmeticError : a number is not finite
+    ArithmeticError says that a number is not finite.
 
     """
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)

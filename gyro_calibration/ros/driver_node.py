@@ -187,17 +187,8 @@ class Messages:
     """
     The messages of samples, made once; only their values change.
 
-    The variance of the temperature stays 0, which stands for unknown.
-
-    Parameters
-    ----------
-    frame_id : str
-
-    Attributes
-    ----------
-    imu : Imu
-    temperature : Temperature
-    variance : of one sample, (rad/s)²
+    The variance of the temperature stays 0, which stands for unknown; `variance` is that of one
+    sample of the rate, (rad/s)².
 
     """
 
@@ -229,23 +220,10 @@ class Messages:
 
 
 def settings(values: SimpleNamespace) -> Settings:
-    """
-    Return the settings of a gyro that parameters stand for.
-
-    Raises
-    ------
-    ValueError : the columns are not possible
-
-    """
-    return Settings(
-        sensitivity=values.sensitivity or None,
-        invert=_THREE_WAYS[values.invert],
-        axis=values.axis,
-        columns=tuple(values.columns),
-        full_scale=values.full_scale or None,
-        increments=_THREE_WAYS[values.increments],
-        sample_rate=values.sample_rate or None,
-    )
+    """Return the settings of a gyro that parameters stand for; raise as `Settings` does."""
+    return Settings(values.sensitivity or None, _THREE_WAYS[values.invert], values.axis,
+                    tuple(values.columns), values.full_scale or None,
+                    _THREE_WAYS[values.increments], values.sample_rate or None)
 
 
 def main() -> int:

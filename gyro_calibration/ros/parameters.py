@@ -62,9 +62,7 @@ class Parameter:
         """
         Return the value as the type of the default; a whole number may stand for a float.
 
-        Raises
-        ------
-        ValueError : the value has another type, is not finite, or is none of those allowed
+        ValueError says which value is wanted.
 
         """
         if isinstance(self.default, float) and type(value) is int and abs(value) < 1 << 63:
@@ -94,14 +92,7 @@ class Parameter:
 
 def record(table: Sequence[Parameter], given: Mapping[str, object] | None = None
            ) -> SimpleNamespace:
-    """
-    Return the values of a table by attribute: the given ones, else the defaults.
-
-    Raises
-    ------
-    ValueError : a value is not possible
-
-    """
+    """Return the values of a table by attribute: the given ones, checked, else the defaults."""
     given = given or {}
     return SimpleNamespace(**{
         each.attribute: each.check(given[each.name]) if each.name in given else each.default

@@ -149,10 +149,7 @@ def load(kind: str) -> Any:
     """
     Return the class of a message type such as ``sensor_msgs/msg/Imu``.
 
-    Raises
-    ------
-    ImportError : it is no message type; any node in the graph can name one, and must not make this
-        one import other modules
+    Any node in the graph can name a type, and must not make this one import other modules.
 
     """
     if not re.fullmatch(r'\w+/msg/\w+', kind):

@@ -38,14 +38,7 @@ __all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find']
 
 
 def find(name: str) -> Protocol:
-    """
-    Return a protocol by its name.
-
-    Raises
-    ------
-    ValueError : there is none of that name
-
-    """
+    """Return a protocol by its name; ValueError names the known ones where there is none."""
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     raise ValueError(f'protocol {name!r} is not known: choose one of {", ".join(PROTOCOLS)}')

@@ -29,6 +29,7 @@ from functools import partial
 
 from gyro_calibration.driver.protocols.protocol import (
     check_counts,
+    count,
     FrameSplitter,
     Protocol,
     Reading,
@@ -59,14 +60,14 @@ class _Parser:
     def __call__(self, frame: bytes) -> Reading:
         _, low, high, middle, number, byte, *_ = frame
         (before, first), (self._number, self._high) = (self._number, self._high), (number, byte)
-        count = int.from_bytes((high, middle, low), 'big', signed=True)
+        rate = int.from_bytes((high, middle, low), 'big', signed=True)
         if before not in _VALUES or number != before + 1:
-            return Reading(count)
+            return Reading(rate)
         name, unit, offset, _ = _VALUES[before]
         value = int.from_bytes((first, byte), 'big', signed=True) * unit + offset
         if name == 'temperature':
-            return Reading(count, temperature=value)
-        return Reading(count, health={name: value})
+            return Reading(rate, temperature=value)
+        return Reading(rate, health={name: value})
 
 
 class _Writer:
@@ -81,10 +82,9 @@ class _Writer:
         if number == even or even not in self._latched:
             name, unit, offset, usual = _VALUES[even]
             value = reading.temperature if name == 'temperature' else reading.health.get(name)
-            half = round(((usual if value is None else value) - offset) / unit)
-            self._latched = {even: min(max(half, -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)}
-        count = min(max(round(reading.value), -0x800000), 0x7FFFFF)
-        high, middle, low = count.to_bytes(3, 'big', signed=True)
+            half = count(((usual if value is None else value) - offset) / unit)
+            self._latched = {even: half.to_bytes(2, 'big', signed=True)}
+        high, middle, low = count(reading.value, 24).to_bytes(3, 'big', signed=True)
         frame = bytes([_HEADER, low, high, middle, number, self._latched[even][number - even]])
         return frame + _checksum(frame)
 

@@ -36,6 +36,7 @@ import struct
 import zlib
 
 from gyro_calibration.driver.protocols.protocol import (
+    count,
     FrameSplitter,
     Protocol,
     Reading,
@@ -83,9 +84,8 @@ def _write(reading: Written, settings: Settings) -> bytes:
     if not reading.valid:
         status &= ~(1 << axis)
     temperature = _ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
-    count = min(max(round(temperature), -0x8000), 0x7FFF)
-    sequence = reading.sequence % _MODULUS
-    frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, sequence, count)
+    frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, reading.sequence % _MODULUS,
+                        count(temperature))
     return frame + _checksum(frame)
 
 

@@ -25,6 +25,7 @@ from functools import partial
 import math
 
 from gyro_calibration.driver.protocols.protocol import (
+    count,
     FrameSplitter,
     Protocol,
     Reading,
@@ -44,8 +45,8 @@ def _content(frame: bytes) -> bytes:
 
 
 def _write(reading: Written, settings: Settings) -> bytes:
-    count = min(max(round(reading.value), -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)
-    bits = int.from_bytes(bytes([-sum(count) % 256, 0, 0, 0, 0]) + count, 'big')
+    rate = count(reading.value).to_bytes(2, 'big', signed=True)
+    bits = int.from_bytes(bytes([-sum(rate) % 256, 0, 0, 0, 0]) + rate, 'big')
     frame = bytes(bits >> shift & 0x7F for shift in range(49, -1, -7))
     return bytes([frame[0] | 0x80]) + frame[1:]
 

@@ -24,6 +24,7 @@ import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
+    count,
     LineSplitter,
     Protocol,
     Reading,
@@ -42,8 +43,7 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
 
 
 def _write(reading: Written, settings: Settings) -> bytes:
-    count = min(max(round(reading.value), -0x8000), 0x7FFF)
-    counts = [count if axis == settings.axis else 0 for axis in 'xyz']
+    counts = [count(reading.value) if axis == settings.axis else 0 for axis in 'xyz']
     return b'!ANG:0.00,0.00,0.00,AN:%d,%d,%d,0,0,0,0,0,0\r\n' % tuple(counts)
 
 

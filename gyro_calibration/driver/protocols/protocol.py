@@ -26,7 +26,6 @@ from functools import partial
 import math
 import re
 from typing import NamedTuple, TypeVar
-from typing import Protocol as Interface
 
 STANDARD_GRAVITY = 9.80665
 """m/s²; what devices call one g."""
@@ -118,13 +117,12 @@ class Settings:
             raise ValueError(f'axis is {self.axis!r}, but must be x, y or z')
         columns = tuple(self.columns)
         object.__setattr__(self, 'columns', columns)
+        named = f'columns are {", ".join(columns)}, but'
         if sum(columns.count(name) for name in GYRO_COLUMNS) != 1:
-            raise ValueError(f'columns are {", ".join(columns)}, but exactly one must be '
-                             f'{", ".join(GYRO_COLUMNS)}')
+            raise ValueError(f'{named} exactly one must be {", ".join(GYRO_COLUMNS)}')
         for name in KNOWN_COLUMNS:
             if columns.count(name) > 1:
-                raise ValueError(f'columns are {", ".join(columns)}, but {name} may occur only '
-                                 'once')
+                raise ValueError(f'{named} {name} may occur only once')
 
 
 @dataclass(frozen=True)
@@ -155,6 +153,11 @@ class Written(Reading):
     sequence: int = 0
 
 
+def count(value: float, bits: int = 16) -> int:
+    """Return the nearest signed number of so many bits, at whose ends a device saturates."""
+    return min(max(round(value), -1 << bits - 1), (1 << bits - 1) - 1)
+
+
 Parse = Callable[[bytes], 'Reading | None']
 """Makes a reading of a frame, or None of one that is none; may remember the frames before."""
 
@@ -165,15 +168,9 @@ Given = TypeVar('Given')
 Made = TypeVar('Made')
 
 
-def stateless(
-    make: Callable[[Given, Settings], Made],
-) -> Callable[[Settings], Callable[[Given], Made]]:
-    """
-    Return the `Protocol.parser` or `Protocol.writer` of a format, from ``make(given, settings)``.
-
-    Each of its frames stands for itself.
-
-    """
+def stateless(make: Callable[[Given, Settings], Made]
+              ) -> Callable[[Settings], Callable[[Given], Made]]:
+    """Return the `Protocol.parser` or `writer` of a format whose frames stand for themselves."""
     return lambda settings: lambda given: make(given, settings)
 
 
@@ -184,41 +181,39 @@ class Frame(NamedTuple):
     garbage: int
 
 
-class Splitter(Interface):
+class Splitter:
     """Finds frames in bytes that come in any pieces; holds back no more than one frame."""
 
-    discarded_bytes: int
+    def __init__(self) -> None:
+        self._tail, self._garbage, self.discarded_bytes = b'', 0, 0
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete."""
+        raise NotImplementedError
 
     def reset(self) -> None:
         """Drop the frame that has begun: the next bytes do not continue it."""
+        self._discard(len(self._tail))
+        self._tail, self._garbage = b'', 0
+
+    def _discard(self, count: int) -> None:
+        self.discarded_bytes += count
+        self._garbage += count
+
+    def _frame(self, data: bytes) -> Frame:
+        garbage, self._garbage = self._garbage, 0
+        return Frame(data, garbage)
 
 
 def check_rates(settings: Settings) -> None:
-    """
-    Accept the settings of a device that can only send rates: all, but that for increments.
-
-    Raises
-    ------
-    ValueError : increments are asked for
-
-    """
+    """Raise ValueError where increments are asked of a device that can only send rates."""
     if settings.increments:
         raise ValueError('increments is set, but this gyro sends rates, not angles: leave '
                          'increments out')
 
 
 def check_counts(settings: Settings) -> None:
-    """
-    Accept the settings of a device that sends rates as counts, whose size differs by unit.
-
-    Raises
-    ------
-    ValueError : no sensitivity is given, or increments are asked for
-
-    """
+    """Raise ValueError where counts, whose size differs by unit, have no sensitivity."""
     check_rates(settings)
     if settings.sensitivity is None:
         raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the rad/s '
@@ -275,25 +270,14 @@ class Protocol:
     check: Callable[[Settings], None] = check_rates
 
     def decoder(self, settings: Settings | None = None) -> Decoder:
-        """
-        Return a decoder for one connection.
-
-        Raises
-        ------
-        ValueError : the settings do not suffice for this format
-
-        """
+        """Return a decoder for one connection, or raise as `check` does."""
         return Decoder(self, settings or Settings())
 
     def encoder(self, settings: Settings | None = None) -> Callable[..., bytes]:
         """
         Return ``encode(sample, valid=True)`` of one device, which gives the bytes that it sends.
 
-        Beyond full scale it saturates.
-
-        Raises
-        ------
-        ValueError : the settings do not suffice for this format
+        Beyond full scale it saturates. It raises as `check` does.
 
         """
         settings = settings or Settings()
@@ -312,14 +296,7 @@ class Protocol:
 
     def encode(self, sample: Sample, settings: Settings | None = None,
                valid: bool = True) -> bytes:
-        """
-        Return what a device, just turned on, sends for a sample; see `encoder`.
-
-        Raises
-        ------
-        ValueError : the settings do not suffice for this format
-
-        """
+        """Return what a device, just turned on, sends for a sample; see `encoder`."""
         return self.encoder(settings)(sample, valid)
 
     def nominal_rate(self, settings: Settings) -> float:
@@ -381,11 +358,9 @@ class Decoder:
         self._splitter = protocol.splitter()
         self._parser = partial(protocol.parser, settings)
         self._parse = self._parser()
-        self._factor = protocol.factor(settings)
-        self._limit = protocol.limit(settings)
-        self._refused_bytes = 0
+        self._factor, self._limit = protocol.factor(settings), protocol.limit(settings)
+        self._refused_bytes, self._begun = 0, False
         self._garbage, self._skipped, self._length = 0, 0, 0.0
-        self._begun = False
         self.faults = self.refused_samples = self.refused_temperatures = 0
 
     @property
@@ -440,7 +415,7 @@ NUMBER = rb'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?'
 _LINE_END = re.compile(rb'[\r\n]')
 
 
-class LineSplitter:
+class LineSplitter(Splitter):
     """
     Gives whole lines without their ends, and no empty ones.
 
@@ -455,13 +430,9 @@ class LineSplitter:
     """
 
     def __init__(self, longest: int, beginnings: tuple[bytes, ...] = ()):
-        self._longest = longest
-        self._beginnings = beginnings
-        self._tail = b''
-        self._begun = False
-        self._too_long = False
-        self._garbage = 0
-        self.discarded_bytes = 0
+        super().__init__()
+        self._longest, self._beginnings = longest, beginnings
+        self._begun = self._too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the lines that these bytes complete."""
@@ -475,8 +446,7 @@ class LineSplitter:
             if not good:
                 self._discard(len(line))
             elif line:
-                whole.append(Frame(line, self._garbage))
-                self._garbage = 0
+                whole.append(self._frame(line))
         self._tail = tail
         if self._too_long or len(tail) > self._longest:
             self._discard(len(tail))
@@ -485,15 +455,11 @@ class LineSplitter:
 
     def reset(self) -> None:
         """Drop the line that has begun."""
-        self._discard(len(self._tail))
-        self._tail, self._garbage, self._begun, self._too_long = b'', 0, False, False
-
-    def _discard(self, count: int) -> None:
-        self.discarded_bytes += count
-        self._garbage += count
+        super().reset()
+        self._begun = self._too_long = False
 
 
-class FrameSplitter:
+class FrameSplitter(Splitter):
     """
     Gives frames that match a pattern and pass their check; after garbage it tries the next byte.
 
@@ -506,12 +472,9 @@ class FrameSplitter:
     """
 
     def __init__(self, pattern: bytes, length: int, is_intact: Callable[[bytes], bool]):
+        super().__init__()
         self._pattern = re.compile(pattern, re.DOTALL)
-        self._length = length
-        self._is_intact = is_intact
-        self._tail = b''
-        self._garbage = 0
-        self.discarded_bytes = 0
+        self._length, self._is_intact = length, is_intact
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete."""
@@ -520,19 +483,9 @@ class FrameSplitter:
             position = match.start() + 1
             if self._is_intact(match.group()):
                 self._discard(match.start() - end)
-                frames.append(Frame(match.group(), self._garbage))
-                self._garbage = 0
+                frames.append(self._frame(match.group()))
                 position = end = match.end()
         kept = max(position, len(data) - self._length + 1)
         self._discard(kept - end)
         self._tail = data[kept:]
         return frames
-
-    def _discard(self, count: int) -> None:
-        self.discarded_bytes += count
-        self._garbage += count
-
-    def reset(self) -> None:
-        """Drop the frame that has begun."""
-        self._discard(len(self._tail))
-        self._tail, self._garbage = b'', 0

@@ -29,6 +29,7 @@ import math
 import struct
 
 from gyro_calibration.driver.protocols.protocol import (
+    count,
     FrameSplitter,
     Protocol,
     Reading,
@@ -73,8 +74,7 @@ def _write(reading: Written, settings: Settings) -> bytes:
 
 def _frame(kind: int, value: float, temperature: float, axis: str) -> bytes:
     numbers = [value if each == axis else 0.0 for each in 'xyz'] + [temperature]
-    counts = [min(max(round(number), -0x8000), 0x7FFF) for number in numbers]
-    frame = bytes([0x55, kind]) + struct.pack('<4h', *counts)
+    frame = bytes([0x55, kind]) + struct.pack('<4h', *map(count, numbers))
     return frame + bytes([sum(frame) & 0xFF])
 
 

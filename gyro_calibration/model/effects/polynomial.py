@@ -132,14 +132,7 @@ def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:
 
 
 def polynomial_to_matrix(effect: Effect, values: Sequence[float]) -> Array:
-    """
-    Write the matrix C of eq. 11 of Ojeda et al.: the inverse of `polynomial_from_matrix`.
-
-    Returns
-    -------
-    array of shape (q + 1, p + 1), for deg/s and degC, highest powers first
-
-    """
+    """Return the matrix C of eq. 11 of Ojeda et al.: the inverse of `polynomial_from_matrix`."""
     output_centre, output_scale, temperature_centre, temperature_scale = values[:4]
     rows = 1 + max(int(parameter.name[1:].split('w')[0]) for parameter in effect.coefficients)
     c = np.reshape(values[4:], (rows, -1))
