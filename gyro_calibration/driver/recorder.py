@@ -55,16 +55,12 @@ class AtomicAppender:
     A new file that grows by whole pieces: each is in it completely, or not at all.
 
     The file is made with the first piece, so that a program that is killed before leaves its place
-    free; that it can be made is tried at once.
+    free; that it can be made is tried at once, and raises OSError where it is there already.
 
     Attributes
     ----------
     size : bytes in the file
     is_full : whether a piece found no room
-
-    Raises
-    ------
-    OSError : the file is there already, or its folder cannot be written to
 
     """
 
@@ -115,33 +111,31 @@ def about(**details: object) -> dict[str, str]:
     return {'recorded by': f'gyro_calibration {__version__}', 'date': date, **known}
 
 
-class McapRecorder:
-    """
-    Writes messages as they are into an MCAP file, a chunk a piece.
-
-    Parameters
-    ----------
-    path : of the new file
-    notes : returns its notes
-
-    Attributes
-    ----------
-    variance : of the rate of one sample of a port, (rad/s)²
-
-    Raises
-    ------
-    OSError : as `AtomicAppender`
-
-    """
+class _Recorder:
+    """A new file of a path and its notes; it raises as `AtomicAppender` does."""
 
     def __init__(self, path: str, notes: Notes):
-        self._file, self._writer, self._notes = AtomicAppender(path), McapWriter(), notes
-        self.variance = ASSUMED_NOISE ** 2
+        self._file, self._notes = AtomicAppender(path), notes
 
     @property
     def size(self) -> int:
         """Bytes in the file."""
         return self._file.size
+
+
+class McapRecorder(_Recorder):
+    """
+    Writes messages as they are into an MCAP file, a chunk a piece.
+
+    Attributes
+    ----------
+    variance : of the rate of one sample of a port, (rad/s)²
+
+    """
+
+    def __init__(self, path: str, notes: Notes):
+        super().__init__(path, notes)
+        self._writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Write a sample of a port as messages on the topics of the driver; the stamp is in ns."""
@@ -184,7 +178,7 @@ class McapRecorder:
             self._file.close()
 
 
-class CsvRecorder:
+class CsvRecorder(_Recorder):
     """
     Writes samples as rows of the log format, some rows a piece.
 
@@ -193,34 +187,20 @@ class CsvRecorder:
     next. Whether and how often a gyro sends its temperature is not known before, so the first
     piece waits for one.
 
-    Parameters
-    ----------
-    path : of the new file, .csv or .csv.gz
-    notes : returns its notes
-
     Attributes
     ----------
     missed : columns that came too late to get into the file
 
-    Raises
-    ------
-    OSError : as `AtomicAppender`
-
     """
 
     def __init__(self, path: str, notes: Notes):
-        self._file, self._is_packed = AtomicAppender(path), path.endswith('.gz')
-        self._notes = notes
+        super().__init__(path, notes)
+        self._is_packed = path.endswith('.gz')
         self._rows: list[tuple[int, dict[str, float]]] = []
         self._current: dict[str, float] = {}
         self._columns: list[str] = []
         self._begin = 0
         self.missed: set[str] = set()
-
-    @property
-    def size(self) -> int:
-        """Bytes in the file."""
-        return self._file.size
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Write a sample of a port; the stamp is in ns."""

@@ -72,11 +72,7 @@ class LowerLine:
 
     Of each block of time only the lowest point is kept. The line is the edge of their lower hull
     that spans their mean. Blocks grow with the time that the points span, up to 20 s altogether;
-    older points are dropped.
-
-    Parameters
-    ----------
-    slope : until there are two points
+    older points are dropped. Until there are two, the slope is the given one.
 
     """
 
@@ -171,17 +167,15 @@ class _Numbers:
 
     def __init__(self, rate: float, modulus: int):
         self._rate, self.modulus = rate, modulus
-        self._sequence: int | None = None
         self._time: float | None = None
         self._outlier: float | None = None
         self.reset()
 
     def reset(self) -> None:
-        self.size, self.unit, self._unevenness = 1.0, 1, 0.0
-        self._odd_advances: list[float] = []
-        self._odd_lost = 0
-        self._sequence = self._time = self._outlier = None
-        self._stands = False
+        self.size, self.unit, self._unevenness, self._stands = 1.0, 1, 0.0, False
+        self._odd_advances, self._odd_lost = list[float](), 0
+        self._sequence: int | None = None
+        self._time = self._outlier = None
 
     def step(self, sample: Sample, most: float = math.inf,
              round_fits: bool = False) -> tuple[float, int]:
@@ -215,8 +209,11 @@ class _Numbers:
 
     def _by_time(self, time: float, missing: int, most: float) -> tuple[float, int]:
         self.unit = 0
-        elapsed = self._elapsed(time, most)
-        if elapsed is None:
+        largest = min(_LARGEST_JUMP, most / self._rate)
+        elapsed = next((time - last for last in (self._time, self._outlier)
+                        if last is not None and _LEAST_STEP <= time - last <= largest), None)
+        if elapsed is None:  # this one time alone shows it
+            self._outlier = time
             advance = self.size * (1 + missing)
             self._time = time if self._time is None else self._time + advance / self._rate
             return advance, missing
@@ -227,15 +224,6 @@ class _Numbers:
             lost = max(lost, min(missing, round(advance / self.size) - 1))
         return advance, lost
 
-    def _elapsed(self, time: float, most: float) -> float | None:
-        """Return the time since the last sample, s; None where only this one time shows it."""
-        largest = min(_LARGEST_JUMP, most / self._rate)
-        for last in (self._time, self._outlier):
-            if last is not None and _LEAST_STEP <= time - last <= largest:
-                return time - last
-        self._outlier = time
-        return None
-
     def _lost(self, advance: float) -> int:
         if self._unevenness == 0.0:
             self.size, self._unevenness = advance, 0.01
@@ -245,8 +233,7 @@ class _Numbers:
         lost = round(steps) - 1 if steps > 2.5 or steps > 1.5 and self._unevenness < 0.15 else 0
         if not 0.3 <= steps <= 2.5:
             return self._odd(advance, max(lost, 0))
-        self._odd_advances.clear()
-        self._odd_lost = 0
+        self._odd_advances, self._odd_lost = [], 0
         self.size += 0.05 * (advance - self.size)
         self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
         return lost
@@ -259,8 +246,7 @@ class _Numbers:
             return lost
         self.size = sorted(self._odd_advances)[_ODD // 2]
         before = self._odd_lost - lost
-        self._odd_advances.clear()
-        self._odd_lost = 0
+        self._odd_advances, self._odd_lost = [], 0
         return -before
 
 
@@ -349,8 +335,8 @@ class SampleClock:
     lost : samples lost so far while the port was open: missing in the sequence or in the time of
         the device, or damaged, or shown by the lateness of all samples since
     period : seconds from one sample to the next, as fitted
-    jitter_before, jitter_after : root mean square over the last ten seconds, s: how late samples
-        arrive, and how far stamps are from the line
+    jitter : root mean square over the last ten seconds, s: how late samples arrive, and how far
+        stamps are from the line
 
     """
 
@@ -361,7 +347,7 @@ class SampleClock:
         self._number, self._slew = 0.0, 0.0
         self._uncertain, self._uncertain_since, self._just_lost = 0, 0.0, 0
         self._last, self._arrival, self._before = after, -math.inf, -math.inf
-        self._squares: tuple[float, ...] = (0.0, 0.0)
+        self._squares = 0.0, 0.0
         self.lost = 0
 
     @property
@@ -375,14 +361,9 @@ class SampleClock:
         return self._line.span() >= _SETTLED
 
     @property
-    def jitter_before(self) -> float:
-        """How late samples arrive, in seconds."""
-        return math.sqrt(self._squares[0])
-
-    @property
-    def jitter_after(self) -> float:
-        """How far stamps are from the line, in seconds."""
-        return math.sqrt(self._squares[1])
+    def jitter(self) -> tuple[float, float]:
+        """How late samples arrive, and how far stamps are from the line, s."""
+        return math.sqrt(self._squares[0]), math.sqrt(self._squares[1])
 
     def interrupt(self) -> None:
         """Begin a new line, as after the port was lost; that time does not count as lost."""
@@ -390,26 +371,17 @@ class SampleClock:
         self._begin_anew()
 
     def stamp(self, samples: Sequence[Sample], arrival: float) -> list[float]:
-        """
-        Return the stamps of the samples that came at one time, by the clock of the arrivals.
-
-        Parameters
-        ----------
-        samples : sequence of Sample, shape (n,)
-        arrival : when they came, in seconds of a clock that never goes back
-
-        """
+        """Return stamps of the samples that came at a time, s, by a clock that never goes back."""
         if not samples:
             return []
         self._before, self._arrival = self._arrival, max(arrival, self._arrival)
         arrival = self._arrival
         numbers = self._count(samples, arrival)
-        shift = self._evidence(numbers[-1], arrival)
-        if shift:
+        if shift := self._evidence(numbers[-1], arrival):
             numbers = [number + shift for number in numbers]
         self._fit(numbers[-1], arrival)
-        stamps = [self._line.at(number) + self._slew for number in numbers]
-        return self._increasing(stamps, arrival)
+        return self._increasing([self._line.at(number) + self._slew for number in numbers],
+                                arrival)
 
     def _count(self, samples: Sequence[Sample], arrival: float) -> list[float]:
         number, before = self._number, self.lost
@@ -504,9 +476,9 @@ class SampleClock:
         first, last = (arrival - stamp + self._slew for stamp in (stamps[0], stamps[-1]))
         weight = min(1.0, len(stamps) * self.period / _JITTER_TIME)
         # the mean square of lateness that is spread evenly
-        now = (first * first + first * last + last * last) / 3.0, self._slew * self._slew
-        self._squares = tuple(old + weight * (new - old)
-                              for old, new in zip(self._squares, now, strict=True))
+        late, (before, after) = (first * first + first * last + last * last) / 3.0, self._squares
+        self._squares = (before + weight * (late - before),
+                         after + weight * (self._slew * self._slew - after))
         if stamps[0] < self._last + _LEAST_STEP:
             step = max((stamps[-1] - self._last) / len(stamps), _LEAST_STEP)
             stamps = [self._last + step * (index + 1) for index in range(len(stamps))]
@@ -522,9 +494,8 @@ def steady() -> float:
 _STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 
-def read_together(
-    even: Callable[[], float], other: Callable[[], float],
-) -> tuple[float, float] | None:
+def read_together(even: Callable[[], float], other: Callable[[], float]
+                  ) -> tuple[float, float] | None:
     """Return two clocks at one time, s; None where each reading of both was held up."""
     for _ in range(5):
         before, value = even(), other()
@@ -577,10 +548,6 @@ class NodeTime:
 
     The difference is followed slowly, and at once where the clock was set.
 
-    Attributes
-    ----------
-    steps : ClockSteps
-
     """
 
     def __init__(self) -> None:
@@ -622,11 +589,7 @@ class HostClock:
     Converts stamps to one axis of time, s, also where the clock of the host is set.
 
     A jump of the stamps counts as none if that clock has just made the same one against the
-    steady clock.
-
-    Attributes
-    ----------
-    steps : ClockSteps
+    steady clock: one of `steps`.
 
     """
 

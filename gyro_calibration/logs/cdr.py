@@ -56,7 +56,7 @@ NO_COVARIANCE, UNMEASURED = (NOT_REPORTED, *8 * (0.0,)), along_z(UNMEASURED_VARI
 
 #: Most parts of a message, how deep they may be nested, and characters of a definition.
 _MOST, _DEEPEST, _LONGEST = 5000, 10, 100_000
-_LINE = '=' * 80
+LINE = '=' * 80
 _CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
           'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
           'float32': 'f', 'float64': 'd', 'string': 's'}
@@ -105,7 +105,7 @@ geometry_msgs/TwistWithCovariance twist""",
 def _with_parts(text: str) -> str:
     for name, part in reversed(_PARTS.items()):
         if f'{name} ' in text:
-            text += f'{_LINE}\nMSG: {name}\n{part}\n'
+            text += f'{LINE}\nMSG: {name}\n{part}\n'
     return text
 
 
@@ -127,19 +127,12 @@ class Layout:
     ----------
     runs : of numbers that follow each other: bytes of an element of the text or sequence before
         the run, 0 for the first run; and formats of the numbers
-    numbers : how many numbers there are after the stamp
     quantities : name -> which of the numbers it is
 
     """
 
     runs: tuple[tuple[int, str], ...]
-    numbers: int
     quantities: Mapping[str, int]
-
-    @property
-    def kept(self) -> tuple[int, ...]:
-        """Return which numbers are quantities."""
-        return tuple(self.quantities.values())
 
 
 @cache
@@ -148,7 +141,7 @@ def layout_of(definition: str, axis: str = 'z') -> Layout:
     if len(definition) > _LONGEST:
         raise MessageError(f'it has more than {_LONGEST} characters')
     parts: dict[str, list[re.Match[str]]] = {}
-    for part in f'MSG: /\n{definition}'.split(f'{_LINE}\n'):
+    for part in f'MSG: /\n{definition}'.split(f'{LINE}\n'):
         name, _, text = part.partition('\n')
         fields = [found for line in text.split('\n')
                   if (found := _FIELD.match(line.partition('#')[0].strip()))]
@@ -170,8 +163,7 @@ def layout_of(definition: str, axis: str = 'z') -> Layout:
     quantities = {quantity: names.index(found) - 2 for quantity, fields in _QUANTITIES.items()
                   for found in [field.format(axis) for field in fields
                                 if field.format(axis) in names][:1]}
-    return Layout(tuple((struct.calcsize(before), codes) for before, codes in runs),
-                  len(names) - 2, quantities)
+    return Layout(tuple((struct.calcsize(before), codes) for before, codes in runs), quantities)
 
 
 def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,

@@ -162,8 +162,15 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     LogError : the file cannot be read, or is not a log; names file, row and column
 
     """
-    blocks = list(_while_it_fits(path, read_log_blocks(
-        path, sensitivity, rate, on_progress=on_progress, columns=columns, axis=axis)))
+    blocks, numbers = [], 0
+    for block in read_log_blocks(path, sensitivity, rate, on_progress=on_progress,
+                                 columns=columns, axis=axis):
+        numbers += len(block) * (sum(getattr(block, quantity) is not None
+                                     for quantity in QUANTITIES) + 10 * len(block.others))
+        if numbers > _WHOLE:
+            raise LogError(f'{path}: has more than {_WHOLE} numbers, which is above the limit of '
+                           'memory; split it')
+        blocks.append(block)
     first = blocks[0]
     present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
     arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks])
@@ -171,17 +178,6 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks))
               for name in first.others}
     return Log(**arrays, notes=first.notes, others=others)
-
-
-def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
-    numbers = 0
-    for block in blocks:
-        numbers += len(block) * (sum(getattr(block, quantity) is not None
-                                     for quantity in QUANTITIES) + 10 * len(block.others))
-        if numbers > _WHOLE:
-            raise LogError(f'{path}: has more than {_WHOLE} numbers, which is above the limit of '
-                           'memory; split it')
-        yield block
 
 
 def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
@@ -278,17 +274,7 @@ def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class _Table:
-    """
-    What the head of a file says of its rows.
-
-    Attributes
-    ----------
-    notes : lines before the header
-    header : names of the columns
-    columns : quantity -> its column
-    delimiter : between values
-
-    """
+    """What the head of a file says of its rows: notes, names, quantity -> column, delimiter."""
 
     notes: tuple[str, ...]
     header: list[str]
@@ -534,13 +520,9 @@ def refuse_wrapped(log: Log) -> None:
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
     """
-    Write a log in SI columns, its other columns, and more named columns, completely or not at all.
+    Write a log, .csv or .csv.gz, in SI columns and its other columns, completely or not at all.
 
-    Parameters
-    ----------
-    path : .csv or .csv.gz
-    log : what to write
-    more : name -> array of shape (n,)
+    More columns may be given: name -> array of shape (n,).
 
     """
     write_log_blocks(path, [(log, more or {})])

@@ -89,7 +89,7 @@ class _Series:
         self.topic, self.kind, self.damaged = topic, kind, 0
         self._layout = cdr.layout_of(definition, axis)
         self.quantities = tuple(self._layout.quantities)
-        self._kept = self._layout.kept
+        self._kept = tuple(self._layout.quantities.values())
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
 
     def __len__(self) -> int:
@@ -313,10 +313,8 @@ class _Reader:
 
     def _in_order(self, gyro: _Course, rate: float | None) -> _Course:
         """Sort samples that overtook each other, leave out doubled ones, refuse unusable times."""
-        if rate is None:
-            gyro = self._single(self._sorted(gyro))
-        else:
-            gyro = replace(gyro, stamps=np.maximum.accumulate(gyro.stamps))
+        gyro = (self._single(self._sorted(gyro)) if rate is None
+                else replace(gyro, stamps=np.maximum.accumulate(gyro.stamps)))
         if len(gyro) < 2:
             raise LogError(f'{self._path}: {gyro.topic} has {len(gyro)} samples with a time; '
                            'a log has at least two: record more')

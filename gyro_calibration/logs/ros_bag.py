@@ -84,22 +84,15 @@ class Message:
 
 @dataclass
 class Contents:
-    """
-    The contents of a recording so far.
+    """The contents of a recording so far."""
 
-    Attributes
-    ----------
-    topics : topic -> kind
-    definitions : kind that may be of use -> definition
-    about, notes : of its recorder; remarks
-    left_out : parts that are damaged or too large
-
-    """
-
+    #: Topic -> kind; kind that may be of use -> definition.
     topics: dict[str, str] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
+    #: Notes of its recorder, and remarks on what was read.
     about: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    #: Parts that are damaged or too large.
     left_out: int = 0
 
     def is_useful(self, kind: str, definition: str) -> bool:
@@ -314,7 +307,14 @@ class _McapReader:
                 definition, _ = _text(body, _text(body, place)[1])
                 self._schemas[struct.unpack_from('<H', body)[0]] = kind, definition
             elif code == _Code.CHANNEL:
-                self._add_channel(body)
+                number, schema = struct.unpack_from('<HH', body)
+                topic, place = _text(body, 4)
+                encoding, _ = _text(body, place)
+                kind, definition = self._schemas.get(schema, ('unknown', ''))
+                topic, kind = shown(topic), shown(kind)
+                self._contents.topics[topic] = kind
+                if encoding == 'cdr' and self._contents.is_useful(kind, definition):
+                    self._channels[number] = topic, kind
             elif code == _Code.METADATA:
                 name, pairs = _metadata(body)
                 if name == ABOUT:  # of a recorder of this program
@@ -322,16 +322,6 @@ class _McapReader:
                                              for key, value in pairs.items()]
         except (_Damaged, struct.error):
             self._contents.left_out += 1
-
-    def _add_channel(self, body: bytes) -> None:
-        number, schema = struct.unpack_from('<HH', body)
-        topic, place = _text(body, 4)
-        topic = shown(topic)
-        encoding, _ = _text(body, place)
-        kind, definition = self._schemas.get(schema, ('unknown', ''))
-        self._contents.topics[topic] = kind = shown(kind)
-        if encoding == 'cdr' and self._contents.is_useful(kind, definition):
-            self._channels[number] = topic, kind
 
 
 class _Damaged(ValueError):
@@ -457,16 +447,15 @@ class McapWriter:
     def add(self, topic: str, kind: str, definition: str, received: int, data: bytes) -> None:
         """Take a message, in CDR, for the next chunk; the time is in ns."""
         if kind not in self._schemas:
-            number = len(self._schemas) + 1
-            schema = _record(_Code.SCHEMA, struct.pack('<H', number), _sized(kind),
+            schema = _record(_Code.SCHEMA, struct.pack('<H', len(self._schemas) + 1), _sized(kind),
                              _sized('ros2msg'), _sized(definition))
-            self._schemas[kind] = number, schema
+            self._schemas[kind] = len(self._schemas) + 1, schema
             self._records += schema
         if topic not in self._channels:
-            number = len(self._channels) + 1
-            channel = _record(_Code.CHANNEL, struct.pack('<HH', number, self._schemas[kind][0]),
-                              _sized(topic), _sized('cdr'), _sized(b''))
-            self._channels[topic] = number, channel
+            ends = len(self._channels) + 1, self._schemas[kind][0]
+            channel = _record(_Code.CHANNEL, struct.pack('<HH', *ends), _sized(topic),
+                              _sized('cdr'), _sized(b''))
+            self._channels[topic] = ends[0], channel
             self._records += channel
         number = self._channels[topic][0]
         self._indexes[number].append((received, len(self._records)))
@@ -588,7 +577,10 @@ def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
     database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{how}', uri=True)
     try:
         database.text_factory = partial(str, encoding='utf-8', errors='replace')
-        database.set_progress_handler(_Steps(file.stat().st_size), _Steps.AT_ONCE)
+        # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite; a query
+        # that takes more than ten a byte, and a million anyway, is ended.
+        thousands = iter(range(file.stat().st_size // 100 + 1000))
+        database.set_progress_handler(lambda: next(thousands, None) is None, 1000)
         if sys.version_info >= (3, 11):
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _PIECE)
         database.execute('PRAGMA trusted_schema = OFF')
@@ -602,24 +594,6 @@ def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
     except BaseException:
         database.close()
         raise
-
-
-class _Steps:
-    """
-    Ends a query that takes more steps of SQLite than the rows of a file can.
-
-    The smallest row has a dozen bytes and takes some 30 steps.
-
-    """
-
-    AT_ONCE, A_BYTE, ANYWAY = 1000, 10, 1_000_000
-
-    def __init__(self, size: int):
-        self._left = self.A_BYTE * size + self.ANYWAY
-
-    def __call__(self) -> bool:
-        self._left -= self.AT_ONCE
-        return self._left < 0
 
 
 def _authorized(action: int, first: str | None, second: str | None, _: str | None,

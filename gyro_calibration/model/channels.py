@@ -38,18 +38,10 @@ Known = dict[tuple[Any, ...], float]
 
 
 class History:
-    """
-    What has been, as far as effects look at it.
-
-    Parameters
-    ----------
-    stand_in : the temperature where none is known, degC
-    low, high : beyond these temperatures the nearest end is taken, degC
-
-    """
+    """What has been, as far as effects look at it."""
 
     def __init__(self, stand_in: float = 25.0, low: float = -math.inf, high: float = math.inf):
-        """Begin with nothing known."""
+        """Begin with nothing known but a temperature that stands in, and its bounds, degC."""
         self._stand_in, self._low, self._high = stand_in, low, high
         self._piece: _Piece | None = None
         self._begin = 0.0

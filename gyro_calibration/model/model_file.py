@@ -58,15 +58,7 @@ class ModelMissing(ModelError):
 
 
 def read_model(path: str | Path) -> GyroModel:
-    """
-    Read a model file.
-
-    Raises
-    ------
-    ModelError : missing, empty, truncated, of a newer version, or no model; names file, place and
-        remedy
-
-    """
+    """Read a model file; a `ModelError` names file, place and remedy."""
     try:
         content = read_settings(path)
     except FileNotFoundError:

@@ -91,10 +91,7 @@ def motion_of(log: Log) -> tuple[Motion, float]:
     """
     Return the motion of the reference of a log with a time, and the time of its beginning, s.
 
-    Raises
-    ------
-    DataRefused : the reference is lost everywhere
-    InputError : there is none
+    InputError says that there is none, DataRefused that it is lost everywhere.
 
     """
     for values, motion in ((log.reference_heading, from_headings),
@@ -110,12 +107,9 @@ def motion_of(log: Log) -> tuple[Motion, float]:
 
 def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
     """
-    Return a motion of constant rates.
+    Return a motion of constant rates: (duration s, rate deg/s) of each stretch.
 
-    Parameters
-    ----------
-    rates : (duration s, rate deg/s) of each stretch; the ramp to its rate is at its beginning
-    ramp : s
+    The ramp to its rate, s, is at its beginning.
 
     """
     time, rate = [0.0], [0.0]

@@ -138,15 +138,7 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
 
 @dataclass(frozen=True)
 class GaussMarkov:
-    """
-    A first-order Gauss-Markov process.
-
-    Attributes
-    ----------
-    density : of the white noise that drives it, rad/s/√s
-    correlation_time : s
-
-    """
+    """A first-order process: density of the noise that drives it, rad/s/√s, and its time, s."""
 
     density: float
     correlation_time: float

@@ -76,15 +76,9 @@ def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarko
 @dataclass(frozen=True)
 class Figures:
     """
-    What simulators hold of a gyro.
+    What simulators hold of a gyro, in rad/s and s; 0 where there is none.
 
-    Attributes
-    ----------
-    bias, bias_deviation : output at rest and its standard deviation, rad/s
-    white_noise : standard deviation of a sample, rad/s
-    wander : of the bias
-    saturation, quantization, time_offset : rad/s, rad/s, s; 0 where there is none
-    interval : between samples, s
+    The bias is the output at rest, the white noise the standard deviation of a sample.
 
     """
 
@@ -191,18 +185,12 @@ _NOISE = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
 
 def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list[str]]:
     """
-    Write what a simulator can hold of a gyro.
-
-    Parameters
-    ----------
-    held : what `figures` returned
-    model : of the gyro
-    simulator : one of `SIMULATORS`
+    Write the `figures` of a gyro for one of `SIMULATORS`.
 
     Returns
     -------
-    text for the simulator, with what it cannot hold as a comment; and the same as a list of
-    sentences
+    text for the simulator, with what it cannot hold of the model as a comment; and the same as a
+    list of sentences
 
     """
     text, names = _FORMATS[simulator](held)

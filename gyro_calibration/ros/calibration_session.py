@@ -161,10 +161,8 @@ class Run:
     @property
     def status(self) -> str:
         """Return the progress in words."""
-        if math.isinf(self.duration):
-            return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call '
-                    'finish_calibration')
-        return f'{self.elapsed:.0f} of {self.duration + self.after:.0f} s'
+        return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
+                if math.isinf(self.duration) else f'{self.elapsed:.0f} of {self.total:.0f} s')
 
     @property
     def temperature(self) -> float | None:
@@ -174,15 +172,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Rules:
-    """
-    What a run is accepted by.
-
-    Attributes
-    ----------
-    limits, odometry : of any run; how accurate the odometry is
-    turns : whole turns; 0 takes the number that the gyro shows
-
-    """
+    """What a run is accepted by; 0 `turns` takes the number that the gyro shows."""
 
     limits: Limits = Limits()
     odometry: Reference = Reference()
@@ -206,9 +196,7 @@ class Drive:
     """
     The commands of a run that drives the robot, and the guards that end it.
 
-    Attributes
-    ----------
-    command_lateness, sample_lateness : the largest of the run, s
+    It measures the largest lateness of commands and of samples, s.
 
     """
 
@@ -219,10 +207,9 @@ class Drive:
         """Begin to wait for a receiver of the commands; `blind` in s, see `BLIND`."""
         assert run.motion is not None
         self._run, self._motion, self._clock, self._blind = run, run.motion, clock, blind
-        self._begun = clock.steady()
-        self._received, self._suspected, self._due = False, False, -math.inf
-        self._called = self._alone = False
-        self._polled = self._begun
+        self._begun = self._polled = clock.steady()
+        self._received = self._suspected = self._called = self._alone = False
+        self._due = -math.inf
         self._delay = StampDelay(clock, BLIND, _DRIVEN)
         self.command_lateness = self.sample_lateness = 0.0
 
@@ -363,7 +350,9 @@ class CalibrationSession:
                     'cancel_calibration')
         if self._store.problem:
             return self._store.problem
-        motion, duration = None, values.calibration_duration
+        motion, drives = None, kind == PROFILE and values.calibration_drive
+        duration = {ODOMETRY: values.calibration_duration,
+                    REST: _REST_DURATION}.get(kind, math.inf)
         if kind == PROFILE:
             try:
                 file = values.calibration_profile_file
@@ -371,12 +360,8 @@ class CalibrationSession:
             except MotionError as error:
                 return str(error)
             duration = motion.duration
-        elif kind != ODOMETRY:
-            duration = _REST_DURATION if kind == REST else math.inf
-        drives = motion is not None and values.calibration_drive
-        if drives and motion is not None:
             fastest, limit = _fastest(motion), self._estimator.used.rate_limit
-            if fastest > limit:
+            if drives and fastest > limit:
                 return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but the gyro '
                         f'measures at most {limit / DEGREE:.0f} deg/s: correct '
                         'calibration.profile_file')
@@ -427,13 +412,7 @@ class CalibrationSession:
                             'time-out of its base, and check for other nodes that command it')
 
     def add_command(self, velocity: Velocity) -> None:
-        """
-        Take a command from cmd_vel, where those of this node come back too.
-
-        They come back in the order in which they were sent. A command that is none of them is that
-        of another node, and ends a run that drives the robot.
-
-        """
+        """Take a command from cmd_vel; one that was not sent here ends a run that drives."""
         for place, rate in enumerate(self._sent):
             if velocity == Velocity(angular=(0.0, 0.0, rate)):
                 for _ in range(place + 1):

@@ -46,9 +46,7 @@ class StampDelay:
     """
     How far stamps are behind the clock of a node, and whether they go on as it does.
 
-    Attributes
-    ----------
-    least : of the samples of the last time, s; nan before the first
+    The `least` delay of the samples of the last time, s, is nan before the first.
 
     """
 

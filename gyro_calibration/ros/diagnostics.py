@@ -35,27 +35,15 @@ def status_array(node: Node, name: str, report: Report, hardware_id: str = '') -
 
 
 class Diagnostics:
-    """
-    Report when asked: once a second, and at once where something has changed.
-
-    Attributes
-    ----------
-    level : of the last report; None before the first
-
-    """
+    """Report when asked; `level` is that of the last report, None before the first."""
 
     def __init__(self, node: Node, name: str, report: Callable[[], Report],
                  hardware_id: str = 'none'):
         """
-        Become a publisher of diagnostics.
+        Become a publisher of diagnostics on a thing by its name, such as ``'gyro'``.
 
-        Parameters
-        ----------
-        node : Node
-        name : what is reported on, for example ``'gyro'``
-        report : returns the level, one sentence, and values by name. It is never called twice at
-            the same time, and must not call `now`.
-        hardware_id : the device; ``'none'`` where it has no name
+        The report, level, sentence and values by name, is never made twice at the same time, and
+        must not call `now`.
 
         """
         self.level: bytes | None = None

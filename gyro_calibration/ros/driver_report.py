@@ -28,9 +28,8 @@ class DriverReport:
 
     Parameters
     ----------
-    connection : Connection
+    connection, settings : of the driver
     port : as it was given
-    settings : Settings
     clock : returns seconds of the steady clock
 
     Attributes
@@ -43,10 +42,9 @@ class DriverReport:
                  clock: Callable[[], float]):
         self._connection, self._port, self._settings = connection, port, settings
         self._clock, self._last, self._last_time = clock, Counts(), clock()
-        self._rate = 0.0
+        self._rate, self._steps = 0.0, 0
         self._grown: dict[str, int] = {}
         self._clock_steps, self.event = '0', ''
-        self._steps = 0
         self._temperature: float | None = None
         self._health: dict[str, float] = {}
 
@@ -127,6 +125,6 @@ class DriverReport:
         return {
             'period_ms': f'{1e3 * clock.period:.6g}',
             'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
-            'jitter_before_ms': f'{1e3 * clock.jitter_before:.3g}',
-            'jitter_after_ms': f'{1e3 * clock.jitter_after:.3g}',
+            'jitter_before_ms': f'{1e3 * clock.jitter[0]:.3g}',
+            'jitter_after_ms': f'{1e3 * clock.jitter[1]:.3g}',
         }

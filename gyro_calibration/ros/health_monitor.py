@@ -108,15 +108,7 @@ class RepeatedOutput:
         self._value, self._since, self._count, self._fell = math.nan, 0.0, 0, False
 
     def add(self, time: float, output: float, turning: float) -> bool:
-        """
-        Take a sample; tell whether it is repeated.
-
-        Parameters
-        ----------
-        time, output : s and rad/s
-        turning : rate that odometry shows, rad/s; 0 where there is none
-
-        """
+        """Take a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
         if output != self._value:
             step = abs(output - self._value)
             self._step = min(step, self._step)
@@ -191,17 +183,9 @@ class HealthMonitor:
 
     def add(self, time: float, output: float, rate: float) -> bool:
         """
-        Take a sample.
+        Take a sample: its stamp, s, output and corrected rate, rad/s.
 
-        Parameters
-        ----------
-        time : stamp, s
-        output : rad/s
-        rate : after model and self-calibration, rad/s
-
-        Returns
-        -------
-        whether a stretch is complete, and `examine` is to be called
+        Tell whether a stretch is complete, and `examine` is to be called.
 
         """
         if self._gathered and not 0.0 < time - self._gathered[-1][0] <= _GAP:

@@ -135,26 +135,19 @@ COUNTED = ('samples', 'refused_samples', 'refused_temperatures', 'lost_samples',
 
 @dataclass
 class Journal:
-    """
-    What happened so far.
+    """What happened so far."""
 
-    Attributes
-    ----------
-    received : when the last sample came, s of the steady clock
-    counts : of samples, and of what was wrong with some
-    event : the last, in words
-    refused : number of refused calibrations, and the last reasons
-    channels : further quantities in the samples
-    clock_steps : of the clock of the host, in words; ''
-
-    """
-
+    #: When the last sample came, s of the steady clock.
     received: float
+    #: Of samples, and of what was wrong with some.
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
+    #: The last event, and steps of the clock of the host, in words.
     event: str = ''
     clock_steps: str = ''
+    #: Number of refused calibrations, and the last reasons.
     refused: int = 0
     reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
+    #: Further quantities in the samples.
     channels: set[str] = field(default_factory=set)
 
 
@@ -234,11 +227,6 @@ class Pipeline:
 
     # Time
 
-    @property
-    def simulated(self) -> bool:
-        """Tell whether stamps are those of a simulation."""
-        return self._clock.simulated() is not None
-
     def _since_epoch(self, stamp: int) -> float:
         """Return s since the first stamp's second, where a double still resolves nanoseconds."""
         if self._epoch is None:
@@ -253,7 +241,7 @@ class Pipeline:
     def _time_of_sample(self, stamp: int, silence: float) -> float:
         """Return the time of a sample that came after a silence; both in s."""
         since = self._since_epoch(stamp)
-        if self.simulated:
+        if self._clock.simulated() is not None:
             return since
         self._look_at_host_clock()
         return self._host.of_sample(since, self._last, self._interval, silence)
@@ -318,8 +306,7 @@ class Pipeline:
 
     def command(self, velocity: Velocity) -> None:
         """Take a command from cmd_vel, those of this node included."""
-        now = self._clock.steady()
-        self.wheels.add(COMMAND, velocity, now)
+        self.wheels.add(COMMAND, velocity, self._clock.steady())
         self.session.add_command(velocity)
 
     def sample(self, stamp: int, output: float, specific_force: float | None = None,
@@ -370,24 +357,21 @@ class Pipeline:
             journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
             return None
         if self._standing is not None:
-            self._add_unseen_turn(now)
+            (first, fastest), self._standing = self._standing, None
+            if now - first > BLIND:  # what the gyro may have turned meanwhile
+                self._add_unknown_turn(min(fastest * (now - first), math.tau))
+                journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
+                                 'came; turns in this time are not in the heading')
         interval = time - self._last
         if 0.0 < interval <= self.values.maximum_gap:
             self._interval = min(interval, self.estimator.tracker.intervals.usual)
-        if self._was_silent(time, now):
+        # Without power, perhaps; where samples only waited, their stamps go on.
+        if (now - journal.received > _POWER_OFF and interval < math.inf
+                and not 0.0 < interval < _POWER_OFF):
             self.estimator.begin_run(self._clock.date())
         self._last = time
         journal.channels = set() if specific_force is None else {'specific_force'}
         return self._use(stamp, time, (interval, silence), output, specific_force, now, receivers)
-
-    def _add_unseen_turn(self, now: float) -> None:
-        """Add to the variance what the gyro may have turned while its stamps stood still."""
-        (first, fastest), self._standing = self._standing or (now, 0.0), None
-        if now - first > BLIND:
-            turned = min(fastest * (now - first), math.tau)
-            self._add_unknown_turn(turned)
-            self.journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
-                                  'came; turns in this time are not in the heading')
 
     def _see_jump(self, now: float, what: str) -> None:
         """Take the second jump of stamps or frames within 1 s for that of several gyros."""
@@ -396,20 +380,15 @@ class Pipeline:
             self._refuse_all(f'{what}, as with several gyros on one topic: give each gyro a topic '
                              'of its own')
 
-    def _was_silent(self, time: float, now: float) -> bool:
-        """Tell whether the gyro may have been without power, and samples did not only wait."""
-        since = time - self._last
-        silent = now - self.journal.received > _POWER_OFF
-        return silent and since < math.inf and not 0.0 < since < _POWER_OFF
-
     def _use(self, stamp: int, time: float, since: tuple[float, float], output: float,
              force: float | None, now: float, receivers: int) -> Output | None:
         """Compensate and integrate a sample; `since` the last one by stamps and arrivals, s."""
         estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
-        moving = self.wheels.moving(now, self._sources) if self._sources else None
+        sources = _SOURCES[self.values.wheels]
+        moving = self.wheels.moving(now, sources) if sources else None
         (interval, silence), received = since, self.journal.received
         lost, unseen = estimator.tracker.intervals.lost, not 0.0 < interval <= BLIND
-        if unseen and not moving and not self.wheels.stood(received, now, self._sources):
+        if unseen and not moving and not self.wheels.stood(received, now, sources):
             moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused > refused:
@@ -472,10 +451,6 @@ class Pipeline:
             self._add_unknown_turn(math.tau)
             if self.session.drives:
                 self.session.end(self.repeats)
-
-    @property
-    def _sources(self) -> tuple[str, ...]:
-        return _SOURCES[self.values.wheels]
 
     def _note_restart(self, reason: str) -> None:
         self.monitor.restart()
@@ -574,7 +549,7 @@ class Pipeline:
 
     def learn(self, ending: bool = False) -> None:
         """Let the bias table learn from rests; to be called once a second, and at the end."""
-        if not self.simulated:
+        if self._clock.simulated() is None:
             self._look_at_host_clock()
         # Twice in a row: samples that were held up come at once, and are late until they have.
         before, self._pace_fault = self._pace_fault, self._stamps.fault()

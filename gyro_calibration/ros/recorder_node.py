@@ -28,10 +28,10 @@ import time
 from typing import Any
 
 from gyro_calibration.driver.timestamps import steady
-from gyro_calibration.logs.cdr import NSEC_PER_SEC
+from gyro_calibration.logs.cdr import LINE, NSEC_PER_SEC
 from gyro_calibration.logs.log import LogError
 from gyro_calibration.logs.ros_bag import Message
-from gyro_calibration.ros.runner import call_every
+from gyro_calibration.ros.runner import call_every, SENSOR_QOS
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -39,11 +39,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-_DEPTH = 5000  # as SENSOR_QOS: 5 s at 1 kHz are kept while a recorder is busy
 _LAST = 10.0  # s; longest time for taking what had come before a busy recorder is stopped
 _POLL_INTERVAL = 0.3  # s; between two queries of the graph
 _LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process
-_LINE = '=' * 80
 _WORDS = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
 
 
@@ -140,7 +138,7 @@ def _quality(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
     latched = all(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
                   for each in publishers)
     return QoSProfile(
-        depth=_DEPTH,
+        depth=SENSOR_QOS.depth,  # while a recorder is busy
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
@@ -163,7 +161,7 @@ def _definition_of(kind: str) -> str:
     kinds, parts = [kind], []
     for each in kinds:
         fields = load(each).get_fields_and_field_types()
-        head = '' if each == kind else f'{_LINE}\nMSG: {each.replace("/msg/", "/")}\n'
+        head = '' if each == kind else f'{LINE}\nMSG: {each.replace("/msg/", "/")}\n'
         parts.append(head + ''.join(f'{_field(text)} {name}\n' for name, text in fields.items()))
         inner = [re.sub(r'^sequence<|[,>\[].*$', '', text).replace('/', '/msg/')
                  for text in fields.values()]
@@ -199,7 +197,14 @@ def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Messa
 
     """
     context = rclpy.Context()
-    _start(context)
+    domain = os.environ.get('ROS_DOMAIN_ID', '')
+    if domain.isdecimal() and int(domain) > _LARGEST_DOMAIN:
+        raise LogError(f'ROS_DOMAIN_ID is {domain}, but must be from 0 to {_LARGEST_DOMAIN}')
+    try:
+        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except (RuntimeError, ValueError) as error:
+        raise LogError(f'ROS 2 cannot be started ({_reason(error)}); '
+                       'check its environment variables') from None
     executor = SingleThreadedExecutor(context=context)
     try:
         node = RecorderNode(topics, everything, take, context)
@@ -224,14 +229,3 @@ def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> Non
         before = node.taken
         executor.spin_once(timeout_sec=0.0)
         idle = 0 if node.taken > before else idle + 1
-
-
-def _start(context: rclpy.Context) -> None:
-    domain = os.environ.get('ROS_DOMAIN_ID', '')
-    if domain.isdecimal() and int(domain) > _LARGEST_DOMAIN:
-        raise LogError(f'ROS_DOMAIN_ID is {domain}, but must be from 0 to {_LARGEST_DOMAIN}')
-    try:
-        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-    except (RuntimeError, ValueError) as error:
-        raise LogError(f'ROS 2 cannot be started ({_reason(error)}); '
-                       'check its environment variables') from None

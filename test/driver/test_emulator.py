@@ -149,15 +149,12 @@ def test_stop_ends_an_endless_gyro_at_once():
     assert time.monotonic() - begin < 5.0  # of 100 s; a busy machine is late
 
 
-@pytest.mark.parametrize('speed', [0.0, -1.0, math.nan])
-def test_an_impossible_speed_is_refused(speed):
-    with pytest.raises(ValueError, match='speed is .* above 0'):
-        Emulator(find('csv'), samples(), speed=speed)
-
-
-def test_settings_that_do_not_suffice_are_refused_before_the_start():
-    with pytest.raises(ValueError, match='sensitivity'):
-        Emulator(find('csv'), samples(), Settings(columns=('gyro_counts',)))
+@pytest.mark.parametrize('given, words', [
+    *(({'speed': speed}, 'speed is .* above 0') for speed in (0.0, -1.0, math.nan)),
+    ({'settings': Settings(columns=('gyro_counts',))}, 'sensitivity')])
+def test_what_an_emulator_cannot_do_is_refused_before_the_start(given, words):
+    with pytest.raises(ValueError, match=words):
+        Emulator(find('csv'), samples(), **given)
 
 
 def test_a_sample_without_a_time_is_refused():

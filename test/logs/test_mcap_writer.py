@@ -42,8 +42,11 @@ def recording(tmp_path):
     return path
 
 
-def test_the_library_mcap_finds_all_by_the_index(recording):
+def test_the_library_mcap_finds_all_from_the_beginning_on_and_by_the_index(recording):
     reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
+    reader = reading.NonSeekingReader(io.BytesIO(recording.read_bytes()), validate_crcs=True)
+    assert [message.log_time for _, channel, message in reader.iter_messages()
+            if channel.topic == '/imu/temperature'] == TIMES[::10]
     with open(recording, 'rb') as file:
         reader = reading.SeekingReader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -56,11 +59,3 @@ def test_the_library_mcap_finds_all_by_the_index(recording):
         found = list(reader.iter_messages(['/imu/data_raw']))
         assert [message.log_time for _, _, message in found] == TIMES
         assert {(schema.name, schema.encoding) for schema, _, _ in found} == {(IMU, 'ros2msg')}
-
-
-def test_the_library_mcap_reads_all_from_the_beginning_to_the_end(recording):
-    reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
-    reader = reading.NonSeekingReader(io.BytesIO(recording.read_bytes()), validate_crcs=True)
-    times = [message.log_time for _, channel, message in reader.iter_messages()
-             if channel.topic == '/imu/temperature']
-    assert times == TIMES[::10]

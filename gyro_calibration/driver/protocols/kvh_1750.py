@@ -40,6 +40,7 @@ from gyro_calibration.driver.protocols.protocol import (
     FrameSplitter,
     Protocol,
     Reading,
+    ROOM_TEMPERATURE,
     Settings,
     STANDARD_GRAVITY,
     stateless,
@@ -50,7 +51,6 @@ _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')
 _MODULUS = 128
 _ALL_VALID = 0x77
-_ROOM_TEMPERATURE = 25.0  # degC; default of an emulated unit
 _MIRRORED = bytes(int(f'{byte:08b}'[::-1], 2) for byte in range(256))
 
 
@@ -83,7 +83,7 @@ def _write(reading: Written, settings: Settings) -> bytes:
         acceleration[axis] = reading.specific_force / STANDARD_GRAVITY
     if not reading.valid:
         status &= ~(1 << axis)
-    temperature = _ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
+    temperature = ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
     frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, reading.sequence % _MODULUS,
                         count(temperature))
     return frame + _checksum(frame)

@@ -30,6 +30,9 @@ from typing import NamedTuple, TypeVar
 STANDARD_GRAVITY = 9.80665
 """m/s²; what devices call one g."""
 
+ROOM_TEMPERATURE = 25.0
+"""degC; default of an emulated device."""
+
 GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts': 1.0}
 """Columns of the log format that hold the output, with their unit in rad/s, or in counts."""
 

@@ -33,6 +33,7 @@ from gyro_calibration.driver.protocols.protocol import (
     FrameSplitter,
     Protocol,
     Reading,
+    ROOM_TEMPERATURE,
     Settings,
     STANDARD_GRAVITY,
     stateless,
@@ -43,7 +44,6 @@ _COUNT = math.radians(2000.0) / 0x8000
 _FORCE = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
 _ACCELERATION, _RATE = 0x51, 0x52
 _NUMBERS = struct.Struct('<2x4h')
-_ROOM_TEMPERATURE = 25.0  # degC; default of an emulated module
 
 
 class _Parser:
@@ -64,7 +64,7 @@ class _Parser:
 
 
 def _write(reading: Written, settings: Settings) -> bytes:
-    degrees = _ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
+    degrees = ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
     rate = _frame(_RATE, reading.value, 100.0 * degrees, settings.axis)
     if reading.specific_force is None:
         return rate
