@@ -32,11 +32,9 @@ import itertools
 import math
 import os
 from pathlib import Path
-import random
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
@@ -50,7 +48,7 @@ from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.runner import PUBLISHED_QOS, SENSOR_QOS
 from nav_msgs.msg import Odometry
 import numpy as np
-from processes import end, processor_time
+from processes import apart, end, node_command, processor_time
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
@@ -59,11 +57,7 @@ from sensor_msgs.msg import Imu, Temperature
 RATES = (100, 1000)  # Hz
 ROUNDS = 4
 BLOCK = 4.0  # s
-COMMANDS = {
-    'relay': [sys.executable, __file__, 'relay'],
-    'node': [sys.executable, '-m', 'gyro_calibration.ros.compensation_node'],
-    'driver': [sys.executable, '-m', 'gyro_calibration.ros.driver_node'],
-}
+NODES = {'node': 'compensation_node', 'driver': 'driver_node'}
 COMPARED = ('relay', 'node')
 PUBLISHED = {'imu/data': Imu, 'heading': PoseWithCovarianceStamped,
              'yaw_rate': TwistWithCovarianceStamped}
@@ -127,10 +121,11 @@ def model() -> GyroModel:
 @contextmanager
 def running(name: str, folder: Path, **parameters: object) -> Iterator[int]:
     """Run a subject in a namespace of its name, and give its process number."""
-    given = [word for key, value in parameters.items() for word in ('-p', f'{key}:={value}')]
+    command = (node_command(NODES[name], parameters) if name in NODES
+               else [sys.executable, __file__, 'relay', '--ros-args'])
     with open(folder / f'{name}.txt', 'wb') as output:
-        process = subprocess.Popen([*COMMANDS[name], '--ros-args', '-r', f'__ns:=/{name}', *given],
-                                   stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+        process = subprocess.Popen([*command, '-r', f'__ns:=/{name}'], stdout=output,
+                                   stderr=subprocess.STDOUT, start_new_session=True)
     try:
         yield process.pid
     finally:
@@ -277,17 +272,14 @@ def _lost(blocks: list[Block]) -> str:
 
 def main() -> None:
     """Measure and print, apart from all other ROS 2 programs."""
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-        os.environ.update(ROS_DOMAIN_ID=str(random.randint(1, 101)),
-                          ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOG_DIR=folder)
+    with apart() as folder:
         rclpy.init()
         try:
             print(f'{os.cpu_count()} cores; load average of the minute before: '
                   f'{os.getloadavg()[0]:.1f}\n')
-            print('\n'.join(table(compare(Path(folder)))))
+            print('\n'.join(table(compare(folder))))
             for rate in RATES:
-                print(f'\ndriver_node at {rate} Hz: load {driver_load(rate, Path(folder)):.1f} % '
+                print(f'\ndriver_node at {rate} Hz: load {driver_load(rate, folder):.1f} % '
                       'of a core')
         finally:
             rclpy.try_shutdown()

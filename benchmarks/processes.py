@@ -8,12 +8,42 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Processes that are measured: how they end, and what they use."""
+"""Processes that are measured: how they begin and end, apart from others, and what they use."""
 
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+import fcntl
+import os
+from pathlib import Path
+import random
 import signal
 import subprocess
+import sys
+import tempfile
 import time
+
+
+@contextmanager
+def apart() -> Iterator[Path]:
+    """Give a folder to programs of ROS 2 that no other one hears: each run locks its domain."""
+    for number in random.sample(range(1, 102), 101):
+        with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}',
+                  'w') as lock, tempfile.TemporaryDirectory() as folder, suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+            os.environ.update(ROS_DOMAIN_ID=str(number), ROS_LOG_DIR=folder,
+                              ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
+            yield Path(folder)
+            return
+    raise RuntimeError('all ROS domains from 1 to 101 are taken by other runs: end some of them')
+
+
+def node_command(name: str, parameters: Mapping[str, object]) -> list[str]:
+    """Return the command that starts a node of this package with parameters."""
+    texts = {key: str(value).lower() if isinstance(value, bool) else value
+             for key, value in parameters.items()}
+    return [sys.executable, '-m', f'gyro_calibration.ros.{name}', '--ros-args',
+            *(word for key, text in texts.items() for word in ('-p', f'{key}:={text}'))]
 
 
 def end(process: subprocess.Popen) -> None:

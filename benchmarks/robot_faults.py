@@ -11,36 +11,33 @@
 """
 What misleads a robot that is calibrated: faults on the real stack, one row each.
 
-    python benchmarks/robot_faults.py [--tree DIRECTORY] [--only WORD]
+    python benchmarks/robot_faults.py [--only WORD]
 
 A compensation node in a process of its own drives a small robot (``test/robot.py``: 150 ms
 latency, 0.2 s lag, 100 Hz) through `calibrate`. In mid-run, at 40 deg/s or more, the fault
 happens. A row states the turn of the robot since, the time until the last command to turn was
 followed by a zero, the error of the heading and its stated standard deviation, the worst
-diagnostics since the fault and the answer of the service. ``--tree`` takes the node from another
-version of this project, also one with the interface of 0.1.0. All faults take 6 min; nothing
-leaves the machine.
+diagnostics since the fault and the answer of the service. All faults take 6 min; nothing leaves
+the machine.
 
 """
 
 import argparse
-from contextlib import contextmanager, ExitStack
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 import math
-import os
 from pathlib import Path
 import random
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / 'test'))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from processes import end  # noqa: E402
+from processes import apart, end, node_command  # noqa: E402
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
@@ -55,27 +52,6 @@ TELEOP = 0.3  # rad/s
 WATCHED = 10.0  # s after a fault
 SPINNING = 'import time\nend = time.monotonic() + 45\nwhile time.monotonic() < end: pass'
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
-
-
-@dataclass(frozen=True)
-class Interface:
-    """Names of one version: module of the node, place of its services, parameter that drives."""
-
-    module: str
-    services: str
-    drive: str
-
-
-OLD = Interface('gyro_calibration.compensation_node', '/', 'drive_profile')
-MOVED = Interface('gyro_calibration.ros.compensation_node', '/', 'drive_profile')
-NEW = Interface('gyro_calibration.ros.compensation_node', '/compensation_node/',
-                'calibration.drive')
-
-
-def interface(tree):
-    """Return the interface of the version in a directory."""
-    ros = tree / 'gyro_calibration' / 'ros'
-    return NEW if (ros / 'pipeline.py').exists() else MOVED if ros.is_dir() else OLD
 
 
 @dataclass
@@ -113,9 +89,8 @@ def _short(text, most=150):
 class Stage:
     """A robot, a node under test, and everything that is heard of both."""
 
-    def __init__(self, tree, folder, closing):
-        self._tree, self._folder, self._closing, self.names = (tree, folder, closing,
-                                                               interface(tree))
+    def __init__(self, folder, closing):
+        self._folder, self.closing = folder, closing
         context = rclpy.Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = rclpy.create_node('robot', context=context)
@@ -149,21 +124,18 @@ class Stage:
 
     def start(self, *, parameters=None, speed=None, **robot):
         """Start robot and node, and wait until the robot has rested for a while."""
-        self.robot = RosRobot(self.node, Robot(**robot), speed=speed)
-        self._closing.callback(self.robot.close)
+        self.robot = RosRobot(self.node, Robot(**robot), speed=speed, stamped=True)
+        self.closing.callback(self.robot.close)
+        self.other = SecondCommander(self.node)
+        self.closing.callback(self.other.close)
         (self._folder / 'model.yaml').write_text(MODEL)
         given = {'model_file': self._folder / 'model.yaml',
                  'calibration_file': self._folder / 'calibration.yaml',
-                 self.names.drive: True, **(parameters or {})}
-        command = [sys.executable, '-m', self.names.module, '--ros-args']
-        texts = {name: str(value).lower() if isinstance(value, bool) else value
-                 for name, value in given.items()}
-        command += [word for name, text in texts.items() for word in ('-p', f'{name}:={text}')]
+                 'calibration.drive': True, 'cmd_vel_stamped': True, **(parameters or {})}
         with open(self._folder / 'node.txt', 'wb') as log:
-            self.process = subprocess.Popen(
-                command, stdout=log, stderr=log, start_new_session=True, cwd=self._tree,
-                env={**os.environ, 'PYTHONPATH': str(self._tree)})
-        self._closing.callback(end, self.process)
+            self.process = subprocess.Popen(node_command('compensation_node', given), stdout=log,
+                                            stderr=log, start_new_session=True)
+        self.closing.callback(end, self.process)
         self.wait(lambda: len(self._heard) > 200, 30.0, 'imu/data')
 
     def wait(self, condition, timeout, what):
@@ -177,7 +149,7 @@ class Stage:
 
     def call(self, name):
         """Call a service, and return the future of its answer."""
-        client = self.node.create_client(Trigger, f'{self.names.services}{name}')
+        client = self.node.create_client(Trigger, f'/compensation_node/{name}')
         if not client.wait_for_service(20.0):
             raise TimeoutError(f'no service {name}')
         return client.call_async(Trigger.Request())
@@ -232,227 +204,154 @@ class Stage:
                 error, claimed = turned - begin[0] - truth[stamp] + begin[1], variance - begin[2]
         return math.degrees(error), math.degrees(math.sqrt(max(claimed, 0.0)))
 
-    def others(self):
-        """Return a second commander."""
-        commander = SecondCommander(self.node)
-        self._closing.callback(commander.close)
-        return commander
+
+@dataclass(frozen=True)
+class Fault:
+    """
+    What happens to a robot and its node; without an `act` the run must work.
+
+    Attributes
+    ----------
+    words : of its row
+    act : in mid-run, at full rate
+    how : arguments of `Stage.start`
+    before : before the run
+    seconds : for which the stage is watched
+    until_answer : or until the run has ended
+    others : rates that others command
+
+    """
+
+    words: str
+    act: Callable | None = None
+    how: dict = field(default_factory=dict)
+    before: Callable = lambda stage: None
+    seconds: float = WATCHED
+    until_answer: bool = False
+    others: tuple = ()
+
+    def row(self, stage):
+        """Let it happen, and return what came of it."""
+        stage.start(**self.how)
+        self.before(stage)
+        if self.act is None:
+            stage.fault()
+        stage.calibrate()
+        if self.act:
+            stage.fault()
+            self.act(stage)
+        stage.watch(self.seconds, self.until_answer)
+        return stage.row(self.words, self.others)
 
 
-def clock_absent(stage):
-    """use_sim_time without /clock, unplugged in mid-run."""
-    stage.start(parameters={'use_sim_time': True})
-    stage.calibrate()
-    stage.robot.robot.unplugged = True
-    stage.fault()
-    stage.watch()
-    return stage.row('sim time without /clock; unplugged in mid-run')
+@dataclass(frozen=True)
+class SecondGyro:
+    """Another publisher on imu/data_raw, whose messages are changed ones of the robot's."""
+
+    words: str
+    late: float
+    output: float | None = None
+
+    def row(self, stage):
+        """Turn the robot by 390 deg, and return what came of it."""
+        stage.start()
+        publisher = stage.node.create_publisher(Imu, 'imu/data_raw', 100)
+
+        def also(message):
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = divmod(
+                stamp.sec * 10 ** 9 + stamp.nanosec + round(1e9 * self.late), 10 ** 9)
+            if self.output is not None:
+                message.angular_velocity.z = self.output * random.random()
+            publisher.publish(message)
+        stage.robot.also = also
+        stage.fault()
+        stage.robot.robot.command(math.radians(45.0))
+        stage.wait(lambda: stage.robot.robot.heading > math.radians(390.0), 20.0, 'the turns')
+        stage.robot.robot.command(0.0)
+        stage.watch(2.0)
+        return stage.row(self.words)
 
 
-def clock_paused(stage):
-    """/clock and stamps stop in mid-run, samples come."""
-    stage.start(parameters={'use_sim_time': True}, speed=1.0)
-    stage.calibrate()
-    stage.robot.clock_stands = True
-    stage.fault()
-    stage.watch()
-    return stage.row('/clock and stamps stand in mid-run')
+def robot_is(**what):
+    """Return what sets attributes of the simulated robot, or of its node."""
+    def act(stage):
+        for name, value in what.items():
+            setattr(stage.robot if name == 'clock_stands' else stage.robot.robot, name, value)
+    return act
 
 
-def clock_paused_unplugged(stage):
-    """/clock stops and the gyro is unplugged."""
-    stage.start(parameters={'use_sim_time': True}, speed=1.0)
-    stage.calibrate()
-    stage.robot.clock_stands = stage.robot.robot.unplugged = True
-    stage.fault()
-    stage.watch()
-    return stage.row('/clock stands and the gyro is unplugged in mid-run')
-
-
-def clock_fast(stage):
-    """/clock at four times the speed: must work."""
-    stage.start(parameters={'use_sim_time': True}, speed=4.0)
-    stage.fault()
-    stage.calibrate()
-    stage.watch(30.0, until_answer=True)
-    return stage.row('/clock at 4x (must work)')
-
-
-def stamps_stand(stage):
-    """Stamps stop in mid-run."""
-    stage.start()
-    stage.calibrate()
-    stage.robot.robot.stamps_stand = True
-    stage.fault()
-    stage.watch()
-    return stage.row('stamps stand in mid-run')
-
-
-def unplugged(stage):
-    """Let the gyro be silent in mid-run."""
-    stage.start()
-    stage.calibrate()
-    stage.robot.robot.unplugged = True
-    stage.fault()
-    stage.watch()
-    return stage.row('gyro unplugged in mid-run')
-
-
-def soft_stop(stage):
-    """Zeros at 20 Hz in mid-run."""
-    stage.start()
-    other = stage.others()
-    stage.calibrate()
-    other.rate = 0.0
-    stage.fault()
-    stage.watch(25.0, until_answer=True)
-    return stage.row('soft stop (zeros at 20 Hz) in mid-run')
+def other_sends(rate):
+    """Return what lets another node send a command at 20 Hz."""
+    return lambda stage: setattr(stage.other, 'rate', rate)
 
 
 def teleop(stage):
-    """Teleop at 20 Hz in mid-run."""
-    stage.start()
-    other = stage.others()
-    stage.calibrate()
-    other.rate = TELEOP
-    stage.fault()
-    stage.watch(5.0)
-    return stage.row('teleop (0.3 rad/s at 20 Hz) in mid-run', others=(TELEOP,))
-
-
-def begun_in_teleop(stage):
-    """Ask for a run while teleop turns the robot."""
-    stage.start()
-    other = stage.others()
-    other.rate = TELEOP
+    """Let teleop turn the robot."""
+    stage.other.rate = TELEOP
     stage.wait(lambda: stage.robot.robot.rate > 0.9 * TELEOP, 10.0, 'teleop')
-    stage.fault()
-    stage.calibrate()
-    stage.watch(5.0)
-    return stage.row('run begun while teleop turns', others=(TELEOP,))
 
 
-def _two_publishers(stage, name, change):
-    stage.start()
-    publisher = stage.node.create_publisher(Imu, 'imu/data_raw', 100)
-
-    def also(message):
-        change(message)
-        publisher.publish(message)
-    stage.robot.also = also
-    stage.fault()
-    stage.robot.robot.command(math.radians(45.0))
-    stage.wait(lambda: stage.robot.robot.heading > math.radians(390.0), 20.0, 'the turns')
-    stage.robot.robot.command(0.0)
-    stage.watch(2.0)
-    return stage.row(name)
-
-
-def _shift(message, seconds):
-    nanoseconds = message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec + round(
-        seconds * 1e9)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10 ** 9)
-
-
-def second_gyro(stage):
-    """Another gyro, which rests, on imu/data_raw."""
-    def change(message):
-        _shift(message, 0.005)
-        message.angular_velocity.z = 0.0001 * random.random()
-    return _two_publishers(stage, 'second publisher: a gyro at rest', change)
-
-
-def second_driver(stage):
-    """Send the same samples once more, 0.3 s old."""
-    return _two_publishers(stage, 'second publisher: stamps 0.3 s older',
-                           lambda message: _shift(message, -0.3))
-
-
-def killed(stage):
-    """SIGKILL of the node; the base has no time-out."""
-    stage.start()
-    stage.calibrate()
-    stage.process.kill()
-    stage.fault()
-    stage.watch(5.0)
-    return stage.row('node killed in mid-run, base without time-out (5 s)')
-
-
-def killed_with_timeout(stage):
-    """SIGKILL of the node; the base has a time-out."""
-    stage.start(timeout=0.5)
-    stage.calibrate()
-    stage.process.kill()
-    stage.fault()
-    stage.watch(5.0)
-    return stage.row('node killed in mid-run, base time-out 0.5 s')
-
-
-def deaf(stage):
+def ignore_the_stop(stage):
     """Let the base go on after a cancel."""
-    stage.start()
-    stage.calibrate()
     stage.robot.robot.deaf = True
-    stage.fault()
     stage.call('cancel_calibration')
-    stage.watch(5.0)
-    return stage.row('base that ignores the stop after a cancel (5 s)')
 
 
-def wheels(stage):
-    """Odometry and commands both feed the detection of standstill: must work."""
-    stage.start(parameters={'wheels': 'both'})
-    stage.fault()
-    stage.calibrate()
-    stage.watch(35.0, until_answer=True)
-    return stage.row('wheels: both (must work)')
+def spin(stage):
+    """Let two processes spin on this computer."""
+    for _ in range(2):
+        stage.closing.callback(end, subprocess.Popen([sys.executable, '-c', SPINNING]))
 
 
-def busy(stage):
-    """Two processes that spin, on this computer."""
-    stage.start()
-    with ExitStack() as spinning:
-        for _ in range(2):
-            process = subprocess.Popen([sys.executable, '-c', SPINNING])
-            spinning.callback(process.wait)
-            spinning.callback(process.kill)
-        stage.fault()
-        stage.calibrate()
-        stage.watch(40.0, until_answer=True)
-    return stage.row('two processes spin (should work)')
-
-
-FAULTS = (clock_absent, clock_paused, clock_paused_unplugged, clock_fast, stamps_stand, unplugged,
-          soft_stop, teleop, begun_in_teleop, second_gyro, second_driver, killed,
-          killed_with_timeout, deaf, wheels, busy)
-
-
-@contextmanager
-def stage_of(tree):
-    """Give a stage of its own to a fault."""
-    os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 101))
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as closing:
-        os.environ['ROS_LOG_DIR'] = folder
-        yield Stage(tree, Path(folder), closing)
+SIMULATED = {'parameters': {'use_sim_time': True}}
+FAULTS = {
+    'clock_absent': Fault('sim time without /clock; unplugged in mid-run',
+                          robot_is(unplugged=True), SIMULATED),
+    'clock_paused': Fault('/clock and stamps stand in mid-run', robot_is(clock_stands=True),
+                          {**SIMULATED, 'speed': 1.0}),
+    'clock_paused_unplugged': Fault(
+        '/clock stands and the gyro is unplugged in mid-run',
+        robot_is(clock_stands=True, unplugged=True), {**SIMULATED, 'speed': 1.0}),
+    'clock_fast': Fault('/clock at 4x (must work)', how={**SIMULATED, 'speed': 4.0}, seconds=30.0,
+                        until_answer=True),
+    'stamps_stand': Fault('stamps stand in mid-run', robot_is(stamps_stand=True)),
+    'unplugged': Fault('gyro unplugged in mid-run', robot_is(unplugged=True)),
+    'soft_stop': Fault('soft stop (zeros at 20 Hz) in mid-run', other_sends(0.0), seconds=25.0,
+                       until_answer=True),
+    'teleop': Fault('teleop (0.3 rad/s at 20 Hz) in mid-run', other_sends(TELEOP), seconds=5.0,
+                    others=(TELEOP,)),
+    'begun_in_teleop': Fault('run begun while teleop turns', before=teleop, seconds=5.0,
+                             others=(TELEOP,)),
+    'second_gyro': SecondGyro('second publisher: a gyro at rest', 0.005, 0.0001),
+    'second_driver': SecondGyro('second publisher: stamps 0.3 s older', -0.3),
+    'killed': Fault('node killed in mid-run, base without time-out (5 s)',
+                    lambda stage: stage.process.kill(), seconds=5.0),
+    'killed_with_timeout': Fault('node killed in mid-run, base time-out 0.5 s',
+                                 lambda stage: stage.process.kill(), {'timeout': 0.5},
+                                 seconds=5.0),
+    'deaf': Fault('base that ignores the stop after a cancel (5 s)', ignore_the_stop,
+                  seconds=5.0),
+    'wheels': Fault('wheels: both (must work)', how={'parameters': {'wheels': 'both'}},
+                    seconds=35.0, until_answer=True),
+    'busy': Fault('two processes spin (should work)', before=spin, seconds=40.0,
+                  until_answer=True),
+}
 
 
 def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--tree', type=Path, default=ROOT, help='version whose node is tested')
-    parser.add_argument('--only', default='',
-                        help='only faults whose function has this in its name')
+    parser.add_argument('--only', default='', help='faults that have this in their name')
     given = parser.parse_args()
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
     print(f'| {" | ".join(HEADER)} |\n|{"---|" * len(HEADER)}', flush=True)
-    for fault in FAULTS:
-        if given.only in fault.__name__:
-            with stage_of(given.tree.resolve()) as stage:
+    for name, fault in FAULTS.items():
+        if given.only in name:
+            with apart() as folder, ExitStack() as closing:
                 try:
-                    row = fault(stage).cells()
+                    row = fault.row(Stage(folder, closing)).cells()
                 except TimeoutError as error:
-                    row = [fault.__name__, *[''] * 4, _short(f'not shown: {error}', 300)]
+                    row = [name, *[''] * 4, _short(f'not shown: {error}', 300)]
             print(f'| {" | ".join(row)} |', flush=True)
 
 

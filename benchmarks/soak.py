@@ -30,14 +30,12 @@ emulated gyro has turned, shows that none of them was lost on the way.
 
 import argparse
 from collections.abc import Iterator
-from contextlib import contextmanager, ExitStack, suppress
-import fcntl
+from contextlib import ExitStack, suppress
 import itertools
 import json
 import math
 import os
 from pathlib import Path
-import random
 import signal
 import statistics
 import subprocess
@@ -56,7 +54,7 @@ from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.runner import SENSOR_QOS
 import numpy as np
-from processes import end, processor_time
+from processes import apart, end, node_command, processor_time
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.signals import SignalHandlerOptions
@@ -277,11 +275,12 @@ class Run:
         words = ['--folder', self._folder, '--protocol', self.given.protocol, '--rate',
                  self.given.rate, '--leading', self.given.leading,
                  '--samples', self.given.samples, *['--patient'] * self.given.patient]
-        self._begin('compensation_node',
-                    self._node('compensation_node', model_file=self._folder / 'model.yaml',
-                               calibration_file=self._folder / 'calibration.yaml'))
-        self._begin('driver_node', self._node('driver_node', port=self._folder / 'port',
-                                              protocol=self.given.protocol, **self._wiring()))
+        for name, parameters in (
+                ('compensation_node', {'model_file': self._folder / 'model.yaml',
+                                       'calibration_file': self._folder / 'calibration.yaml'}),
+                ('driver_node', {'port': self._folder / 'port', 'protocol': self.given.protocol,
+                                 **self._wiring()})):
+            self._begin(name, node_command(name, parameters))
         self._begin('count', [*own, 'count', *words])
         self._begin('gyro', [*own, 'gyro', *words])
         self._wait_for_rates()
@@ -299,11 +298,6 @@ class Run:
         if self.given.rate > LARGEST_RATE:
             given['samples_per_message'] = math.ceil(self.given.rate / LARGEST_RATE)
         return given
-
-    def _node(self, name: str, **parameters: object) -> list[object]:
-        return [sys.executable, '-m', f'gyro_calibration.ros.{name}', '--ros-args',
-                *itertools.chain.from_iterable(('-p', f'{key}:={value}')
-                                               for key, value in parameters.items())]
 
     def _begin(self, name: str, command: list[object]) -> None:
         with open(self._folder / name, 'wb') as output:
@@ -432,18 +426,6 @@ def text(found: dict[str, object]) -> Iterator[str]:
                f'{found["memory_growth_percent"][name]}')
 
 
-@contextmanager
-def own_domain() -> Iterator[int]:
-    """Return a domain that no other run uses meanwhile: each holds the lock of its own."""
-    for number in random.sample(range(1, 102), 101):
-        with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}',
-                  'w') as lock, suppress(BlockingIOError):
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield number
-            return
-    raise RuntimeError('all ROS domains from 1 to 101 are taken by other runs: end some of them')
-
-
 def arguments() -> argparse.Namespace:
     """Return what was asked for; the words `gyro` and `count` start the processes of a run."""
     parser = argparse.ArgumentParser(description='the whole graph under load, for long')
@@ -474,10 +456,7 @@ def process_arguments() -> argparse.Namespace:
 def main() -> None:
     """Measure and print, apart from all other ROS 2 programs."""
     given = arguments()
-    with tempfile.TemporaryDirectory() as folder, own_domain() as domain:
-        os.environ.setdefault('ROS_DOMAIN_ID', str(domain))
-        os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-        os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOG_DIR=folder)
+    with apart():
         if not given.json:
             print(f'{os.cpu_count()} cores; load average of the minute before: '
                   f'{os.getloadavg()[0]:.1f}', flush=True)

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 import json
 import math
 import os
@@ -35,7 +34,7 @@ import time
 from gyro_calibration.diagnosis.findings import Diagnosis, Finding
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, QUANTITIES, read_log
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, part, read_log
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -43,18 +42,10 @@ WINDOW = 60.0
 LAGS = np.arange(-1.5, 1.501, 0.05)
 
 
-def rows(log: Log, chosen: slice) -> Log:
-    """Return some rows of a log; its time goes on as it is."""
-    columns = {name: getattr(log, name) for name in QUANTITIES}
-    return replace(
-        log, **{name: each[chosen] for name, each in columns.items() if each is not None}
-    )
-
-
 def halves(log: Log) -> tuple[Log, Log]:
     """Return a log in two halves of the same duration."""
     middle = int(np.searchsorted(log.time, 0.5 * (log.time[0] + log.time[-1])))
-    return rows(log, slice(0, middle)), rows(log, slice(middle, None))
+    return part(log, slice(0, middle)), part(log, slice(middle, None))
 
 
 def integral(log: Log, rate: Array) -> Array:
@@ -76,13 +67,11 @@ def robust_least_squares(log: Log) -> tuple[float, float]:
     known, best = log.reference_heading[at], (math.inf, 1.0, 0.0)
     for lag in LAGS:
         gyro = np.interp(log.time[at] - lag, log.time, turned)
-        columns = np.column_stack(
-            [gyro - gyro[0], log.time[at] - log.time[at[0]], np.ones(len(at))]
-        )
+        columns = np.column_stack([gyro - gyro[0], log.time[at] - log.time[at[0]],
+                                   np.ones(len(at))])
         start = np.linalg.lstsq(columns, known, rcond=None)[0]
-        found = least_squares(
-            lambda x, columns=columns: columns @ x - known, start, loss='soft_l1', f_scale=DEGREE
-        )
+        found = least_squares(lambda x, columns=columns: columns @ x - known, start,
+                              loss='soft_l1', f_scale=DEGREE)
         best = min(best, (found.cost, found.x[0], found.x[1]))
     return best[1], best[2]
 
@@ -109,11 +98,8 @@ def error(log: Log, rate: Array) -> float:
 
 def sets(found: Diagnosis) -> list[tuple[Finding, set[str]]]:
     """Return the established causes with their sets; those of the reference or record, too."""
-    return [
-        (each, {each.effect, *each.ambiguous_with})
-        for each in found.findings
-        if getattr(each, 'status', 'established') == 'established'
-    ]
+    return [(each, {each.effect, *each.ambiguous_with}) for each in found.findings
+            if getattr(each, 'status', 'established') == 'established']
 
 
 def agree(one: Finding, other: Finding) -> bool:
@@ -140,55 +126,39 @@ def judged(name: str, parts: Sequence[Log]) -> Iterator[dict[str, object]]:
         mine, seconds = found[place]
         other, peer = parts[1 - place], found[1 - place][0]
         scale, bias = robust_least_squares(parts[place])
-        plain = {
-            'nothing': error(other, other.output),
-            'squares': error(other, scale * other.output + bias),
-        }
-        rate = None if mine is None else compensate_log(mine.model, other)
+        plain = {'nothing': error(other, other.output),
+                 'squares': error(other, scale * other.output + bias)}
         row: dict[str, object] = {
-            'drive': name,
-            'part': place + 1,
-            'answered': mine is not None,
+            'drive': name, 'part': place + 1, 'answered': mine is not None,
             'seconds': round(seconds, 1),
-        }
-        row |= {key: round(value / DEGREE, 3) for key, value in plain.items()}
-        if mine is not None and rate is not None:
-            row['model'] = round(error(other, rate) / DEGREE, 3)
-            row['ratio'] = round(error(other, rate) / min(plain.values()), 3)
-            row['verdict'] = mine.verdict
-            row['causes'] = [each.effect for each, _ in sets(mine)]
+            **{key: round(value / DEGREE, 3) for key, value in plain.items()}}
+        if mine is not None and (rate := compensate_log(mine.model, other)) is not None:
+            ours = error(other, rate)
+            row |= {'model': round(ours / DEGREE, 3),
+                    'ratio': round(ours / min(plain.values()), 3),
+                    'verdict': mine.verdict, 'causes': [each.effect for each, _ in sets(mine)]}
             if peer is not None:
-                twins = [
-                    next((b for b, more in sets(peer) if more & names), None)
-                    for _, names in sets(mine)
-                ]
-                row['again'] = sum(twin is not None for twin in twins)
-                same = [
-                    (each, twin)
-                    for (each, _), twin in zip(sets(mine), twins)
-                    if twin is not None
-                    and twin.effect == each.effect
-                    and each.effect in each.parameters
-                ]
-                row['values'], row['agree'] = len(same), sum(agree(*both) for both in same)
+                twins = [next((b for b, more in sets(peer) if more & names), None)
+                         for _, names in sets(mine)]
+                same = [(each, twin) for (each, _), twin in zip(sets(mine), twins)
+                        if twin is not None and twin.effect == each.effect
+                        and each.effect in each.parameters]
+                row |= {'again': sum(twin is not None for twin in twins), 'values': len(same),
+                        'agree': sum(agree(*both) for both in same)}
         yield row
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0])
     parser.add_argument('--drives', help='names, with commas between; default: all')
-    parser.add_argument(
-        '--pairs', action='store_true', help='from drive h to i and from j to k of a unit, too'
-    )
+    parser.add_argument('--pairs', action='store_true',
+                        help='from drive h to i and from j to k of a unit, too')
     parser.add_argument('--json', help='file for the rows')
     given = parser.parse_args()
     folder = Path(os.environ['GYRO_CALIBRATION_DATA']) / 'wheeled_drives'
     names = sorted(path.name.removesuffix('.csv.gz') for path in folder.glob('*.csv.gz'))
-    chosen = (
-        given.drives.split(',')
-        if given.drives
-        else [name for name in names if not name.endswith('_as_recorded')]
-    )
+    chosen = (given.drives.split(',') if given.drives
+              else [name for name in names if not name.endswith('_as_recorded')])
     logs = {name: read_log(folder / f'{name}.csv.gz') for name in chosen}
     work: list[tuple[str, Sequence[Log]]] = [(name, halves(log)) for name, log in logs.items()]
     if given.pairs:
@@ -204,16 +174,13 @@ def main() -> None:
     ratios = np.array([row.get('ratio', np.inf) for row in table], dtype=float)
     causes, again, values, same = (
         sum(len(x) if isinstance(x := row.get(key, 0), list) else int(x) for row in table)
-        for key in ('causes', 'again', 'values', 'agree')
-    )
-    print(
-        f'{len(table)} parts, {sum(bool(row["answered"]) for row in table)} answered; ratio: '
-        'median '
-        f'{np.median(ratios):.2f}, nine in ten {np.quantile(ratios, 0.9, method="higher"):.2f}, '
-        f'worst {ratios.max():.2f}; {again} of {causes} causes in the other part too; '
-        f'{same} of {values} values agree; '
-        f'longest {max(float(row["seconds"]) for row in table):.0f} s'
-    )
+        for key in ('causes', 'again', 'values', 'agree'))
+    print(f'{len(table)} parts, {sum(bool(row["answered"]) for row in table)} answered; ratio: '
+          f'median {np.median(ratios):.2f}, '
+          f'nine in ten {np.quantile(ratios, 0.9, method="higher"):.2f}, '
+          f'worst {ratios.max():.2f}; {again} of {causes} causes in the other part too; '
+          f'{same} of {values} values agree; '
+          f'longest {max(float(row["seconds"]) for row in table):.0f} s')
     if given.json:
         Path(given.json).write_text(json.dumps(table, indent=1))
 
