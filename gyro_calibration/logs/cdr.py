@@ -193,8 +193,6 @@ def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
 
 #: Kind -> layout, of an Imu about and along z.
 LAYOUTS: Mapping[str, Layout] = {kind: layout_of(text) for kind, text in DEFINITIONS.items()}
-#: Place of the rate among the numbers of an Imu.
-RATE_Z = LAYOUTS[IMU].quantities['rate']
 
 
 @cache

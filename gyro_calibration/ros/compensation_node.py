@@ -76,17 +76,11 @@ _WATCH_INTERVAL = 0.2
 class NodeClock:
     """The clocks of a node; see `clock.Clock`."""
 
+    steady, date = staticmethod(steady), staticmethod(time.time)
+
     def __init__(self, node: Node):
         """Read ROS time from a node."""
         self._clock = node.get_clock()
-
-    def steady(self) -> float:
-        """Return seconds of the steady clock."""
-        return steady()
-
-    def date(self) -> float:
-        """Return seconds since 1970."""
-        return time.time()
 
     def simulated(self) -> float | None:
         """Return the time of a simulation, s; None where there is none."""

@@ -75,12 +75,13 @@ class DriverReport:
                            for name, count in vars(counts).items()}
             self._rate = self._grown.pop('samples') / elapsed
             self._last, self._last_time = counts, now
-        last = self._temperature  # which the other thread may drop meanwhile
+        # The other thread may drop these meanwhile.
+        last, clock, protocol = self._temperature, connection.clock, connection.protocol
         return *self._evaluate(), {
             'port': self._port,
             'device': connection.path,
             'state': connection.state.name,
-            'protocol': connection.protocol.name if connection.protocol else '',
+            'protocol': protocol.name if protocol else '',
             'baud': connection.baud,
             'detected': connection.detected,
             'reopened': max(0, connection.openings - 1),
@@ -91,7 +92,11 @@ class DriverReport:
             'rate_hz': f'{self._rate:.1f}',
             'longest_gap_s': f'{self._connection.longest_gap:.3f}',
             'clock_steps': self._clock_steps,
-            **self._of_the_clock(),
+            **({} if clock is None or protocol is None else {
+                'period_ms': f'{1e3 * clock.period:.6g}',
+                'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
+                'jitter_before_ms': f'{1e3 * clock.jitter[0]:.3g}',
+                'jitter_after_ms': f'{1e3 * clock.jitter[1]:.3g}'}),
             **({} if last is None else {'temperature_degc': f'{last:.2f}'}),
             **{name: f'{value:.4g}' for name, value in self._health.items()},
             'last_event': self.event,
@@ -117,14 +122,3 @@ class DriverReport:
                 warnings.append(wrong)
         return (WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (
             OK, 'samples come')
-
-    def _of_the_clock(self) -> dict[str, str]:
-        clock, protocol = self._connection.clock, self._connection.protocol
-        if clock is None or protocol is None:
-            return {}
-        return {
-            'period_ms': f'{1e3 * clock.period:.6g}',
-            'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
-            'jitter_before_ms': f'{1e3 * clock.jitter[0]:.3g}',
-            'jitter_after_ms': f'{1e3 * clock.jitter[1]:.3g}',
-        }

@@ -12,7 +12,7 @@
 
 import io
 
-from gyro_calibration.logs.cdr import DEFINITIONS, IMU, RATE_Z, serialize, TEMPERATURE
+from gyro_calibration.logs.cdr import DEFINITIONS, IMU, LAYOUTS, serialize, TEMPERATURE
 from gyro_calibration.logs.ros_bag import McapWriter
 import pytest
 
@@ -27,7 +27,7 @@ def recording(tmp_path):
     pieces = [writer.begin('a test', 'about', NOTES)]
     for number, time in enumerate(TIMES):
         numbers = 37 * [0.0]
-        numbers[RATE_Z] = 0.001 * number
+        numbers[LAYOUTS[IMU].quantities['rate']] = 0.001 * number
         imu = serialize(time, 'gyro', numbers)
         writer.add('/imu/data_raw', IMU, DEFINITIONS[IMU], time, imu)
         if number % 10 == 0:

@@ -98,7 +98,7 @@ def test_the_shorter_way_to_a_polynomial_is_the_sum_of_its_columns(orders):
     shapes, coefficients = (0.1, 1.7, 35.0, 10.0), generator.normal(size=len(effect.coefficients))
     channels = Channels(np.zeros(50), generator.uniform(-2.0, 2.0, 50),
                         generator.uniform(10.0, 50.0, 50))
-    error = effect.error(channels, (*shapes, *coefficients.tolist()))
+    error = effect.adding((*shapes, *coefficients.tolist()))(channels)
     assert error == pytest.approx(coefficients @ np.array(effect.columns(channels, *shapes)),
                                   rel=1e-12, abs=1e-13)
 

@@ -151,10 +151,6 @@ class Effect:
         """Shapes, then coefficients: the order of a term's values."""
         return self.shapes + self.coefficients
 
-    def error(self, channels: Channels, values: Sequence[float]) -> Number:
-        """Return what the effect adds to the output, rad/s, with these parameters."""
-        return self.adding(values)(channels)
-
     def adding(self, values: Sequence[float]) -> Callable[[Channels], Number]:
         """Return a function of channels: what the effect adds to the output, rad/s."""
         shapes, coefficients = values[:len(self.shapes)], values[len(self.shapes):]
