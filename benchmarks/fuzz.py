@@ -47,8 +47,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 PACKAGE = Path(__file__).parents[1] / 'gyro_calibration'
 GIGABYTE = 1 << 30
 #: What reads the bytes of a target, in the package.
-FILES = {'decoder': ('driver/protocols/protocol.py', 'driver/protocols/frames.py',
-                     'driver/protocols/lines.py'),
+FILES = {'decoder': ('driver/protocols/protocol.py',),
          'listening': ('driver/protocols/listening.py',),
          'sample clock': ('driver/timestamps.py',),
          'log': ('logs/log.py',), 'compressed log': ('logs/log.py',),

@@ -38,7 +38,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from multiprocessing import get_context
 import re
 
@@ -67,7 +67,7 @@ PUBLISHED, WINDOWED = Threshold(0.3 * DEGREE, 0.0), Threshold(0.3 * DEGREE, 0.2)
 SLOW = (0.02, 0.05, 0.1, 0.3, 1.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Known:
     """A drive with its calibrations: by the likelihood, and by eq. 7 of Hong and Park."""
 
@@ -98,28 +98,24 @@ def known(gyro: Preset, course: Course, generator: np.random.Generator) -> Known
 
 # Rows
 
-Row = Callable[[Known], Iterator[tuple[str, Estimate]]]
+Row = Callable[[Known], 'Estimate | None']
 
 
-def _simple(known: Known) -> Iterator[tuple[str, Estimate]]:
-    """Yield integrals of rates: of the paper, and of its parts put right."""
-    time, output = known.drive.time, known.drive.output
-    rates = {'pure integration': output,
-             'self-calibration by eq. 7': known.published.correct(output)}
-    filtered = {'threshold as published': (PUBLISHED, output),
-                'both as published': (PUBLISHED, rates['self-calibration by eq. 7']),
-                'eq. 7, threshold on 0.2 s': (WINDOWED, rates['self-calibration by eq. 7']),
-                'likelihood, threshold on 0.2 s': (WINDOWED, known.likely.correct(output))}
-    rates |= {name: filter_rates(settings, time, rate)
-              for name, (settings, rate) in filtered.items()}
-    rates['likelihood'] = known.likely.correct(output)
-    for name, rate in rates.items():
-        yield name, Estimate(integrate(time, rate))
+def _integrated(calibration: str, threshold: Threshold | None, known: Known) -> Estimate:
+    """Return the integral of rates: of the paper, or of its parts put right."""
+    time, rate = known.drive.time, known.drive.output
+    if calibration:
+        rate = getattr(known, calibration).correct(rate)
+    return Estimate(integrate(time, rate if threshold is None
+                              else filter_rates(threshold, time, rate)))
 
 
-def _tracked(known: Known, noise: Noise, wheels: bool = False) -> tuple[Estimate, Estimate]:
-    """Return what this program makes of a drive, live and with hindsight."""
+@lru_cache(1)
+def _tracked(known: Known, factor: float = 1.0, wheels: bool = False
+             ) -> tuple[Estimate, Estimate]:
+    """Return what this program makes of a drive, live and with hindsight, told this noise."""
     drive, model = known.drive, GyroModel(self_calibration=known.likely)
+    noise = Noise(*(factor * figure for figure in vars(drive.gyro.model.noise).values()))
     rate = np.asarray(known.likely.correct(drive.output))
     sensitivity, still = (rate_sensitivity(model, drive.output, value, 25.0)
                           for value in (rate, 0.0))
@@ -143,68 +139,44 @@ def _looks(drive: Drive) -> np.ndarray:
     return np.arange((len(drive.time) - 1) % every, len(drive.time), every)
 
 
-def _program(known: Known) -> Iterator[tuple[str, Estimate]]:
-    live, later = _tracked(known, known.drive.gyro.model.noise)
-    yield 'this program, live', live
-    yield 'this program, with hindsight', later
-
-
-def _program_with_wheels(known: Known) -> Iterator[tuple[str, Estimate]]:
-    live, later = _tracked(known, known.drive.gyro.model.noise, wheels=True)
-    yield 'this program with wheels, live', live
-    yield 'this program with wheels, with hindsight', later
-
-
-def _program_misled(factor: float, known: Known) -> Iterator[tuple[str, Estimate]]:
-    noise = known.drive.gyro.model.noise
-    live, later = _tracked(known, Noise(*(factor * figure for figure in vars(noise).values())))
-    words = 'half' if factor < 1.0 else 'twice'
-    yield f'this program told {words} the noise, live', live
-    yield f'this program told {words} the noise, with hindsight', later
-
-
-def _peer(name: str, settings: Mapping[str, float],
-          known: Known) -> Iterator[tuple[str, Estimate]]:
-    peer = PEERS[name]
-    if peer.installed:
-        yield f'{name}, as published', Estimate(peer.run(known.drive, known.likely,
-                                                         peer.published))
-        yield f'{name}, best settings', Estimate(peer.run(known.drive, known.likely, settings))
-
-
-def _bounds(known: Known) -> Iterator[tuple[str, Estimate]]:
+@lru_cache(1)
+def _knows_rests(known: Known) -> list[Estimate]:
+    """Return the bounds of who is told the rests, live and with hindsight."""
     looks = _looks(known.drive)
-    yield 'knows s and b(t)', Estimate(bounds.knows_errors(known.drive))
-    yield 'knows s, b(t) and the rests', Estimate(bounds.knows_errors_and_rests(known.drive))
-    for name, (heading, variance) in zip(('live', 'with hindsight'),
-                                         bounds.knows_rests(known.drive)):
-        yield f'knows the rests, {name}', Estimate(heading, variance[looks])
+    return [Estimate(heading, variance[looks])
+            for heading, variance in bounds.knows_rests(known.drive)]
 
 
-#: What makes rows, and the rows it makes.
-MAKERS: dict[Row, tuple[str, ...]] = {
-    _simple: ('pure integration', 'self-calibration by eq. 7', 'threshold as published',
-              'both as published', 'eq. 7, threshold on 0.2 s',
-              'likelihood', 'likelihood, threshold on 0.2 s'),
-    _program: ('this program, live', 'this program, with hindsight'),
-    partial(_program_misled, 0.5): tuple(f'this program told half the noise, {way}'
-                                         for way in ('live', 'with hindsight')),
-    partial(_program_misled, 2.0): tuple(f'this program told twice the noise, {way}'
-                                         for way in ('live', 'with hindsight')),
-    _program_with_wheels: ('this program with wheels, live',
-                           'this program with wheels, with hindsight'),
-    _bounds: ('knows the rests, live', 'knows the rests, with hindsight', 'knows s and b(t)',
-              'knows s, b(t) and the rests'),
-}
+def _by_peer(name: str, settings: Mapping[str, float] | None, known: Known) -> Estimate | None:
+    """Return the heading by a peer with settings, or the published ones; None without it."""
+    peer = PEERS[name]
+    return Estimate(peer.run(known.drive, known.likely, peer.published if settings is None
+                             else settings)) if peer.installed else None
 
 
-def makers(settings: Mapping[str, Mapping[str, float]]) -> dict[Row, tuple[str, ...]]:
-    """Return what makes rows, with the peers in place, and the rows."""
-    of_peers: dict[Row, tuple[str, ...]] = {
-        partial(_peer, name, found): (f'{name}, as published', f'{name}, best settings')
-        for name, found in settings.items()}
-    program = list(MAKERS.items())
-    return dict([*program[:-1], *of_peers.items(), program[-1]])
+def rows(settings: Mapping[str, Mapping[str, float]]) -> dict[str, Row]:
+    """Return what makes the rows, by their names, with the best settings of peers."""
+    found: dict[str, Row] = {
+        name: partial(_integrated, *given) for name, given in {
+            'pure integration': ('', None), 'self-calibration by eq. 7': ('published', None),
+            'threshold as published': ('', PUBLISHED),
+            'both as published': ('published', PUBLISHED),
+            'eq. 7, threshold on 0.2 s': ('published', WINDOWED), 'likelihood': ('likely', None),
+            'likelihood, threshold on 0.2 s': ('likely', WINDOWED)}.items()}
+    ways = list(enumerate(('live', 'with hindsight')))
+    for words, told in (('', (1.0,)), (' told half the noise', (0.5,)),
+                        (' told twice the noise', (2.0,)), (' with wheels', (1.0, True))):
+        found |= {f'this program{words}, {way}': lambda known, told=told, place=place: _tracked(
+            known, *told)[place] for place, way in ways}
+    for name, best in settings.items():
+        found |= {f'{name}, as published': partial(_by_peer, name, None),
+                  f'{name}, best settings': partial(_by_peer, name, best)}
+    found |= {f'knows the rests, {way}': lambda known, place=place: _knows_rests(known)[place]
+              for place, way in ways}
+    return found | {
+        'knows s and b(t)': lambda known: Estimate(bounds.knows_errors(known.drive)),
+        'knows s, b(t) and the rests': lambda known: Estimate(
+            bounds.knows_errors_and_rests(known.drive))}
 
 
 # Scores
@@ -245,12 +217,8 @@ def scores(job: tuple[str, str, int, int, str,
     gyro, course, number, seed, only, settings = job
     generator = np.random.default_rng([seed, number, *gyro.encode(), *course.encode()])
     drive = known(GYROS[gyro], COURSES[course], generator)
-    found: dict[str, Score] = {}
-    for maker, names in makers(settings).items():
-        if any(re.search(only, name) for name in names):
-            found |= {name: score(drive.drive, estimate, generator)
-                      for name, estimate in maker(drive)}
-    return found
+    return {name: score(drive.drive, estimate, generator) for name, row in rows(settings).items()
+            if re.search(only, name) and (estimate := row(drive)) is not None}
 
 
 def tune(job: tuple[str, str, str, int]) -> Mapping[str, float]:
@@ -314,8 +282,7 @@ def drives_tables(given: argparse.Namespace) -> Iterator[str]:
         found_scores = pool.map(scores, jobs, chunksize=1)
     columns = {place: found_scores[given.drives * index:given.drives * (index + 1)]
                for index, place in enumerate(places)}
-    names = [name for each in makers({peer: {} for peer in wanted}).values()
-             for name in each if re.search(given.only, name)]
+    names = [name for name in rows({peer: {} for peer in wanted}) if re.search(given.only, name)]
     yield table(columns, names, mean_error, f'mean error, deg, {given.drives} drives')
     yield table(columns, names, error_of_most, '95 % of the errors are below, deg')
     yield table(columns, names, inside,
@@ -332,12 +299,9 @@ def slow_errors(job: tuple[str, float, int, int,
     gyro, rate, number, seed, settings = job
     generator = np.random.default_rng([seed, number, round(1e6 * rate), *gyro.encode()])
     one = known(GYROS[gyro], Course(partial(slow_path, rate * DEGREE)), generator)
-    found: dict[str, float] = {}
-    for maker, names in makers(settings).items():
-        if any(name in SLOW_ROWS for name in names):
-            found |= {name: abs((estimate.heading[-1] / one.drive.heading[-1]) - 1.0)
-                      for name, estimate in maker(one)}
-    return found
+    made = rows(settings)
+    return {name: abs((estimate.heading[-1] / one.drive.heading[-1]) - 1.0)
+            for name in SLOW_ROWS if (estimate := made[name](one)) is not None}
 
 
 SLOW_ROWS = ('likelihood', 'likelihood, threshold on 0.2 s', 'this program, live',

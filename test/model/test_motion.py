@@ -66,24 +66,16 @@ def test_known_headings_are_met_and_joined_by_lines():
             == [0.0, 0.5, 1.0, 1.25, 1.5])
 
 
-@pytest.mark.parametrize('column, factor',
-                         [('heading_deg', DEGREE), ('heading_rad', 1.0),
-                          ('reference_heading_deg', DEGREE), ('reference_heading_rad', 1.0)])
-def test_a_profile_of_headings_is_read(tmp_path, column, factor):
-    (tmp_path / 'profile.csv').write_text(f'# note\n{column},time_s,lap\n1,0,a\n3,2,b\n\n')
-    motion = read_motion(tmp_path / 'profile.csv')
-    assert (motion.heading.tolist() == pytest.approx([0.0, 2.0 * factor]) and motion.rate is None
-            and motion.duration == 2.0)
-
-
-@pytest.mark.parametrize('column, factor',
-                         [('rate_dps', DEGREE), ('rate_rad_s', 1.0),
-                          ('reference_rate_dps', DEGREE), ('reference_rate_rad_s', 1.0)])
-def test_a_profile_of_rates_is_read(tmp_path, column, factor):
-    (tmp_path / 'profile.csv').write_text(f'\ufefftime_s,{column}\n5,0\n7,3\n')
-    motion = read_motion(tmp_path / 'profile.csv')
-    assert (motion.rate.tolist() == [0.0, 3.0 * factor]
-            and motion.heading_at(2.0) == pytest.approx(3.0 * factor))
+@pytest.mark.parametrize('prefix', ['', 'reference_'])
+@pytest.mark.parametrize('column, factor', [('heading_deg', DEGREE), ('heading_rad', 1.0),
+                                            ('rate_dps', DEGREE), ('rate_rad_s', 1.0)])
+def test_a_profile_of_headings_or_rates_is_read(tmp_path, prefix, column, factor):
+    (tmp_path / 'profile.csv').write_text(
+        f'\ufeff# note\n{prefix}{column},time_s,lap\n0,5,a\n3,7,b\n\n')
+    motion, is_rate = read_motion(tmp_path / 'profile.csv'), column.startswith('rate')
+    assert motion.duration == 2.0 and motion.heading_at(2.0) == pytest.approx(3.0 * factor)
+    assert (motion.rate.tolist() if is_rate else motion.heading.tolist()) == pytest.approx(
+        [0.0, 3.0 * factor]) and (motion.rate is not None) == is_rate
 
 
 def test_the_reference_of_a_log_is_a_profile_by_its_heading_and_without_what_was_lost(tmp_path):
