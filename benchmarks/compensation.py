@@ -11,21 +11,19 @@
 """
 Compare the speed of the compensation of a log, in samples per second, with numpy and a floor.
 
-    python benchmarks/compensation.py [--long]
+    python benchmarks/compensation.py
 
 A polynomial of orders (3, 2) over output and temperature and the integration to the heading run
 over ten million samples. Compared with: numpy's `polyval2d`, and the floor, Horner's rule in place
 on blocks that fit the cache, with nothing else done. All take turns in one run, and medians count.
 Then follows the cost of a sample for logs of 1e4 to 1e7, and of single samples, as on the robot.
-With --long, a hundred million samples are processed in blocks. Prints tables in Markdown.
+Prints tables in Markdown.
 
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
-import resource
 import time as clock
 
 from gyro_calibration.heading.integration import integrate
@@ -46,9 +44,9 @@ BLOCK = 1 << 15  # the fastest of 2**11 to 2**16 for the floor
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def samples(count: int, generator: np.random.Generator, first: int = 0) -> Samples:
+def samples(count: int, generator: np.random.Generator) -> Samples:
     """Return time, output and temperature of a log."""
-    return (np.arange(first, first + count) * 0.01, generator.uniform(-1.75, 1.75, count),
+    return (np.arange(count) * 0.01, generator.uniform(-1.75, 1.75, count),
             generator.uniform(38.0, 48.0, count))
 
 
@@ -147,24 +145,5 @@ def by_length(counts: tuple[int, ...] = (10 ** 4, 10 ** 5, 10 ** 6, 10 ** 7),
     return '\n'.join(lines + [f'| 1, a float, without integration | {1e9 * alone:.0f} |'])
 
 
-def long_log(count: int = 10 ** 8, block: int = 10 ** 6) -> str:
-    """Return the cost of compensating and integrating a log block by block."""
-    generator, heading, taken = np.random.default_rng(0), 0.0, 0.0
-    for first in range(0, count, block):
-        time, output, temperature = samples(block, generator, first)
-        begin = clock.process_time()
-        heading = integrate(time, compensate(MODEL, output, temperature).rate, heading)[-1]
-        taken += clock.process_time() - begin
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return (f'{count:.0e} samples in blocks of {block:.0e}: {1e9 * taken / count:.1f} ns a '
-            f'sample, peak memory {peak:.0f} MiB')
-
-
 if __name__ == '__main__':
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--long', action='store_true',
-                        help='a hundred million samples in blocks, and nothing else')
-    if parser.parse_args().long:
-        print(long_log())
-    else:
-        print(side_by_side(), by_length(), sep='\n\n')
+    print(side_by_side(), by_length(), sep='\n\n')

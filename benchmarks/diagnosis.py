@@ -12,7 +12,7 @@
 Measure how well a diagnosis finds hidden effects: false alarms, names, sets, estimates, gain.
 
     python benchmarks/diagnosis.py [--logs N] [--part PART ...] [--processes 2] [--verbose]
-                                   [--out CASES.jsonl] [--only TEXT] [--seed N] [--with-model]
+                                   [--out CASES.jsonl] [--only TEXT] [--seed N]
 
 Each log has 15 min at 50 Hz of a random gyro in random motion, made by `gyro_calibration_bench`,
 which shares nothing with the package. Sizes are multiples of the minimum detectable effect. Every
@@ -45,8 +45,7 @@ prints each failed one, and ``--out`` writes all of them as JSON, one a line. Pa
 
     A scale factor error of the gyro and one of the reference are the same in any log, and count as
     one. The diagnosis is given no model, except for effects that show only against one: bias,
-    scale factor, and noise; that model is right but for what is hidden. `--with-model` always
-    gives such a model.
+    scale factor, and noise; that model is right but for what is hidden.
 
 """
 
@@ -55,6 +54,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 import json
 import math
 from multiprocessing import get_context
@@ -95,14 +95,14 @@ class Answer:
 
 # the answers
 
-def answered(case: Case, seed: int, with_model: bool | None = None) -> Answer:
+def answered(case: Case, seed: int) -> Answer:
     """Run a case; one that fails in whatever way is a row of the table, and not the end of it."""
     generator = source(case, seed)
     logs = made(case, generator)
     hidden = logs[0]
     begin, found, problem = time.process_time(), None, ''
     try:
-        found = diagnosis_of(logs, generator, with_model or case.against_a_model)
+        found = diagnosis_of(logs, generator, case.against_a_model)
     except Exception as raised:
         problem = f'{type(raised).__name__}: {raised}'
     seconds = time.process_time() - begin
@@ -189,13 +189,10 @@ def main(words: Sequence[str] | None = None) -> None:
     """Run the parts and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--logs', type=int, default=2, help='of each kind; default: 2')
-    parser.add_argument('--part', nargs='+',
-                        default=PARTS)
+    parser.add_argument('--part', nargs='+', default=PARTS)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--only', default='',
                         help='cases in whose names this regular expression is found')
-    parser.add_argument('--with-model', action='store_true',
-                        help='of the simulation, right but for what is hidden')
     parser.add_argument('--processes', type=int, default=1)
     parser.add_argument('--verbose', action='store_true', help='print each case that fails')
     parser.add_argument('--out', help='a file for all cases, JSON, one a line')
@@ -209,19 +206,14 @@ def main(words: Sequence[str] | None = None) -> None:
 
 def _run(chosen: Sequence[Case], given: argparse.Namespace) -> Iterator[Answer]:
     """Run cases, in some processes, and keep them in a file."""
-    jobs = [(case, given.seed, given.with_model or None) for case in chosen]
     with get_context('fork').Pool(given.processes) as pool:
-        for answer in pool.imap(_answered, jobs):
+        for answer in pool.imap(partial(answered, seed=given.seed), chosen):
             if given.verbose and not answer.right:
                 print(failing(answer), file=sys.stderr, flush=True)
             if given.out:
                 with open(given.out, 'a') as file:
                     file.write(json.dumps(asdict(answer)) + '\n')
             yield answer
-
-
-def _answered(job: tuple[Case, int, bool | None]) -> Answer:
-    return answered(*job)
 
 
 def _print(answers: Iterable[Answer]) -> None:

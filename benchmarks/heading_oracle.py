@@ -12,7 +12,6 @@
 Compare the tracked heading with an oracle that is told when the robot rests.
 
     python benchmarks/heading_oracle.py [--drives N] [--only TEXT] [--seed N] [--minutes M]
-                                        [--late S]
 
 Four gyros on four kinds of drive. Noise, motion and oracle are computed here and share nothing
 with the package: flicker is a sum of Gauss-Markov processes half a decade apart, a straight way
@@ -22,8 +21,7 @@ scale factor known within 0.05 %.
 
 The table has the mean absolute heading error of the oracle and, as a ratio to it, that of this
 program, live and with hindsight, and the share of all looks (one a second) inside the stated 95 %.
-The oracle of drives without rests has the calibration alone. With --late the oracle is told each
-rest without so many seconds at its begin and its end, as nobody who has to find it can know more.
+The oracle of drives without rests has the calibration alone.
 
 """
 
@@ -235,16 +233,8 @@ def program(one: Gyro, output: np.ndarray, hindsight: bool) -> tuple[np.ndarray,
     return found.heading, found.variance, found.resting
 
 
-def inner(rests: np.ndarray, count: int) -> np.ndarray:
-    """Return rests without so many samples at begin and end."""
-    known = rests.copy()
-    for edge in np.flatnonzero(np.diff(rests)) + 1:
-        known[max(edge - count, 0):edge + count] = False
-    return known
-
-
-def score(one: Gyro, kind: str, minutes: float, generator: np.random.Generator,
-          late: float = 0.0) -> dict[str, float]:
+def score(one: Gyro, kind: str, minutes: float, generator: np.random.Generator
+          ) -> dict[str, float]:
     """Return errors, deg, and shares inside the stated 95 %, of one drive."""
     rate, rests = drive(kind, minutes, one.interval, generator)
     output = output_of(one, rate, generator)
@@ -252,8 +242,7 @@ def score(one: Gyro, kind: str, minutes: float, generator: np.random.Generator,
     true = np.concatenate([[0.0], np.cumsum(0.5 * one.interval * (rate[1:] + rate[:-1]))])
     true = true[first:] - true[first]
     found: dict[str, float] = {'rests': float(rests[first:].mean())}
-    for name, heading in zip(('live', 'later'), oracle(
-            one, output, inner(rests, round(late / one.interval)))):
+    for name, heading in zip(('live', 'later'), oracle(one, output, rests)):
         found[f'oracle, {name}'] = float(
             np.abs(heading[first:] - heading[first] - true).mean()) / DEG
     for name, hindsight in (('live', False), ('later', True)):
@@ -271,7 +260,6 @@ def main() -> None:
     parser.add_argument('--minutes', type=float, default=15.0)
     parser.add_argument('--only', default='', help='gyros and drives whose name has this text')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--late', type=float, default=0.0)
     given = parser.parse_args()
     print('| gyro, drive | at rest, % | oracle, deg: live, hindsight | over it: live, hindsight '
           '| inside 95 %: live, hindsight | taken for rest, % |\n|:---|---:|---:|---:|---:|---:|')
@@ -280,8 +268,7 @@ def main() -> None:
             if given.only not in f'{name}, {kind}':
                 continue
             generator = np.random.default_rng([given.seed, place, DRIVES.index(kind)])
-            several = [score(one, kind, given.minutes, generator, given.late)
-                       for _ in range(given.drives)]
+            several = [score(one, kind, given.minutes, generator) for _ in range(given.drives)]
             mean = {key: float(np.mean([each[key] for each in several])) for key in several[0]}
             over = [np.array([each[key] for each in several]) for key in
                     ('live', 'oracle, live', 'later', 'oracle, later')]

@@ -11,13 +11,12 @@
 """
 Diagnosis on real drives: the model of one part of a recording, judged by another part.
 
-    python benchmarks/wild.py [--drives wid_02,rc_car_h_unit2] [--pairs] [--json FILE]
+    python benchmarks/wild.py [--drives wid_02,rc_car_h_unit2] [--json FILE]
 
 The recordings are `wheeled_drives` of GYRO_CALIBRATION_DATA (see README.md there). Each half of a
-drive is diagnosed, and its model corrects the other half; with --pairs, so it does from drive h to
-i and from j to k of one unit. The error is that of the heading over 60 s against the course, at
-the lag that is best for each model. It is given over the better one of doing nothing and of a
-robust least squares of bias, scale and lag, which saw the same part.
+drive is diagnosed, and its model corrects the other half. The error is that of the heading over
+60 s against the course, at the lag that is best for each model. It is given over the better one of
+doing nothing and of a robust least squares of bias, scale and lag, which saw the same part.
 
 """
 
@@ -151,24 +150,15 @@ def judged(name: str, parts: Sequence[Log]) -> Iterator[dict[str, object]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0])
     parser.add_argument('--drives', help='names, with commas between; default: all')
-    parser.add_argument('--pairs', action='store_true',
-                        help='from drive h to i and from j to k of a unit, too')
     parser.add_argument('--json', help='file for the rows')
     given = parser.parse_args()
     folder = Path(os.environ['GYRO_CALIBRATION_DATA']) / 'wheeled_drives'
     names = sorted(path.name.removesuffix('.csv.gz') for path in folder.glob('*.csv.gz'))
     chosen = (given.drives.split(',') if given.drives
               else [name for name in names if not name.endswith('_as_recorded')])
-    logs = {name: read_log(folder / f'{name}.csv.gz') for name in chosen}
-    work: list[tuple[str, Sequence[Log]]] = [(name, halves(log)) for name, log in logs.items()]
-    if given.pairs:
-        for name in chosen:
-            after = name.replace('_h_', '_i_').replace('_j_', '_k_')
-            if after != name and after in logs:
-                work.append((f'{name} to {after}', (logs[name], logs[after])))
     table = []
-    for name, parts in work:
-        for row in judged(name, parts):
+    for name in chosen:
+        for row in judged(name, halves(read_log(folder / f'{name}.csv.gz'))):
             table.append(row)
             print(row, flush=True)
     ratios = np.array([row.get('ratio', np.inf) for row in table], dtype=float)
