@@ -13,7 +13,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 
@@ -83,6 +83,8 @@ from gyro_calibration.diagnosis.search import (
     alternatives,
     begin,
     evidence_of,
+    held_out,
+    lasts,
     MOST_OF,
     MOST_SLIPS,
     polished,
@@ -90,6 +92,7 @@ from gyro_calibration.diagnosis.search import (
     pruned,
     Search,
     searched,
+    SURELY,
     suspected,
 )
 from gyro_calibration.diagnosis.steps import CHECKS, OnProgress, Steps
@@ -201,8 +204,12 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate, steps)
+    everything, unconfirmed = _confirmed(search, everything)
     named, unnamed = _withdrawn(search, everything)
     named, contradicted = _without_contradictions(search, named)
+    refuted = {**{each.candidate.cause: 'it does not predict stretches that are held out'
+                  for each in unconfirmed if not lasts(each.candidate)},
+               **dict.fromkeys(contradicted, 'the interval of its size holds 0')}
     steps.begin('alternatives')
     named, sets = _simplest(search, named, unnamed)
     found = FittedValues(fitted(search.problem, named), search.problem.replays)
@@ -238,8 +245,12 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     findings += [*best.values(), *(each for each in changed if each.effect not in covered)]
     if model is not None:
         findings += _of_noise(figures, model, rate, found.replays)
-    if more := suspected(search, (*named, *unnamed)):
-        everything = polished(search, more.named)
+    more = suspected(search, (*named, *unnamed))
+    taken = {each.candidate.cause for each in named}
+    doubtful = [each for each in unconfirmed
+                if lasts(each.candidate) and each.candidate.cause not in taken]
+    for maybe in doubtful or ([more.named[-1]] if more else []):
+        everything = polished(search, (*named, *unnamed, maybe))
         place, with_more = len(everything) - 1, FittedValues(
             fitted(search.problem, everything), found.replays)
         findings.append(as_suspected(named_finding(
@@ -266,7 +277,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         tuple(unexplained(search, found, unnamed)), noise, simulated, won, before, after,
         _cannot_show(search, logs), curves(left, shown), heading_curve(left, shown),
         noise_curve(found, noise, simulated),
-        tuple(_remarks(quality, names, found, unnamed, contradicted, out, won, model)), rate,
+        tuple(_remarks(quality, names, found, unnamed, refuted, out, won, model)), rate,
         heading_shares=of_heading)
 
 
@@ -285,6 +296,22 @@ def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: f
         return search, everything
     search = begin(as_filtered, generator, rate, steps.within)
     return search, searched(search)
+
+
+def _confirmed(search: Search,
+               everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[Named]]:
+    """Take out what does not surely predict stretches that are held out, the least sure first."""
+    unconfirmed: list[Named] = []
+    while everything:
+        surely = [held_out(search, everything, place) for place in range(len(everything))]
+        weakest = int(np.argmin(surely))
+        if surely[weakest] > SURELY:
+            break
+        if is_named(everything[weakest].candidate):
+            unconfirmed.append(everything[weakest])
+        rest = everything[:weakest] + everything[weakest + 1:]
+        everything = polished(search, rest) if rest else rest
+    return everything, unconfirmed
 
 
 def _withdrawn(search: Search,
@@ -465,7 +492,7 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
 
 
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: FittedValues,
-             unnamed: Sequence[Named], contradicted: Sequence[str], out: Sequence[Named],
+             unnamed: Sequence[Named], refuted: Mapping[str, str], out: Sequence[Named],
              won: Gain | None, model: GyroModel | None) -> Iterator[str]:
     """Give what a person should know: of the records, of withdrawn names, and of the model."""
     for place, clean in enumerate(quality):
@@ -476,9 +503,8 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
         why = ('it is at many frequencies' if name == 'interference_tone'
                else 'it differs from log to log, or is not alone')
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
-    for name in dict.fromkeys(contradicted):
-        yield (f'What looks like {name.replace("_", " ")} is not named: the interval of its size '
-               'holds 0.')
+    for name, why in refuted.items():
+        yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     scale, own = (found.scale_factor_error,
                   {term.effect.name for term in ([] if model is None else model.terms)})
     if implausible_scale(found):

@@ -96,6 +96,10 @@ MARGIN = 4.0
 MOST_CONFOUNDERS = 9
 #: So many causes at most are named.
 MOST_CAUSES = 6
+#: A cause is established where it wins so many standard deviations on stretches that are held out
+#: (one-sided 5 %). A stretch counts no more than so much log-likelihood, a ratio of 20: no single
+#: stretch establishes a cause. All logs together have so many stretches.
+SURELY, BOUND, STRETCHES = 1.65, 3.0, 64
 
 
 @dataclass(frozen=True)
@@ -368,8 +372,10 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
     size, deviation = _matched(white, factor, time, width)
     wide, _ = _matched(white, factor, time, 5.0 * width + 0.3)
     value = 0.5 * (size[moments] / deviation) ** 2 - likely - PRICE_OF_COLUMN
-    # A slip stays; an error that comes and goes again has nothing left over a longer time.
-    value[wide[moments] / size[moments] < 0.3] = -np.inf
+    # A slip stays; an error that comes and goes again has nothing left over a longer time. The
+    # rounding of an encoder stays while it rests, and differs by up to a step between two rests.
+    value[(wide[moments] / size[moments] < 0.3)
+          | (np.abs(size[moments]) <= each.rounded)] = -np.inf
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
@@ -530,7 +536,8 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     first = _first(search, done, named)
     if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
         found = [refined(done, each.candidate, each.most - each.mean) for each in first
-                 if search.excess(each.candidate.cause, each.mean, _times(each.candidate)) > 0.0]
+                 if search.excess(each.candidate.cause, each.mean,
+                                  SUSPECTED if lasts(each.candidate) else 1.0) > 0.0]
         return None, sorted(found, key=lambda step: -step.score)
     top = max(first, key=lambda each: each.most)
     # Causes that change the rate look alike to first order; large ones need refined shapes.
@@ -551,15 +558,14 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     return next(beyond, None), steps
 
 
-def _times(candidate: Candidate) -> float:
+def lasts(candidate: Candidate) -> bool:
     """
-    Return at how many times the rate a candidate counts: lasting causes of a size are suspected.
+    Tell whether a cause acts in all logs with a size of its own: only such are suspected.
 
     A limit or a delay has no size apart from its shape, and refined it explains single peaks.
 
     """
-    lasts = is_named(candidate) and candidate.run is None and candidate.amplitude is None
-    return SUSPECTED if lasts else 1.0
+    return is_named(candidate) and candidate.run is None and candidate.amplitude is None
 
 
 def suspected(search: Search, named: Sequence[Named]) -> Step | None:
@@ -569,7 +575,7 @@ def suspected(search: Search, named: Sequence[Named]) -> Step | None:
     causes = {each.candidate.cause for each in named}
     candidates = ((step, step.named[-1].candidate) for step in steps)
     return next((step for step, candidate in candidates
-                 if _times(candidate) > 1.0 and candidate.cause not in causes
+                 if lasts(candidate) and candidate.cause not in causes
                  and search.excess(candidate.cause, step.score - score, SUSPECTED) > 0.0), None)
 
 
@@ -691,3 +697,41 @@ def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
     others = tuple(each for number, each in enumerate(named) if number != place)
     return (fitted(search.problem, named).score - fitted(search.problem, others).score
             - price_of_freedom(named[place]))
+
+
+def sureness(won: Array) -> float:
+    """Return what stretches that are held out win in log-likelihood over its deviation."""
+    bounded = np.clip(won, -BOUND, BOUND)
+    scatter = float(np.std(bounded, ddof=1)) * len(won) ** 0.5
+    return float(np.sum(bounded)) / max(scatter, 1e-9) if np.sum(won) > 0.0 else 0.0
+
+
+def held_out(search: Search, named: Sequence[Named], place: int) -> float:
+    """
+    Return how surely one of the causes predicts stretches of the logs that are held out.
+
+    What it adds, given the others, is scaled by what fits best without each stretch in turn.
+
+    """
+    others = tuple(each for number, each in enumerate(named) if number != place)
+    left, without = (_in_time(fitted(search.problem, some), fitted(search.problem, named))
+                     for some in (named, others))
+    count = max(STRETCHES // len(left), 1)
+    stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
+                              for run, each in enumerate(left)])
+    off, before = np.concatenate(left), np.concatenate(without)
+    added = before - off
+    score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
+    size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
+    return sureness(0.5 * np.bincount(
+        stretch, before ** 2 - (before - size[stretch] * added) ** 2))
+
+
+def _in_time(done: Fitted, noise: Fitted) -> list[Array]:
+    """Return what is left of each log in time, in units of the likeliest noise of another fit."""
+    best = int(noise.by_noise.likelihood[0].argmax())
+    values = np.linalg.solve(done.marginalized.own[best], done.by_noise.towards[0, best])
+    left = (done.residual - values @ done.columns) * done.problem.divided(best) * np.sqrt(
+        noise.marginalized.freedom / noise.by_noise.squares[0, best])
+    ends = np.cumsum([each.points - 1 for each in done.problem.replays])
+    return [inverse(part) for part in np.split(left, ends[:-1])]

@@ -28,7 +28,16 @@ from gyro_calibration.diagnosis.candidates import (
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.regression import fitted, Named, regression_problem
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.search import begin, evidence_of, searched, strongest, suspected
+from gyro_calibration.diagnosis.search import (
+    begin,
+    evidence_of,
+    held_out,
+    polished,
+    searched,
+    strongest,
+    SURELY,
+    suspected,
+)
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration_bench.hidden import hide
@@ -91,6 +100,15 @@ def test_what_may_be_anywhere_pays_for_the_places_to_the_end(cause, added, place
     search, named = found_in([laid(resting(added))])
     assert [each.candidate.cause for each in named] == [cause]
     assert evidence_of(search, named, 0) < gained(search, named) - math.log(places)
+
+
+def test_what_one_stretch_shows_does_not_predict_the_others():
+    lasting, brief = tone(4e-4, 3.3), np.where(abs(TIME - 203.0) < 2.0, tone(2e-2, 3.3), 0.0)
+    search, named = found_in([laid(resting(lasting))])
+    assert held_out(search, named, 0) > SURELY
+    search = begin([laid(resting(brief))], np.random.default_rng(1))
+    named = polished(search, named)
+    assert evidence_of(search, named, 0) > 10.0 and held_out(search, named, 0) < SURELY
 
 
 def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
