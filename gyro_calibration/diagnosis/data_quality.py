@@ -336,6 +336,8 @@ _NOISY, _BLURRED = 0.01, 0.25
 #: it as noise that is new in each sample; but during a rest it stands, and jumps by up to a step
 #: as the motion goes on. Up to this step, rad, that makes no slips (bench: 0.0055 deg, 50 Hz).
 _EXPLAINED, _FINE = 1.5, 0.05 * DEGREE
+#: From this part of a log on, in which a shaft moves evenly or rests, its encoder is not exact.
+_EVEN = 0.5
 #: So many tones are looked for, each of which noise alone shows with this chance.
 _TONES, _BY_CHANCE = 10, 1e-6
 #: An error of a heading that is none but of numbers, rad.
@@ -392,10 +394,27 @@ def limits(log: Log, reference: Reference) -> bool:
     found, step = heading_errors(log), encoder_step(log.reference_heading)
     # while a shaft rests, which may be most of a log, the error of its encoder does not show
     rounding = step / math.sqrt(12.0)
+    if step and rounding > _BLURRED * found.walk and _evenness(log, step) > _EVEN:
+        return True
     if not (found.larger or replace(found, error=rounding).larger):
         return False
     return (reference.kind != 'encoder' or step > _FINE
             or found.error > _EXPLAINED * rounding)
+
+
+def _evenness(log: Log, step: float) -> float:
+    """
+    Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
+
+    Rounding errors are independent from sample to sample where the rate varies. At a constant rate
+    they are a saw, which exact references take for tones, and at rest they stand.
+
+    """
+    assert log.time is not None and log.output is not None
+    phase = np.diff(angle_of(log.time, bridged(log.output))) * (2.0 * math.pi / step)
+    count = max(round(2.0 * _SPAN / float(np.median(np.diff(log.time)))), _BLOCK)
+    blocks = np.exp(1j * phase[:len(phase) // count * count]).reshape(-1, count)
+    return float(np.mean(np.abs(blocks.mean(axis=1)) ** 2)) if len(blocks) else 1.0
 
 
 @dataclass(frozen=True)

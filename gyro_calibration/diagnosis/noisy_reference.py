@@ -50,6 +50,7 @@ from gyro_calibration.diagnosis.findings import (
     SUSPECTED,
     Trace,
 )
+from gyro_calibration.diagnosis.search import SURELY, sureness
 from gyro_calibration.diagnosis.spans import (
     all_columns,
     Column,
@@ -105,10 +106,6 @@ _ALWAYS_SEEN = {*PLAIN, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_er
                 'quantization', 'saturation'}
 #: Most causes that are added, and parts of a log for cross-fitting.
 MOST, FOLDS = 4, 5
-#: By how many standard deviations a cause must win on stretches that are held out (one-sided 5 %),
-#: where a stretch counts no more than so much log-likelihood, a ratio of 20: no single stretch
-#: establishes a cause.
-_SURELY, _BOUND = 1.65, 3.0
 #: Effects along the rate that are larger than this part of it are not established: no gyro has
 #: them (two deviations of the prior of a scale factor error), but where a motion makes columns
 #: alike, several that nearly cancel each other fit what none of them is.
@@ -555,7 +552,7 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequ
     probability = {name: chance for name, chance in probabilities(
         {name: gain - chances[other][1] for name, other in best_of.items()}).items()
         if name in alike}
-    established = (p_value < level and surely > _SURELY and chosen == 1.0 and not column.once
+    established = (p_value < level and surely > SURELY and chosen == 1.0 and not column.once
                    and stretches >= FEWEST_STRETCHES)
     return Confirmed(column, max(p_value, LEAST_PROBABILITY), predicted, chosen, established,
                      probability)
@@ -567,14 +564,14 @@ def _evidences(data: Whitened, columns: Array, places: Sequence[slice], positive
     base, _ = np.linalg.qr(data.plain[rows])
     both = np.column_stack([columns, data.observed])[rows]
     both -= base @ (base.T @ both)
-    stretch = data.stretch[rows]
+    clusters = [each[rows] for each in (data.stretch, *data.places)]
     sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
     return [(1.0, 0.0, 0.0) if above and float(both[:, place.start] @ both[:, -1]) <= 0.0
-            else _evidence(both[:, place], both[:, -1], stretch, 1e-6 * sizes[place])
+            else _evidence(both[:, place], both[:, -1], clusters, 1e-6 * sizes[place])
             for place, above in zip(places, positive)]
 
 
-def _evidence(x: Array, left: Array, stretch: NDArray[np.intp],
+def _evidence(x: Array, left: Array, clusters: Sequence[NDArray[np.intp]],
               least: Array) -> tuple[float, float, float]:
     """Return chance, gain in log-likelihood (both cluster-robust) and effective stretches."""
     information = x.T @ x
@@ -583,14 +580,16 @@ def _evidence(x: Array, left: Array, stretch: NDArray[np.intp],
         return 1.0, 0.0, 0.0
     # by what the candidate leaves: a score that holds the effect itself would hide it
     off = left - x @ np.linalg.lstsq(x, left, rcond=None)[0]
-    scores = np.array([np.bincount(stretch, part * off) for part in x.T])
-    shares = np.bincount(stretch, np.sum((x / size) ** 2, axis=1))
-    effective = float(shares.sum() ** 2 / (shares ** 2).sum())
-    count = x.shape[1]
-    scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
+    count, more, numbers = x.shape[1], 1.0, []
     root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size**2)))
-    more = float(np.linalg.eigvalsh(root @ scatter @ root.T).max())
-    statistic = float(np.sum((root @ x.T @ left) ** 2)) / max(more, 1.0)
+    for cluster in clusters:
+        scores = np.array([np.bincount(cluster, part * off) for part in x.T])
+        shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
+        numbers.append(float(shares.sum() ** 2 / (shares ** 2).sum()))
+        scatter = scores @ scores.T * numbers[-1] / max(numbers[-1] - 1.0 - count, 0.5)
+        more = max(more, float(np.linalg.eigvalsh(root @ scatter @ root.T).max()))
+    effective = min(numbers)
+    statistic = float(np.sum((root @ x.T @ left) ** 2)) / more
     freedom = max(effective - count, 1.0)
     return float(fisher.sf(statistic / count, count, freedom)), 0.5 * statistic, effective
 
@@ -627,9 +626,5 @@ def _cross_fitted(data: Whitened, columns: Array, places: Sequence[slice],
                 off.append(data.observed[held] - design[held] @ values)
             won += np.bincount(np.searchsorted(fold, data.stretch[held]),
                                0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
-        bounded = np.clip(won, -_BOUND, _BOUND)
-        scatter = float(np.std(bounded, ddof=1)) * len(won) ** 0.5
-        total = float(np.sum(won))
-        surely = float(np.sum(bounded)) / max(scatter, 1e-9) if total > 0.0 else 0.0
-        found.append((surely, total, same / folds))
+        found.append((sureness(np.array(won)), float(np.sum(won)), same / folds))
     return found

@@ -67,6 +67,8 @@ _DELAYS = np.arange(-1.5, 1.501, 0.05)
 _NOISY, _LONGEST = 0.05, 0.5
 #: Passes in which values, and points that stand out, are found robustly.
 _PASSES = 2
+#: Places of a shaft, rad: readings in one are not independent of each other.
+_CELL = 10.0 * DEGREE
 #: A gyro rests where its course is lost for so long, s, and its output is as quiet as ever.
 _REST, _QUIET = 3.0, 2.0
 
@@ -157,6 +159,7 @@ class Spans:
         and by what gyro and reference differ by over a second, the smaller first, rad/√s
     noisier : noise of a reference rate over that of the gyro
     delay : by which the stamps of the gyro are late against the reference, s
+    by_code : whether the points are changes of the code of an encoder
 
     """
 
@@ -171,6 +174,7 @@ class Spans:
     walk: tuple[float, float]
     noisier: float = 0.0
     delay: float = 0.0
+    by_code: bool = False
 
     @property
     def fine(self) -> bool:
@@ -184,6 +188,20 @@ class Spans:
         count = max(int(np.ceil(middle[-1] / self.treatment.stretch)), 1)
         of_spans = np.minimum(middle * count / (middle[-1] + 1e-9), count - 1).astype(np.intp)
         return np.concatenate([of_spans, count + np.arange(len(self.rests))])
+
+    @property
+    def places(self) -> NDArray[np.intp]:
+        """
+        Return the number of the place and sense of the shaft of each observation, shape (n + r,).
+
+        An encoder is read in time with the samples. Where a motion repeats in step with them, so
+        does the error of each code change, which stretches in time would take for that many.
+
+        """
+        middle = self.points(np.asarray(self.channels.heading))
+        cell = np.floor(0.5 * (middle[1:] + middle[:-1]) / _CELL)
+        keys = np.concatenate([2.0 * cell + (np.diff(middle) > 0.0), np.zeros(len(self.rests))])
+        return np.unique(keys, return_inverse=True)[1].astype(np.intp)
 
     def points(self, values: Array) -> Array:
         """Return the means of a signal at the points, its delay taken off, shape (n + 1,)."""
@@ -370,8 +388,8 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
     if treatment.relative and not treatment.of_heading and heading_errors(log).larger:
         treatment = replace(treatment, of_heading=True)  # a heading that was differentiated
-    at = time
-    if kind == 'encoder' and encoder_step(reference):
+    at, by_code = time, kind == 'encoder' and encoder_step(reference) > 0.0
+    if by_code:
         # between two samples with different codes the shaft was in the middle between both; of
         # one code only a range is known, and its error where the shaft rests or turns back is the
         # same each time that it does so there: no noise, which averages out
@@ -393,7 +411,7 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
     channels = replace(channels_of(log), rate=output, time=time, heading=integral_of(time, output))
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count, _rests(time, output, known),
-                 treatment, _walk(log, white, treatment), noisier)
+                 treatment, _walk(log, white, treatment), noisier, by_code=by_code)
 
 
 def _walk(log: Log, white: float, treatment: Treatment) -> tuple[float, float]:
@@ -527,18 +545,25 @@ def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array]:
 
     """
     count, stretch = len(fit.values), data.stretch
-    clusters = int(stretch.max()) + 1
     values = np.linalg.lstsq(data.plain, data.observed, rcond=None)[0]
     left = data.observed - data.plain @ values
     influence = data.plain @ np.linalg.pinv(data.plain.T @ data.plain)[:, :count]
-    scores = np.array([np.bincount(stretch, part * left, clusters) for part in influence.T])
-    found = clusters / max(clusters - 1.0, 1.0) * np.sum(scores ** 2, axis=1)
-    larger = np.maximum(np.sqrt(found / np.diag(fit.covariance)), 1.0)
-    inside = stretch < data.of_log
-    shares = np.array([np.bincount(stretch[inside], part ** 2)
-                       for part in data.plain[inside, :count].T])
-    effective = shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300)
+    found, inside = np.diag(fit.covariance), stretch < data.of_log
+    for cluster in (stretch, *data.places):
+        scores = np.array([np.bincount(cluster, part * left) for part in influence.T])
+        number = (_effective(cluster[inside], influence[inside]) if cluster is not stretch
+                  else float(cluster.max()) + 1.0)
+        found = np.maximum(found, np.sum(scores ** 2, axis=1) * number / np.maximum(
+            number - 1.0, 0.5))
+    larger = np.sqrt(found / np.diag(fit.covariance))
+    effective = _effective(stretch[inside], data.plain[inside, :count])
     return fit.covariance * np.outer(larger, larger), effective
+
+
+def _effective(cluster: NDArray[np.intp], columns: Array) -> Array:
+    """Return the effective number of clusters on which each column rests."""
+    shares = np.array([np.bincount(cluster, part ** 2) for part in columns.T])
+    return np.asarray(shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300))
 
 
 def _waves(spans: Spans) -> tuple[Array, list[SharedNoise]]:
@@ -574,6 +599,7 @@ class Whitened:
     observed : shape (n + r + m,)
     plain : columns of scale factor error, bias, delay and causes, then those of the wander
     stretch : of each row
+    places : of an encoder, the place of the shaft of each row
     of_log : the number of stretches of the log; those from it on are known beforehand
 
     """
@@ -581,6 +607,7 @@ class Whitened:
     observed: Array
     plain: Array
     stretch: NDArray[np.intp]
+    places: tuple[NDArray[np.intp], ...]
     of_log: int
     _fit: GridFit
 
@@ -614,8 +641,8 @@ def whitened(done: SpanFit, causes: Sequence[Column], noise: SpanFit | None = No
     prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
     prior[:3, :3] = np.diag(1.0 / done.prior)
     prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
-    stretches = spans.stretches
-    of_log = int(stretches.max()) + 1
+    clusters = [np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
+                for each in (spans.stretches, *([spans.places] if spans.by_code else []))]
     return Whitened(np.append(noise.fit.whiten(spans.observed), np.zeros(len(prior))),
                     np.concatenate([noise.fit.whiten(columns), prior]),
-                    np.concatenate([stretches, of_log + np.arange(len(prior))]), of_log, noise.fit)
+                    clusters[0], tuple(clusters[1:]), int(spans.stretches.max()) + 1, noise.fit)

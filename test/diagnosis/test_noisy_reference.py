@@ -19,6 +19,7 @@ from gyro_calibration.diagnosis.data_quality import (
     rate_noise_share,
     reference_of,
 )
+from gyro_calibration.diagnosis.noisy_reference import search
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.spans import fit_spans, spans_of
@@ -246,6 +247,28 @@ def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always
               reference_heading=np.floor(heading / 0.002) * 0.002)
     assert reference_of(log).kind == 'encoder' and limits(log, reference_of(log))
     assert not heading_errors(log).larger
+
+
+def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
+    # at a constant rate the rounding of a fine encoder is a saw, 50 times the noise of the gyro
+    time, step = np.arange(0.0, 300.0, 0.02), 0.017 * DEGREE
+    turned = 20.0 * DEGREE * np.arcsin(np.sin(0.7 * time))
+    for heading, even in ((turned, True), (2.0 * np.sin(0.7 * time), False)):
+        log = Log(time=time, output=np.gradient(heading, time)
+                  + 7e-5 * np.random.default_rng(6).standard_normal(len(time)),
+                  reference_heading=np.floor(heading / step) * step)
+        assert reference_of(log).kind == 'encoder' and limits(log, reference_of(log)) == even
+
+
+def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
+    # as many swings show the same error of half a sample at each code, one of them that of noise
+    generator, time, step = np.random.default_rng(4), np.arange(0.0, 220.0, 0.01), 0.4 * DEGREE
+    rate = np.convolve(np.where(time % 12.0 < 6.0, 0.2, -0.2), np.hanning(60) / 29.5, 'same')
+    heading = np.cumsum(rate) * 0.01 - 0.005 * rate + 2.1 * DEGREE
+    log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
+              reference_heading=np.floor(heading / step) * step)
+    fit, found = search(fit_spans(spans_of(log, 'encoder')), 0.01, lambda words: None)
+    assert not fit.causes and not any(each.established for each in found)
 
 
 @pytest.mark.parametrize('seed', [1, 2])
