@@ -83,7 +83,6 @@ from gyro_calibration.diagnosis.search import (
     alternatives,
     begin,
     evidence_of,
-    held_out,
     lasts,
     MOST_OF,
     MOST_SLIPS,
@@ -93,6 +92,7 @@ from gyro_calibration.diagnosis.search import (
     Search,
     searched,
     SURELY,
+    surely_predicts,
     suspected,
 )
 from gyro_calibration.diagnosis.steps import CHECKS, OnProgress, Steps
@@ -303,7 +303,7 @@ def _confirmed(search: Search,
     """Take out what does not surely predict stretches that are held out, the least sure first."""
     unconfirmed: list[Named] = []
     while everything:
-        surely = [held_out(search, everything, place) for place in range(len(everything))]
+        surely = [surely_predicts(search, everything, place) for place in range(len(everything))]
         weakest = int(np.argmin(surely))
         if surely[weakest] > SURELY:
             break

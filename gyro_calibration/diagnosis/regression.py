@@ -192,15 +192,16 @@ class Fitted:
         return float(log_sum(by_noise.likelihood)[0] + 0.5 * (
             logarithm - len(self.columns) * np.log(by_noise.squares[0, best])))
 
-    def white(self) -> list[Array]:
+    def white(self, noise: Fitted | None = None) -> list[Array]:
         """Return the residual of each log, whitened in time to variance 1: shape (points,)."""
-        return [inverse(part) for part in self.whitened()]
+        return [inverse(part) for part in self.whitened(noise)]
 
-    def whitened(self) -> list[Array]:
-        """Return the whitened coefficients of each log's residual: shape (points - 1,)."""
-        best = int(self.by_noise.likelihood[0].argmax())
-        factor = self.problem.divided(best) * np.sqrt(
-            self.marginalized.freedom / self.by_noise.squares[0, best])
+    def whitened(self, noise: Fitted | None = None) -> list[Array]:
+        """Return each log's whitened residual, by its own or another's noise: (points - 1,)."""
+        of = noise or self
+        best = int(of.by_noise.likelihood[0].argmax())
+        factor = of.problem.divided(best) * np.sqrt(
+            of.marginalized.freedom / of.by_noise.squares[0, best])
         return [part * own for part, own in zip(self.left(), self._by_log(factor))]
 
     def left(self) -> list[Array]:

@@ -706,16 +706,16 @@ def sureness(won: Array) -> float:
     return float(np.sum(bounded)) / max(scatter, 1e-9) if np.sum(won) > 0.0 else 0.0
 
 
-def held_out(search: Search, named: Sequence[Named], place: int) -> float:
+def surely_predicts(search: Search, named: Sequence[Named], place: int) -> float:
     """
     Return how surely one of the causes predicts stretches of the logs that are held out.
 
     What it adds, given the others, is scaled by what fits best without each stretch in turn.
 
     """
-    others = tuple(each for number, each in enumerate(named) if number != place)
-    left, without = (_in_time(fitted(search.problem, some), fitted(search.problem, named))
-                     for some in (named, others))
+    full, rest = (fitted(search.problem, some)
+                  for some in (named, [*named[:place], *named[place + 1:]]))
+    left, without = full.white(), rest.white(full)
     count = max(STRETCHES // len(left), 1)
     stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
                               for run, each in enumerate(left)])
@@ -725,13 +725,3 @@ def held_out(search: Search, named: Sequence[Named], place: int) -> float:
     size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
     return sureness(0.5 * np.bincount(
         stretch, before ** 2 - (before - size[stretch] * added) ** 2))
-
-
-def _in_time(done: Fitted, noise: Fitted) -> list[Array]:
-    """Return what is left of each log in time, in units of the likeliest noise of another fit."""
-    best = int(noise.by_noise.likelihood[0].argmax())
-    values = np.linalg.solve(done.marginalized.own[best], done.by_noise.towards[0, best])
-    left = (done.residual - values @ done.columns) * done.problem.divided(best) * np.sqrt(
-        noise.marginalized.freedom / noise.by_noise.squares[0, best])
-    ends = np.cumsum([each.points - 1 for each in done.problem.replays])
-    return [inverse(part) for part in np.split(left, ends[:-1])]
