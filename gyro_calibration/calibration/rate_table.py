@@ -143,8 +143,8 @@ class Calibration:
         None where the output always grows with the rate.
 
         """
-        folded = (self.model.steepness(channels_of(self.dwells)) + np.zeros(len(self.dwells))
-                  <= 0.1)
+        steepness = GyroModel(self.terms).steepness(channels_of(self.dwells))
+        folded = np.broadcast_to(steepness <= 0.1, len(self.dwells))
         return float(np.abs(self.dwells.rate[folded]).min()) if folded.any() else None
 
     @property

@@ -191,10 +191,15 @@ def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibra
 
 
 def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
-    """Return whether more effects predict left-out sweeps better, each beyond chance."""
+    """
+    Return whether more effects predict left-out sweeps better, each beyond chance.
+
+    A response that no longer grows with the rate at some dwells cannot be undone there.
+
+    """
     added = [effect for effect in larger.effects if effect not in smaller.effects]
     predicts = larger.predicted_misfit() < smaller.predicted_misfit()
-    return predicts and all(larger.chance_of(effect) < limit for effect in added)
+    return predicts and larger.folded_beyond is None and all(larger.chance_of(effect) < limit for effect in added)
 
 
 def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float) -> Calibration:
@@ -250,7 +255,8 @@ def decided(fit: Calibration, technology: str | None,
             if taken in fit.effects:
                 swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other),
                                fit.scatter)
-            if swapped is not None:
+            # rates at the zeros of a sine let it explain anything
+            if swapped is not None and swapped.folded_beyond is None:
                 fit, confounders = _decide((fit, taken), (swapped, other), technology, bounded)
                 found.append(confounders)
                 break

@@ -46,8 +46,9 @@ def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Col
     """
     Return what a rate may be off by beyond the covariance of the values.
 
-    Beyond what was seen the error is that of a fit with more columns, less that of the values, at
-    half a width beyond.
+    Effects that were not fitted may still be there, as far as they do not show: a fit with more
+    columns has a larger variance than that of the values. Its mean over the dwells adds to the
+    variance of the bias; half a width beyond what was seen it gives the slopes.
 
     Parameters
     ----------
@@ -88,7 +89,8 @@ def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Col
     at_rest = max(more(0.0, end) for end in ends)
     turning = max(more(side * fastest, end) for end in ends for side in (-1.0, 1.0))
     faster = max(more(side * 1.5 * fastest, middle) for side in (-1.0, 1.0))
-    return Tolerance(float(sweeps[0]), float(sweeps[1]), math.sqrt(at_rest) / half,
+    unfitted = np.mean([more(*each) for each in zip(dwells.rate, temperature)])
+    return Tolerance(math.sqrt(sweeps[0] ** 2 + unfitted), float(sweeps[1]), math.sqrt(at_rest) / half,
                      math.sqrt(max(turning - at_rest, 0.0)) / half / fastest,
                      math.sqrt(faster) / (0.5 * fastest))
 

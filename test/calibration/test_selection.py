@@ -12,7 +12,7 @@
 
 from dataclasses import replace
 
-from gyro_calibration.calibration.dwells import join
+from gyro_calibration.calibration.dwells import from_table, join
 from gyro_calibration.calibration.selection import (
     DISTINGUISHED,
     FALSE_ALARM_RATE,
@@ -20,7 +20,7 @@ from gyro_calibration.calibration.selection import (
     select_effects,
     TECHNOLOGIES,
 )
-from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.effects import (
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -113,6 +113,16 @@ def test_the_rate_that_is_proposed_distinguishes_confounders(runs):
         sigmas.append(pair.sigmas if pair.taken == 'sine_response' else -pair.sigmas)
     # The aim is one sigma more than needed; a single pair of fits varies by one sigma.
     assert np.mean(sigmas) > DISTINGUISHED - 3.7 / np.sqrt(runs), sigmas
+
+
+def test_a_sine_with_its_zeros_at_the_rates_of_the_dwells_is_no_response():
+    rate = 6.0 * DEGREE * np.tile(np.arange(-10.0, 11.0), 6)
+    sweeps = {'sweep': tuple(np.repeat(list('abcdef'), 21))}
+    for seed in range(4):
+        error = 1.2e-5 * np.random.default_rng(seed).standard_normal(len(rate))
+        table = from_table(Log(output=rate * (1.0 + 2e-5 * rate ** 2) + error,
+                               reference_rate=rate, others=sweeps))
+        assert select_effects(table, 'open_loop_fog').calibration.folded_beyond is None
 
 
 def test_every_effect_has_its_reason():
