@@ -199,7 +199,8 @@ def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
     """
     added = [effect for effect in larger.effects if effect not in smaller.effects]
     predicts = larger.predicted_misfit() < smaller.predicted_misfit()
-    return predicts and larger.folded_beyond is None and all(larger.chance_of(effect) < limit for effect in added)
+    return (predicts and larger.folded_beyond is None
+            and all(larger.chance_of(effect) < limit for effect in added))
 
 
 def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float) -> Calibration:

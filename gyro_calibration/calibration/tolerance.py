@@ -79,18 +79,19 @@ def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Col
     gram = (white / lengths).T @ (white / lengths) + np.diag((spread * lengths) ** -2.0)
     inverse = np.linalg.pinv(gram, hermitian=True)
 
-    def more(rate: float, warm: float) -> float:
+    def more(rate: Array, warm: Array) -> Array:
         """Return the variance that the larger fit has beyond that of the values, (rad/s)²."""
-        at = np.array([rate]), np.array([warm])
-        wide, row = larger(*at)[0] / lengths, columns(*at)[0]
-        return float(max(wide @ inverse @ wide - row @ covariance @ row, 0.0))
+        wide, row = larger(rate, warm) / lengths, columns(rate, warm)
+        return np.maximum(((wide @ inverse) * wide).sum(axis=1)
+                          - ((row @ covariance) * row).sum(axis=1), 0.0)
 
-    ends = (low - half, high + half)
-    at_rest = max(more(0.0, end) for end in ends)
-    turning = max(more(side * fastest, end) for end in ends for side in (-1.0, 1.0))
-    faster = max(more(side * 1.5 * fastest, middle) for side in (-1.0, 1.0))
-    unfitted = np.mean([more(*each) for each in zip(dwells.rate, temperature)])
-    return Tolerance(math.sqrt(sweeps[0] ** 2 + unfitted), float(sweeps[1]), math.sqrt(at_rest) / half,
+    ends, sides = np.array([low - half, high + half]), np.array([-1.0, 1.0])
+    at_rest = more(np.zeros(2), ends).max()
+    turning = more(fastest * np.repeat(sides, 2), np.tile(ends, 2)).max()
+    faster = more(1.5 * fastest * sides, np.full(2, middle)).max()
+    unfitted = more(dwells.rate, temperature).mean()
+    return Tolerance(math.sqrt(sweeps[0] ** 2 + unfitted), float(sweeps[1]),
+                     math.sqrt(at_rest) / half,
                      math.sqrt(max(turning - at_rest, 0.0)) / half / fastest,
                      math.sqrt(faster) / (0.5 * fastest))
 
