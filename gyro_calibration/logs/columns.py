@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 import difflib
 import math
 import re
+import shlex
 from typing import NamedTuple
 
 from gyro_calibration.files import InputError, plain
@@ -66,7 +67,8 @@ _QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
 #: and the unit.
 _USUAL = {
     'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
-    'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|omega|omegaz|angularvelocityz|angvelz|yawrate|gyrorate',
+    'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|gyroscope|gyroscopez|omega|omegaz|.*angularvelocityz|'
+            r'angvelz|yawrate|gyrorate',
     'temperature': r'temp|temperature|tempc|gyrotemp|imutemp|dietemp|tgyro',
     'rate': r'ref|reference|referencerate|refrate|truerate|tablerate|ratetable',
     'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
@@ -167,12 +169,12 @@ def suggestion(header: Sequence[str]) -> str:
         for name in names:
             letters, unit = _letters_and_unit(name, _QUANTITIES[quantity][1])
             if re.fullmatch(pattern, letters):
-                wanted.append(f'{quantity}={name}{unit}')
+                wanted.append(f'{quantity}={name}:{unit}')
                 break
     if any(each.startswith('gyro=') for each in wanted):
-        units = ('' if all(':' in each for each in wanted) else
-                 '; units follow a colon, as in time=t:ms,gyro=wz:deg/s, and are SI without it')
-        return f'; perhaps --columns {",".join(wanted)} is meant{units}'
+        units = (', with a unit in place of each UNIT, such as s, ms, deg/s, rad/s, deg, rad'
+                 if any(each.endswith(':UNIT') for each in wanted) else '')
+        return f'; perhaps --columns {shlex.quote(",".join(wanted))} is meant{units}'
     for name in header:
         if name not in COLUMNS and (
                 close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
@@ -181,12 +183,16 @@ def suggestion(header: Sequence[str]) -> str:
 
 
 def _letters_and_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
-    """Return the letters of a name without its unit, and the unit as `:unit`; ''."""
-    letters = re.sub(r'[^a-z]', '', name.lower())
+    """Return the letters of a name without its unit, and the unit, UNIT if the name has none."""
+    base, _, rest = name.replace('[', '(').partition('(')
+    unit = rest.rstrip(')] ').replace('°', 'deg').replace('sec', 's')
+    letters = re.sub(r'[^a-z]', '', (base if unit in units else name).lower())
+    if unit in units:
+        return letters, unit
     for end, unit in _ENDS.items():
         if unit in units and letters.endswith(end) and len(letters) > len(end):
-            return letters.removesuffix(end), f':{unit}'
-    return letters, ''
+            return letters.removesuffix(end), unit
+    return letters, 'UNIT'
 
 
 def _short(text: str) -> str:

@@ -76,8 +76,6 @@ _LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
 _WHOLE = 1 << 29
 
 _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
-#: Quantities of which an empty cell is a lost value, as motion capture writes lost markers.
-_REFERENCES = ('reference_rate', 'reference_heading')
 
 
 #: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns
@@ -233,7 +231,12 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
 def _refusing(path: str | Path) -> Iterator[None]:
     try:
         yield
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        code = 'UTF-16' if error.object[:1] in (b'\xff', b'\xfe') else 'WINDOWS-1252'
+        raise LogError(f'{path}: cannot be read as a log, since it is not text in UTF-8; if it is '
+                       f'text, convert it, as by iconv -f {code} -t UTF-8 {path} > log.csv'
+                       ) from error
+    except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise LogError(f'{path}: cannot be read as a log ({reason(error)}); '
                        'wanted a CSV file, .csv or .csv.gz') from error
 
@@ -300,9 +303,11 @@ def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_unix(name.strip()) for name in next(rows, [])]
     if not is_header(header, columns, axis):
-        raise LogError(f'{path}: line {len(notes) + 1} is no header with a known '
-                       'column; name the columns there, such as '
-                       f'time_s,gyro_dps,temperature_degc, or with --columns{suggestion(header)}')
+        meant = suggestion(header) or (
+            '; put one such as time_s,gyro_dps,reference_heading_deg there, with # before the '
+            'lines above it, or name the columns, as by --columns time=NAME:s,gyro=NAME:deg/s')
+        raise LogError(f'{path}: line {len(notes) + 1} is no header with a known column: '
+                       f'{shown(line.strip())}{meant}')
     try:
         found = found_in(header, columns, axis)
     except InputError as error:
@@ -375,7 +380,7 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
 
 def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...],
              quantity: str) -> Array:
-    if quantity in _REFERENCES:
+    if quantity in _MAY_BE_LOST:
         texts = tuple(text.strip() or 'nan' for text in texts)
     try:
         values = np.array(texts, dtype=np.float64)
@@ -385,8 +390,11 @@ def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[st
             for text in texts:
                 float(text)
                 row += 1
+        remedy = ('give seconds, or the sample rate with --rate' if quantity == 'time' else
+                  'leave the cell empty if the value is lost' if quantity in _MAY_BE_LOST else
+                  'correct or remove the row')
         raise LogError(f'{path}: line {places[row]}, column {name}: {reprlib.repr(texts[row])} '
-                       'is not a number') from None
+                       f'is not a number; {remedy}') from None
     wrong = _wrong(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))

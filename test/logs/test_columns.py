@@ -73,11 +73,15 @@ def test_the_axis_of_three_is_taken(tmp_path, axis, rate, force):
 
 
 @pytest.mark.parametrize(('header', 'columns', 'wanted'), [
-    ('t,wz,yaw', {}, '--columns time=t,gyro=wz,heading=yaw'),
-    ('timestamp_ms,gyro_z_degs,yaw_deg,temp', {},
-     '--columns time=timestamp_ms:ms,gyro=gyro_z_degs:deg/s,temperature=temp,heading=yaw_deg:deg'),
+    ('t,wz,yaw', {}, '--columns time=t:UNIT,gyro=wz:UNIT,heading=yaw:UNIT is meant, with a unit'),
+    ('timestamp_ms,gyro_z_degs,yaw_deg,temp', {}, '--columns time=timestamp_ms:ms,'
+     'gyro=gyro_z_degs:deg/s,temperature=temp:UNIT,heading=yaw_deg:deg'),
+    ('Time (ms);gyro_z [°/s];temp [°C];Yaw [°]', {}, "--columns 'time=Time (ms):ms,"
+     "gyro=gyro_z [°/s]:deg/s,temperature=temp [°C]:degC,heading=Yaw [°]:deg' is meant"),
+    ('%time,field.angular_velocity.z', {},
+     '--columns time=%time:UNIT,gyro=field.angular_velocity.z:UNIT is meant'),
     ('time_s,gyro_dsp', {}, 'gyro_dps is meant by gyro_dsp'),
-    ('time_s,wz', {}, '--columns gyro=wz is meant; units follow a colon'),
+    ('time_s,wz', {}, '--columns gyro=wz:UNIT is meant, with a unit in place of each'),
     ('time_s,wz', {'gyro': 'wzz'}, 'there is no column wzz among time_s,wz; perhaps wz is meant'),
     ('time_s,wz', {'gyro': 'wz:deg/min'}, 'deg/min is no unit of it; wanted one of rad/s, deg/s'),
     ('time_s,wz', {'giro': 'wz'}, 'giro is no quantity of a log; wanted one of time, gyro'),

@@ -62,8 +62,9 @@ REFUSED = {
                     'columns gyro_dps and gyro_rad_s both give the output'),
     'twice the same': ('gyro_dps,gyro_dps\n0,1\n1,1\n', 'columns gyro_dps and gyro_dps both'),
     'text': ('# note\ntime_s,gyro_dps\n0,1\n1,fast\n',
-             "line 4, column gyro_dps: 'fast' is not a number"),
-    'nothing': ('time_s,gyro_dps\n0,1\n1,\n', "line 3, column gyro_dps: '' is not a number"),
+             "line 4, column gyro_dps: 'fast' is not a number; leave the cell empty"),
+    'no time': ('time_s,gyro_dps\n0,1\n,1\n',
+                "line 3, column time_s: '' is not a number; give seconds, or"),
     'an empty line between': ('time_s,gyro_dps\n0,1\n\n1,1\n',
                               'line 3 has 0 values where the header has 2'),
     'stands': ('time_s,gyro_dps\n0,1\n1,1\n1,1\n',
@@ -86,6 +87,8 @@ REFUSED = {
     'a text without end': ('gyro_dps,place\n0,a\n1,"b\n2,c\n' + '3,d\n' * 50000,
                            'cannot be read as a log'),
     'binary': (bytes(range(256)), 'cannot be read as a log'),
+    'Latin-1': ('Zeit;Drehrate [°/s]\n0;1\n'.encode('latin-1'), 'iconv -f WINDOWS-1252 -t UTF-8'),
+    'UTF-16': ('time_s,gyro_dps\n0,1\n'.encode('utf-16'), 'iconv -f UTF-16 -t UTF-8'),
     'beyond a gyro': (
         'time_s,gyro_dps\n0,1\n1,1e300\n',
         'line 3, column gyro_dps: 1e300 is beyond the limit of 1e+20; remove the'),
@@ -149,9 +152,10 @@ def test_a_broken_compressed_file_is_refused(tmp_path, cut):
         read_log(written(tmp_path, whole[:cut] + b'x' * (cut == 0), 'log.csv.gz'))
 
 
-def test_a_lost_reference_is_nan(tmp_path):
+def test_a_lost_value_is_nan_or_an_empty_cell(tmp_path):
     log = read_log(written(
-        tmp_path, 'gyro_dps,reference_rate_dps,reference_heading_deg\n1,nan,nan\n2,180,NaN\n'))
+        tmp_path, 'gyro_dps,reference_rate_dps,reference_heading_deg\n1,nan,\n,180,NaN\n'))
+    assert np.isnan(log.output).tolist() == [False, True]
     assert (np.isnan(log.reference_rate).tolist() == [True, False]
             and np.isnan(log.reference_heading).all())
 
