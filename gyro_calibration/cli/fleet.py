@@ -24,7 +24,7 @@ from typing import Any
 
 from gyro_calibration.calibration.course_over_ground import PRIORS
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, bar, UsageError, wrapped
+from gyro_calibration.cli.verb import Answer, under_way, UsageError, wrapped
 from gyro_calibration.diagnosis.gates import is_confused
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.files import plain, write_atomically
@@ -106,7 +106,8 @@ def _fleet(given: argparse.Namespace) -> Answer:
     left = [each for each in records if each['status'] == NO_EVIDENCE]
     lines = [f'{len(used)} of {len(records)} logs are calibrated.']
     lines += [f'{each["log"]}: no evidence, {each["reason"]}.' for each in left]
-    types = summarized(used)
+    with under_way('units, types and references'):
+        types = summarized(used)
     for found in types:
         lines += ['', *(wrapped(each, 2 + len(each) - len(each.lstrip()))
                         for each in _lines(found))]
@@ -162,10 +163,12 @@ def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str,
     """Return the record of each log, in the order of the logs, whatever was finished first."""
     found: dict[str, dict[str, Any]] = {}
     try:
-        with _executors(given) as (workers, create):
-            for task, record in bar(finished(done, tasks, workers, create), 'logs', len(tasks)):
+        with (_executors(given) as (workers, create),
+              under_way(f'0 of {len(tasks)} logs') as on_progress):
+            for task, record in finished(done, tasks, workers, create):
                 found[task.entry.log] = (refused(task.entry, str(record))
                                          if isinstance(record, Lost) else record)
+                on_progress(len(found) / len(tasks), f'{len(found)} of {len(tasks)} logs')
     except KeyboardInterrupt:
         raise DataRefused(f'interrupted after {len(found)} of {len(tasks)} logs; run the same '
                           'command again to continue') from None

@@ -13,13 +13,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import count
 import textwrap
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, bar
+from gyro_calibration.cli.verb import Answer, under_way
 from gyro_calibration.logs.log import Progress
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, Reproduction
@@ -43,17 +43,25 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _reproduce(given: argparse.Namespace) -> Answer:
     """Give every source its own generator, so that its numbers do not depend on the others."""
     names = [given.source] if given.source else list(SOURCES)
-    found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=_bars(name))
-             for name in names}
+    with under_way(names[0]) as on_progress:
+        found = {name: SOURCES[name](np.random.default_rng(given.seed),
+                                     progress=_counted(name, on_progress)) for name in names}
     text = '\n\n'.join(page(reproduction) for reproduction in found.values())
     return Answer([text], {'seed': given.seed, 'sources': {
         name: reproduction.data() for name, reproduction in found.items()}})
 
 
-def _bars(name: str) -> Progress:
-    """Return what shows a bar for each simulation of a source, numbered."""
+def _counted(name: str, on_progress: Callable[[float | None, str], None]) -> Progress:
+    """Return what reports the runs of each simulation of a source, which it numbers."""
     number = count(1)
-    return lambda items: bar(items, f'{name}, simulation {next(number)}')
+
+    def runs(items: Iterable[Any]) -> Iterator[Any]:
+        simulation, drawn = next(number), list(items)
+        for run, item in enumerate(drawn, 1):
+            on_progress(None, f'{name}, simulation {simulation}, run {run} of {len(drawn)}')
+            yield item
+
+    return runs
 
 
 def page(reproduction: Reproduction) -> str:

@@ -81,11 +81,6 @@ def under_way(words: str) -> Iterator[Callable[[float | None, str], None]]:
         shown.join()
 
 
-def bar(items: Iterable[Any], what: str, total: int | None = None) -> Iterable[Any]:
-    """Show on a terminal the progress over some items, if it takes longer than two seconds."""
-    return tqdm(items, desc=what, total=total, delay=DELAY, leave=False, disable=None)
-
-
 @contextmanager
 def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
     """Show on a terminal how many bytes of a log are read, and give the function that counts."""
