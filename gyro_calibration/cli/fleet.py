@@ -105,7 +105,7 @@ def _fleet(given: argparse.Namespace) -> Answer:
                           f'{first["log"]}: {first["reason"]}')
     left = [each for each in records if each['status'] == NO_EVIDENCE]
     lines = [f'{len(used)} of {len(records)} logs are calibrated.']
-    lines += [f'{each["log"]}: no evidence, {each["reason"]}.' for each in left]
+    lines += [f'{each["log"]}: excluded, {each["reason"]}.' for each in left]
     with under_way('units, types and references'):
         types = summarized(used)
     for found in types:

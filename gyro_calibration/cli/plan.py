@@ -172,8 +172,7 @@ def _lines(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
         f'{scale:.2f} times as accurate, and the mean heading error is {100 * abs(less):.2f} % '
         f'{"smaller" if less >= 0.0 else "larger"}.',
         f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the error, '
-        'independent of the calibration.',
-        'The accuracy of the bias depends on the length of the motion only.']
+        'independent of the calibration.']
 
 
 def _row(name: str, row: Prediction) -> str:

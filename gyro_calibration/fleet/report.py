@@ -48,6 +48,7 @@ for (const table of document.querySelectorAll('table.sortable')) {
   });
   [...table.tHead.rows[0].cells].forEach((head, column) => {
     const button = document.createElement('button');
+    for (const row of rows) row.cells[column].dataset.head = head.textContent;
     button.textContent = head.textContent;
     head.replaceChildren(button);
     let sign = -1;
@@ -63,10 +64,12 @@ for (const table of document.querySelectorAll('table.sortable')) {
 _STYLE = Markup("""<style>
 th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid; }
 input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-width: 20rem; }
-.scroll.tall { max-height: 40rem; }
+.scroll.fold { max-width: none; max-height: none; } .scroll.tall { max-height: 40rem; }
 .sortable th, .sortable td { overflow-wrap: normal; word-break: normal; }
 .sortable td:nth-child(n + 2):not(:empty) { min-width: 4.5rem; }
-@media (max-width: 40rem) { .sortable td { white-space: nowrap; } }
+@container (max-width: 29.99rem) {
+  .fold .sortable td:first-child { font-weight: 600; } .fold .sortable td:empty { display: none; }
+}
 </style>""")
 
 
@@ -83,7 +86,7 @@ def report(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> 
     used = sum(len(found.records) for found in types)
     title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
              f'{len(types)} {"type" if len(types) == 1 else "types"}')
-    about = f'{len(records) - used} more logs are no evidence.' if used < len(records) else None
+    about = f'{len(records) - used} more logs are excluded.' if used < len(records) else None
     body = joined(
         element('header', element('p', 'Fleet', class_='about'), element('h1', title),
                 element('p', about, class_='gained') if about else None),
@@ -100,7 +103,7 @@ def _type(found: TypeFound, place: int) -> Iterator[Markup]:
     values = [each for each in found.values.values() if not each.slow]
     yield element(
         'section', element('h2', f'{name}: units'),
-        element('p', 'Bars hold the value of a unit, as the mean over its power-ons, with 95 %.',
+        element('p', 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
                 class_='quiet'),
         element('div', *(draw(_chart(each, f't{place}-{each.name}-units', 'unit', found.units,
                                      each.units, 'after')) for each in values), class_='pairs'),
@@ -109,8 +112,8 @@ def _type(found: TypeFound, place: int) -> Iterator[Markup]:
     if shared:
         yield element(
             'section', element('h2', f'{name}: drives'),
-            element('p', 'What all units of a drive have in common is of its reference or of '
-                    'the vehicle.', class_='quiet'),
+            element('p', 'An error that all units of a drive have in common is assigned to its '
+                    'reference or to the vehicle.', class_='quiet'),
             element('div', *(draw(_chart(each, f't{place}-{each.name}-drives', 'drive',
                                          found.drives, each.drives, 'before'))
                              for each in shared), class_='pairs'))
@@ -177,7 +180,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
     head = element('tr', *(element('th', each, scope='col') for each in heads))
     table = element('table', element('thead', head),
                     element('tbody', *(element('tr', *row) for row in rows)), class_='sortable')
-    return element('div', table, class_='scroll tall' if len(rows) > _LONG else 'scroll',
+    return element('div', table, class_=f'scroll fold{" tall" * (len(rows) > _LONG)}',
                    tabindex='0')
 
 
@@ -204,8 +207,9 @@ def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval
     unit, factor = for_people(each.unit, each.name)
     middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / NORMAL_95
     return Chart(name, f'{spoken(each.name)} by {kind}',
-                 f'{kind.capitalize()}s whose bars do not overlap differ; of a bar across zero '
-                 f'the sign is open. {kind.capitalize()}s: {", ".join(names)}.', kind, '',
+                 f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
+                 f'across zero is not determined. {kind.capitalize()}s: {", ".join(names)}.',
+                 kind, '',
                  np.arange(1.0, len(names) + 1.0), spoken(each.name), unit,
                  [Line(kind, style, factor * middle, factor * half, dots=True)], names=names)
 

@@ -240,8 +240,8 @@ def sentences(found: TypeFound) -> Iterator[str]:
         yield (f'{spoken(first.name)}: it repeats in all units, so the model of the type lacks '
                f'it: {size}{also}')
     elif slow:
-        yield (f'{listed([spoken(each.name) for each in slow])}: none repeats, so what single '
-               'logs show of them is the wander of the bias')
+        yield (f'{listed([spoken(each.name) for each in slow])}: none repeats; in single logs '
+               'they are the random walk of the bias')
     yield from (_of_count(each, len(found.units)) for each in counted(found))
 
 
@@ -263,8 +263,8 @@ def _shares(found: TypeFound, each: Found) -> Iterator[str]:
                f'(probability {outlier.chance:.1g})')
     for outlier in each.outlying_drives:
         yield (f'{spoken(each.name)}: all units of drive {plain(found.drives[outlier.number])} '
-               f'are off by {amount(outlier.excess, each.unit, each.name)}, so its reference is '
-               f'(probability {outlier.chance:.1g})')
+               f'deviate by {amount(outlier.excess, each.unit, each.name)}, an error of the '
+               f'reference (probability {outlier.chance:.1g})')
     for change in each.changed:
         yield (f'{spoken(each.name)}: unit {plain(found.units[change.unit])} changed by '
                f'{amount(change.size, each.unit, each.name)} on {found.dates[change.since]} '
