@@ -49,6 +49,11 @@ class Estimate:
         """Return the standard deviation of which the interval has 1.96 each way."""
         return (self.interval[1] - self.interval[0]) / (2.0 * 1.96)
 
+    @property
+    def holds_zero(self) -> bool:
+        """Return whether the interval holds zero."""
+        return self.interval[0] <= 0.0 <= self.interval[1]
+
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
         return {'estimate': self.estimate, 'ci95': list(self.interval), 'unit': self.unit}

@@ -160,7 +160,8 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     of_heading = shares([(parts, time)], 2.0 * (
         noise['reference'] ** 2 + noise['motion'] ** 2 * float(np.mean(rates ** 2))))
     findings = [*_of_values(extended, model, rate, reference), *record.findings,
-                *(_finding(each, extended, plain) for each in found)]
+                *(each for cause in found for each in [_finding(cause, extended)]
+                  if not each.parameters[each.effect].holds_zero)]
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     of_record = {each.effect for each in record.findings}
     changed = any(each.status == 'established' and CAUSES[each.effect].of == 'gyro'
@@ -248,9 +249,10 @@ def _may_lag(done: SpanFit, delay: float) -> bool:
     return abs(square - 0.5 * delay ** 2) < _RULED_OUT * math.sqrt(inverse[place, place])
 
 
-def _finding(each: Confirmed, extended: SpanFit, plain: SpanFit) -> Finding:
-    """Return a cause that the search found, with its values from a fit that holds it."""
-    done = extended if each.established else fit_spans(plain.spans, [each.column])
+def _finding(each: Confirmed, extended: SpanFit) -> Finding:
+    """Return a cause that the search found, with its values given the established ones."""
+    done = (extended if each.established
+            else fit_spans(extended.spans, [*extended.causes, each.column]))
     name, known, places = each.column.cause, CAUSES[each.column.cause], done.places(each.column)
     values = done.values[places]
     half = np.array([done.half(place) for place in range(places.start, places.stop)])
@@ -273,7 +275,7 @@ def _finding(each: Confirmed, extended: SpanFit, plain: SpanFit) -> Finding:
         evidence=f'it adds {each.predicted:.1f} to the log-likelihood of stretches that took no '
         f'part in choice and fit, and is chosen in {100.0 * each.chosen:.0f} % of them',
         probability=each.probability,
-        where=(each.column.shapes[0], float(plain.spans.time[-1])) if each.column.once else None)
+        where=(each.column.shapes[0], float(done.spans.time[-1])) if each.column.once else None)
     return shown if each.established else as_suspected(shown)
 
 
