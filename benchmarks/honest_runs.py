@@ -36,6 +36,7 @@ from gyro_calibration.model.motion import from_headings, from_rates
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 DEGREE = math.pi / 180.0
@@ -85,11 +86,15 @@ def flicker(size: float, draw: np.random.Generator) -> Array:
         kept = math.exp(-STEP / constant)
         deviation = size * math.sqrt(math.log(3.0) / math.pi)
         shocks = deviation * math.sqrt(1.0 - kept ** 2) * draw.standard_normal(len(TIME))
-        value = deviation * draw.standard_normal()
-        for place, shock in enumerate(shocks):
-            value = kept * value + shock
-            total[place] += value
+        before = [kept * deviation * draw.standard_normal()]
+        total += lfilter([1.0], [1.0, -kept], shocks, zi=before)[0]
     return total
+
+
+def lagging(rate: Array, constant: float) -> Array:
+    """Return a rate through a lag of first order, s."""
+    kept = math.exp(-STEP / constant)
+    return lfilter([1.0 - kept], [1.0, -kept], rate, zi=[kept * rate[0]])[0]
 
 
 def delayed(rate: Array, by: float) -> Array:
@@ -124,10 +129,8 @@ def wobble(draw: np.random.Generator) -> Array:
 
 def lag(draw: np.random.Generator) -> Array:
     """Follow with a lag of first order of 0.05 to 0.3 s."""
-    kept, rate = math.exp(-STEP / draw.uniform(0.05, 0.3)), exact(draw)
-    for place in range(1, len(rate)):
-        rate[place] = kept * rate[place - 1] + (1.0 - kept) * rate[place]
-    return rate
+    constant = draw.uniform(0.05, 0.3)
+    return lagging(exact(draw), constant)
 
 
 def follower(draw: np.random.Generator) -> Array:
@@ -160,9 +163,7 @@ def slipping_evenly(draw: np.random.Generator) -> Array:
 
 def everything(draw: np.random.Generator) -> Array:
     """Wobble, lag and slip at once."""
-    rate, kept = wobble(draw), math.exp(-STEP / draw.uniform(0.02, 0.15))
-    for place in range(1, len(rate)):
-        rate[place] = kept * rate[place - 1] + (1.0 - kept) * rate[place]
+    rate = lagging(wobble(draw), draw.uniform(0.02, 0.15))
     return rate * (1.0 - draw.uniform(0.0, 0.01))
 
 
