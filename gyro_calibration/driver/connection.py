@@ -150,62 +150,32 @@ _MOST_BYTES = 16384  # of what came last, to be recognized
 
 @dataclass(frozen=True)
 class Chunk:
-    """
-    Samples that came at one time, by the steady clock of the host.
-
-    Attributes
-    ----------
-    samples : list of Sample
-    stamps : when they were sent, in seconds; they increase strictly over all chunks
-    arrival : when they came, in seconds
-
-    """
+    """Samples that came at one time, by the steady clock of the host, s."""
 
     samples: list[Sample]
-    stamps: list[float]
+    stamps: list[float]  # when they were sent; they increase strictly over all chunks
     arrival: float
 
 
 @dataclass(frozen=True)
 class State:
-    """
-    How a connection stands.
-
-    Attributes
-    ----------
-    name : ``'opening'``, ``'listening'``, ``'reading'`` (samples come) or ``'failed'`` (none come)
-    problem : one sentence while it has failed, else empty
-    waiting : seconds until the port is opened anew, while it has failed; an open one is read until
-        then
-
-    """
+    """How a connection stands: opening, listening, reading (samples come) or failed."""
 
     name: str
-    problem: str = ''
-    waiting: float = 0.0
+    problem: str = ''  # one sentence while it has failed
+    waiting: float = 0.0  # s; until the port is opened anew, and an open one read, when failed
 
 
 @dataclass(frozen=True)
 class Counts:
-    """
-    What has happened since the start.
-
-    Attributes
-    ----------
-    samples, lost_samples : int
-    refused_samples : not finite, or beyond full scale
-    refused_temperatures : not finite, or beyond what a sensor can report
-    device_faults : samples that the gyro itself calls invalid
-    discarded_bytes : in no frame
-
-    """
+    """What has happened since the start."""
 
     samples: int = 0
     lost_samples: int = 0
-    refused_samples: int = 0
-    refused_temperatures: int = 0
-    device_faults: int = 0
-    discarded_bytes: int = 0
+    refused_samples: int = 0  # not finite, or beyond full scale
+    refused_temperatures: int = 0  # not finite, or beyond what a sensor can report
+    device_faults: int = 0  # samples that the gyro itself calls invalid
+    discarded_bytes: int = 0  # in no frame
 
 
 def resolve(port: str) -> str:

@@ -153,15 +153,10 @@ def _lower_hull(points: Sequence[_Point]) -> list[_Point]:
 
 class _Numbers:
     """
-    How far each sample is from the one before, in nominal periods.
+    How far each sample is from the one before, in nominal periods: `size` on average.
 
-    By the sequence of the device, by its time, or by counting.
-
-    Attributes
-    ----------
-    size : how far a sample is from the next on average
-    unit : by this many samples, or a multiple, the number may be wrong; 0 where the device gives
-        its time
+    By the sequence of the device, by its time, or by counting. The number may be wrong by `unit`
+    samples, or a multiple, which is 0 where the device gives its time.
 
     """
 
@@ -507,17 +502,10 @@ def read_together(even: Callable[[], float], other: Callable[[], float]
 
 class ClockSteps:
     """
-    Detects a clock that is set, by comparing it with a steady one.
+    Detects a clock that is set, by comparing it with a steady one; all in s.
 
-    Parameters
-    ----------
-    ahead, behind : by more than this, s, a clock that runs does not change against the steady one
-    back : by more than this, s, it does not go back
-
-    Attributes
-    ----------
-    count : how often the clock was set
-    last : by how much it was set the last time, s
+    A clock that runs does not change by more than `ahead` or `behind` against the steady one, and
+    does not go back by more than `back`. It counts how often it was set, and by how much `last`.
 
     """
 

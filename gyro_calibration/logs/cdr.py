@@ -120,19 +120,12 @@ class MessageError(ValueError):
 
 @dataclass(frozen=True)
 class Layout:
-    """
-    How a kind of message lies in bytes, as far as it says something of a gyro or a reference.
+    """How a kind of message lies in bytes, as far as it says something of gyro or reference."""
 
-    Attributes
-    ----------
-    runs : of numbers that follow each other: bytes of an element of the text or sequence before
-        the run, 0 for the first run; and formats of the numbers
-    quantities : name -> which of the numbers it is
-
-    """
-
+    #: Of numbers that follow each other: bytes of an element of the text or sequence before the
+    #: run, 0 for the first run; and formats of the numbers.
     runs: tuple[tuple[int, str], ...]
-    quantities: Mapping[str, int]
+    quantities: Mapping[str, int]  # name -> which of the numbers it is
 
 
 @cache

@@ -48,22 +48,13 @@ def white_noise(values: Array, order: int = 3) -> float:
 
 @dataclass(frozen=True)
 class Codes:
-    """
-    The values that occur, in order, and how often: arrays of shape (m,).
-
-    Attributes
-    ----------
-    step : between neighbouring codes; 0 where there is no such step
-    aligned : how well the codes lie on it, 0 to 1
-    deviation : standard deviation of the step
-
-    """
+    """The values that occur, in order, and how often: arrays of shape (m,)."""
 
     values: Array
     counts: Array
-    step: float = 0.0
-    aligned: float = 0.0
-    deviation: float = 0.0
+    step: float = 0.0  # between neighbouring codes; 0 where there is no such step
+    aligned: float = 0.0  # how well the codes lie on it, 0 to 1
+    deviation: float = 0.0  # standard deviation of the step
 
 
 def codes_of(values: Array) -> Codes:

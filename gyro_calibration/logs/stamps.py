@@ -38,26 +38,14 @@ LONG = 50
 
 @dataclass(frozen=True)
 class Stamps:
-    """
-    Stamps on an even grid.
+    """Stamps on an even grid."""
 
-    Attributes
-    ----------
-    time : s, shape (n,)
-    lost : how many samples are lost after each but the last, shape (n - 1,)
-    number : of each sample on the grid, shape (n,); long gaps are cut down to `longest_gap`
-    interval : of the grid, s
-    wander : how far the stamps are off it at most, s
-    bursts : the stamps come in bursts or with jitter, and the grid is believed instead
-
-    """
-
-    time: Array
-    lost: Integers
-    number: Integers
-    interval: float
-    wander: float
-    bursts: bool
+    time: Array  # s, shape (n,)
+    lost: Integers  # how many samples are lost after each but the last, shape (n - 1,)
+    number: Integers  # of each on the grid, shape (n,); long gaps are cut to `longest_gap`
+    interval: float  # of the grid, s
+    wander: float  # how far the stamps are off it at most, s
+    bursts: bool  # the stamps come in bursts or with jitter, and the grid is believed instead
 
     @property
     def longest_gap(self) -> int:

@@ -171,21 +171,17 @@ class Part:
     """
     A part of the noise, by the slope of its Allan deviation (IEEE Std 952, C.1).
 
-    Attributes
-    ----------
-    name, symbol, unit : as in IEEE Std 952; the unit in SI
-    slope : of the Allan deviation in the logarithmic chart
-    factor : Allan variance = factor * coefficient² * tau ** (2 slope)
-    covariance : of the angle, for a coefficient of 1, as a function of the time between, up to
-        terms that second differences remove
+    Its Allan variance is ``factor * coefficient² * tau ** (2 slope)``.
 
     """
 
     name: str
     symbol: str
-    unit: str
-    slope: float
+    unit: str  # in SI
+    slope: float  # of the Allan deviation in the logarithmic chart
     factor: float
+    #: Of the angle, for a coefficient of 1, as a function of the time between, up to terms that
+    #: second differences remove.
     covariance: Callable[[Number], Array]
 
     def variance(self, time: Number) -> Array:

@@ -22,28 +22,15 @@ from gyro_calibration.model.noise import Noise
 
 @dataclass(frozen=True)
 class Preset:
-    """
-    A gyro by published figures, in the units of data sheets.
-
-    Attributes
-    ----------
-    name : of the gyro
-    source : of the figures
-    angle_random_walk : deg/√h
-    bias_instability : deg/h
-    scale_factor_error : 1
-    bias : deg/s
-    interval : between samples, s
-
-    """
+    """A gyro by published figures, in the units of data sheets."""
 
     name: str
-    source: str
-    angle_random_walk: float
-    bias_instability: float = 0.0
-    scale_factor_error: float = 0.0
-    bias: float = 0.0
-    interval: float = 0.01
+    source: str  # of the figures
+    angle_random_walk: float  # deg/√h
+    bias_instability: float = 0.0  # deg/h
+    scale_factor_error: float = 0.0  # 1
+    bias: float = 0.0  # deg/s
+    interval: float = 0.01  # between samples, s
 
     @property
     def noise(self) -> Noise:

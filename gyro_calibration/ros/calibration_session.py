@@ -91,32 +91,19 @@ _REPEATED = 1.0
 
 @dataclass
 class Run:
-    """
-    A calibration in progress.
+    """A calibration in progress."""
 
-    Attributes
-    ----------
-    kind : PROFILE, ODOMETRY, TURNS or REST
-    duration : of the motion that is compared, s; infinite until `CalibrationSession.finish`
-    after : further samples that are wanted, s
-    received : when the last sample, or else the request, came, s of the steady clock
-    motion : the profile; None for other kinds
-    reason : why it ended; '' where its samples are complete; None while it goes on
-    times, outputs, rates : stamps, s, output and rate after the model, rad/s
-    odometry : stamp, s, heading, rad, and rate, rad/s, of each message
-
-    """
-
-    kind: str
-    duration: float
-    after: float
-    received: float
-    motion: Motion | None = None
-    reason: str | None = None
-    times: list[float] = field(default_factory=list)
-    outputs: list[float] = field(default_factory=list)
-    rates: list[float] = field(default_factory=list)
-    temperatures: list[float] = field(default_factory=list)
+    kind: str  # PROFILE, ODOMETRY, TURNS or REST
+    duration: float  # of the motion that is compared, s; inf until `CalibrationSession.finish`
+    after: float  # further samples that are wanted, s
+    received: float  # when the last sample, or else the request, came, s of the steady clock
+    motion: Motion | None = None  # the profile
+    reason: str | None = None  # why it ended; '' where its samples are complete
+    times: list[float] = field(default_factory=list)  # stamps, s
+    outputs: list[float] = field(default_factory=list)  # rad/s
+    rates: list[float] = field(default_factory=list)  # after the model, rad/s
+    temperatures: list[float] = field(default_factory=list)  # degC
+    #: Stamp, s, heading, rad, and rate, rad/s, of each message.
     odometry: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, time: float, output: float, rate: float, temperature: float | None) -> None:

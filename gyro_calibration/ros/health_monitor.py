@@ -65,30 +65,15 @@ _IN_A_ROW = 3
 
 @dataclass(frozen=True)
 class Rest:
-    """
-    The result of one stretch at rest.
+    """The result of one stretch at rest."""
 
-    Attributes
-    ----------
-    time : of its end, s
-    noise_ratio : standard deviation of the noise over that of the model
-    noise_fits : whether that is within chance and tolerance
-    bias : mean rate, rad/s
-    sigmas : of the mean, in standard deviations of what the model explains; nan where the model
-        does not give the accuracy of the bias
-    bias_fits : whether that is within chance
-    bias_deviation : standard deviation of the mean by the noise of this stretch, rad/s
-    announced : whether the rest was announced
-
-    """
-
-    time: float
-    noise_ratio: float
-    noise_fits: bool
-    bias: float
-    sigmas: float
-    bias_fits: bool
-    bias_deviation: float
+    time: float  # of its end, s
+    noise_ratio: float  # standard deviation of the noise over that of the model
+    noise_fits: bool  # within chance and tolerance
+    bias: float  # mean rate, rad/s
+    sigmas: float  # of the mean, by what the model explains; nan where it does not say
+    bias_fits: bool  # within chance
+    bias_deviation: float  # standard deviation of the mean by the noise of this stretch, rad/s
     announced: bool
 
 

@@ -25,28 +25,15 @@ _WORDS: dict[type, str] = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    One parameter of a node; its type is the type of its default.
+    """One parameter of a node; its type is the type of its default."""
 
-    Attributes
-    ----------
-    name : groups are separated by a dot, as in ``calibration.maximum_bias``
-    default : bool, int, float, str or sequence of str
-    description : one sentence, without the unit
-    unit : empty where there is none
-    range : lowest and highest value, both allowed
-    dynamic : whether it may be set while the node runs
-    choices : the values that a text may have; empty for any
-
-    """
-
-    name: str
+    name: str  # groups are separated by a dot, as in ``calibration.maximum_bias``
     default: bool | int | float | str | Sequence[str]
-    description: str
+    description: str  # one sentence, without the unit
     unit: str = ''
-    range: tuple[float, float] | None = None  # noqa: A003
-    dynamic: bool = False
-    choices: tuple[str, ...] = ()
+    range: tuple[float, float] | None = None  # noqa: A003  lowest and highest value allowed
+    dynamic: bool = False  # may be set while the node runs
+    choices: tuple[str, ...] = ()  # the values that a text may have; empty for any
 
     @property
     def attribute(self) -> str:

@@ -41,23 +41,17 @@ class Recognition:
     """
     The format of some bytes.
 
-    Attributes
-    ----------
-    protocol : None if there are too few bytes, or none explains them, or two do
-    explained : the share of the bytes that are frames of the best format, 0 to 1; the rest of a
-        frame at the beginning does not count. Where the columns do not fit, the share of the lines
-        that have as many numbers as most.
-    frames : how many frames that are
-    runner_up : the next best format, if it explains any byte
-    words : this in a sentence
+    The share that is explained, 0 to 1, is that of the bytes in frames of the best format, without
+    the rest of a frame at the beginning. Where the columns do not fit, it is that of the lines
+    that have as many numbers as most.
 
     """
 
-    protocol: Protocol | None
+    protocol: Protocol | None  # where it is one, and not too few bytes
     explained: float
     frames: int
-    runner_up: Protocol | None
-    words: str
+    runner_up: Protocol | None  # the next best format, if it explains any byte
+    words: str  # this in a sentence
 
 
 @dataclass(frozen=True)
