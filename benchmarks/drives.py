@@ -42,28 +42,16 @@ class Path:
 
 @dataclass(frozen=True)
 class Drive:
-    """
-    What a gyro says of a calibration of 20 s and of the drive after it.
-
-    Attributes
-    ----------
-    time : s, shape (n,), 0 at the beginning of the drive
-    output, rate : rad/s, shape (n,)
-    bias : true bias, wandering, rad/s, shape (n,)
-    heading : rad, shape (n,), 0 at the beginning of the drive
-    moving : the wheels turn, or did or will within a sample, shape (n,)
-    run : time, s, 0 at the beginning of the calibration, and output, rad/s, of the calibration
-
-    """
+    """What a gyro says of a calibration of 20 s and of the drive after it; arrays of (n,)."""
 
     gyro: Preset
-    time: Array
-    output: Array
+    time: Array  # s, 0 at the beginning of the drive
+    output: Array  # rad/s
     rate: Array
-    bias: Array
-    heading: Array
-    moving: NDArray[np.bool_]
-    run: tuple[Array, Array]
+    bias: Array  # true and wandering, rad/s
+    heading: Array  # rad, 0 at the beginning of the drive
+    moving: NDArray[np.bool_]  # the wheels turn, or did or will within a sample
+    run: tuple[Array, Array]  # time from its begin, s, and output, rad/s, of the calibration
 
 
 def path(rate: Array, moving: NDArray[np.bool_]) -> Path:

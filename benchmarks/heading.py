@@ -183,19 +183,11 @@ def rows(settings: Mapping[str, Mapping[str, float]]) -> dict[str, Row]:
 
 @dataclass(frozen=True)
 class Score:
-    """
-    Accuracy of a heading over a drive.
+    """Accuracy of a heading over a drive."""
 
-    Attributes
-    ----------
-    mean : mean absolute error, rad
-    errors : absolute errors at some times, rad
-    inside : share inside the 95 % at the end, a random time and all looks; nan without a variance
-
-    """
-
-    mean: float
-    errors: Array
+    mean: float  # absolute error, rad
+    errors: Array  # absolute, at some times, rad
+    #: Share inside the 95 % at the end, a random time and all looks; nan without a variance.
     inside: tuple[float, float, float]
 
 

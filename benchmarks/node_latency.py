@@ -65,20 +65,11 @@ PUBLISHED = {'imu/data': Imu, 'heading': PoseWithCovarianceStamped,
 
 @dataclass(frozen=True)
 class Block:
-    """
-    What one subject did at one rate.
+    """What one subject did at one rate."""
 
-    Attributes
-    ----------
-    latencies : of the messages that came back, ms
-    sent : number of messages
-    load : processor time of the subject's process, % of a core
-
-    """
-
-    latencies: list[float]
+    latencies: list[float]  # of the messages that came back, ms
     sent: int
-    load: float
+    load: float  # processor time of the subject's process, % of a core
 
     @property
     def lost(self) -> int:

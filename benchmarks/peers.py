@@ -43,22 +43,12 @@ Heading = Callable[[Drive, Array, 'float | None', Mapping[str, float]], Array]
 
 @dataclass(frozen=True)
 class Peer:
-    """
-    Another program.
+    """Another program."""
 
-    Attributes
-    ----------
-    heading : returns what it makes of a drive, rad, shape (n,)
-    package : what it needs to be installed; '' for nothing
-    published : its settings as they come
-    choices : for each setting what to try
-
-    """
-
-    heading: Heading
-    package: str
-    published: Mapping[str, float]
-    choices: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    heading: Heading  # returns what it makes of a drive, rad, shape (n,)
+    package: str  # what it needs to be installed; '' for nothing
+    published: Mapping[str, float]  # its settings as they come
+    choices: Mapping[str, Sequence[float]] = field(default_factory=dict)  # what to try
 
     @property
     def installed(self) -> bool:

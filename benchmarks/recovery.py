@@ -73,31 +73,18 @@ SINE = (*LINEAR, *(TRUTH[name] for name in ('quadratic_nonlinearity', 'sine_resp
 
 @dataclass(frozen=True)
 class Table:
-    """
-    A simulated rate table.
-
-    Attributes
-    ----------
-    sweeps, rates : how many sweeps, and rates in each
-    fastest : rad/s
-    temperatures : of the first sweep and of the last, degC
-    one_way : sweeps go from rest to the fastest rate, one way and the other way in turn
-    dwell, dwell_scale : scatter of dwells, rad/s, and of their scale factor, 1
-    told : the deviations of dwells differ, by a factor of 1.6 mostly, and are told
-    sweep_bias, sweep_scale : what wanders from sweep to sweep, rad/s and 1
-
-    """
+    """A simulated rate table."""
 
     sweeps: int = 8
-    rates: int = 21
+    rates: int = 21  # in each sweep
     fastest: float = 100.0 * DEGREE
-    temperatures: tuple[float, float] = (25.0, 45.0)
-    one_way: bool = False
-    dwell: float = 0.03 * DEGREE
-    dwell_scale: float = 0.0
-    told: bool = False
-    sweep_bias: float = 0.0
-    sweep_scale: float = 0.0
+    temperatures: tuple[float, float] = (25.0, 45.0)  # of the first sweep and the last, degC
+    one_way: bool = False  # from rest to the fastest rate, one way and the other way in turn
+    dwell: float = 0.03 * DEGREE  # scatter of dwells, rad/s
+    dwell_scale: float = 0.0  # and of their scale factor, 1
+    told: bool = False  # the deviations of dwells differ, by a factor of 1.6 mostly
+    sweep_bias: float = 0.0  # what wanders from sweep to sweep, rad/s
+    sweep_scale: float = 0.0  # 1
 
     def measure(self, gyro: GyroModel, generator: np.random.Generator) -> Dwells:
         """Return the dwells of a gyro on the table."""

@@ -207,28 +207,15 @@ class Stage:
 
 @dataclass(frozen=True)
 class Fault:
-    """
-    What happens to a robot and its node; without an `act` the run must work.
+    """What happens to a robot and its node; without an `act` the run must work."""
 
-    Attributes
-    ----------
-    words : of its row
-    act : in mid-run, at full rate
-    how : arguments of `Stage.start`
-    before : before the run
-    seconds : for which the stage is watched
-    until_answer : or until the run has ended
-    others : rates that others command
-
-    """
-
-    words: str
-    act: Callable | None = None
-    how: dict = field(default_factory=dict)
-    before: Callable = lambda stage: None
+    words: str  # of its row
+    act: Callable | None = None  # in mid-run, at full rate
+    how: dict = field(default_factory=dict)  # arguments of `Stage.start`
+    before: Callable = lambda stage: None  # the run
     seconds: float = WATCHED
-    until_answer: bool = False
-    others: tuple = ()
+    until_answer: bool = False  # watch no longer than until the run has ended
+    others: tuple = ()  # rates that others command
 
     def row(self, stage):
         """Let it happen, and return what came of it."""
