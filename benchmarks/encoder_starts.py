@@ -31,6 +31,7 @@ from pathlib import Path
 import sys
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, Log, read_log
 import numpy as np
 
@@ -40,18 +41,9 @@ SENSE = {'yaw_slow': -1.0, 'pitch_slow': 1.0, 'yaw_fast': -1.0}
 LAGS = np.arange(-20, 21) * 0.004
 
 
-def integral(time: Array, rate: Array) -> Array:
-    """Return the integral by the trapezoid rule."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
-
-
 def squares(time: Array, output: Array, heading: Array) -> tuple[float, float]:
-    """
-    Return bias and scale factor error by least squares on increments.
-
-    At the delay that leaves least.
-    """
-    turned, best = integral(time, output), (math.inf, 0.0, 0.0)
+    """Return bias and scale factor error by least squares on increments at the best delay."""
+    turned, best = integrate(time, output), (math.inf, 0.0, 0.0)
     points = np.arange(time[0] + 0.1, time[-1] - 0.1, BLOCK)
     columns = np.column_stack([np.diff(np.interp(points, time, heading)), np.diff(points)])
     for lag in LAGS:
@@ -64,7 +56,7 @@ def squares(time: Array, output: Array, heading: Array) -> tuple[float, float]:
 
 def error(time: Array, output: Array, heading: Array, bias: float, scale: float) -> float:
     """Return the heading error, rms about its mean, deg, at the best delay."""
-    turned = integral(time, (output - bias) / (1.0 + scale))
+    turned = integrate(time, (output - bias) / (1.0 + scale))
     return min(
         float(np.std(np.interp(time + lag, time, turned)[50:-50] - heading[50:-50]))
         for lag in LAGS[::2]) / DEGREE
@@ -81,16 +73,14 @@ def main(folder: Path, step: float = 120.0, first: float = 0.0) -> None:
             rows = []
             for begin in np.arange(first, log.time[-1] - FOLLOWED, step):
                 inside = (log.time >= begin) & (log.time < begin + FOLLOWED)
-                time, output, heading = log.time[
-                    inside] - begin, sense * log.output[inside], log.reference_heading[inside]
-                run = time < seconds
-                given = time[run], output[run], heading[run]
-                nothing, plain = error(time, output, heading, 0.0,
-                                       0.0), error(time, output, heading, *squares(*given))
+                whole = (log.time[inside] - begin, sense * log.output[inside],
+                         log.reference_heading[inside])
+                given = [values[whole[0] < seconds] for values in whole]
+                nothing, plain = error(*whole, 0.0, 0.0), error(*whole, *squares(*given))
                 try:
                     fit = calibrate_encoder(
                         Log(time=given[0], output=given[1], reference_heading=given[2])).fit
-                    ours = error(time, output, heading, fit.bias, fit.scale_factor_error)
+                    ours = error(*whole, fit.bias, fit.scale_factor_error)
                 except DataRefused:
                     ours = math.nan
                 rows.append((nothing, plain, ours, nothing if math.isnan(ours) else ours))

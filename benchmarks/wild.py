@@ -32,6 +32,7 @@ import time
 
 from gyro_calibration.diagnosis.findings import Diagnosis, Finding
 from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, part, read_log
 import numpy as np
@@ -47,12 +48,6 @@ def halves(log: Log) -> tuple[Log, Log]:
     return part(log, slice(0, middle)), part(log, slice(middle, None))
 
 
-def integral(log: Log, rate: Array) -> Array:
-    """Return the heading that a rate comes to."""
-    steps = np.diff(log.time, prepend=log.time[0])
-    return np.cumsum(steps * 0.5 * (rate + np.insert(rate[:-1], 0, rate[0])))
-
-
 def fixes(log: Log) -> Array:
     """Return the rows with a course, thinned to at most ten in a second."""
     known = np.flatnonzero(np.isfinite(log.reference_heading))
@@ -62,7 +57,7 @@ def fixes(log: Log) -> Array:
 
 def robust_least_squares(log: Log) -> tuple[float, float]:
     """Return (1 + s) and b of heading = (1 + s) integral + b t + c at the best lag."""
-    at, turned = fixes(log), integral(log, log.output)
+    at, turned = fixes(log), integrate(log.time, log.output)
     known, best = log.reference_heading[at], (math.inf, 1.0, 0.0)
     for lag in LAGS:
         gyro = np.interp(log.time[at] - lag, log.time, turned)
@@ -82,7 +77,7 @@ def error(log: Log, rate: Array) -> float:
     Where the course is known over less than 80 s, it is that over three quarters of these.
 
     """
-    at, turned = fixes(log), integral(log, rate)
+    at, turned = fixes(log), integrate(log.time, rate)
     stamps = log.time[at]
     window = min(WINDOW, 0.75 * (stamps[-1] - stamps[0]))
     later = np.searchsorted(stamps, stamps + window)
