@@ -63,13 +63,10 @@ class Rig:
 
     Parameters
     ----------
-    folder : pathlib.Path
-        Where model and calibration are kept.
-    model : str
-        Text of the model file; '' for none.
+    folder : where model and calibration are kept
+    model : text of the model file; '' for none
     robot : Robot, or None for one with the defaults
-    ros : float or None
-        Begin of a simulation, s, whose time the stamps follow.
+    ros : begin of a simulation, s, whose time the stamps follow
     calibration_file : pathlib.Path, or None for one in the folder
     **parameters
         Of the node; ``calibration_drive=True`` stands for ``calibration.drive``.
@@ -81,16 +78,12 @@ class Rig:
     outputs : list of what `Pipeline.sample` returned, without None
     truth : dict of the true heading, rad, by stamp, ns
     publishers : list of names; who publishes the samples
-    receivers, callers : int
-        Other nodes that receive cmd_vel, and clients of the service that calibrates.
-    ros_speed : float
-        Seconds of the simulation in one second; 0 while it stands.
-    speed : float
-        Seconds of the robot and of the simulation in one second of the steady clock.
-    other : float or None
-        What somebody else commands at 20 Hz, rad/s.
-    fed : int
-        Stamp of the last sample of `feed`, ns.
+    receivers, callers : other nodes that receive cmd_vel, and clients of the service that
+        calibrates
+    ros_speed : seconds of the simulation in one second; 0 while it stands
+    speed : seconds of the robot and of the simulation in one second of the steady clock
+    other : what somebody else commands at 20 Hz, rad/s
+    fed : stamp of the last sample of `feed`, ns
 
     """
 
@@ -195,14 +188,11 @@ class Rig:
         Parameters
         ----------
         outputs : sequence of float
-        interval : float
-            Between samples, s.
+        interval : between samples, s
         temperature : sequence of float, float or None
             With each sample, degC.
-        force : float or None
-            Specific force along the input axis, m/s².
-        moving : float or None
-            Rate that odometry shows, rad/s.
+        force : specific force along the input axis, m/s²
+        moving : rate that odometry shows, rad/s
 
         Returns
         -------

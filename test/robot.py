@@ -44,12 +44,9 @@ class Reading:
 
     Attributes
     ----------
-    stamp : float
-        Time of sample and odometry, s.
-    output : float or None
-        Rate that the gyro reports, rad/s; None while it is unplugged.
-    heading, rate : float
-        Odometry: heading, rad, not wrapped, and yaw rate, rad/s.
+    stamp : time of sample and odometry, s
+    output : rate that the gyro reports, rad/s; None while it is unplugged
+    heading, rate : odometry: heading, rad, not wrapped, and yaw rate, rad/s
 
     """
 
@@ -65,24 +62,18 @@ class Robot:
 
     Parameters
     ----------
-    scale_factor_error, bias, noise : float
-        Errors of the gyro: 1, rad/s, and rad/s (standard deviation of a sample).
-    latency, lag : float
-        Time until a command acts, and time constant of the drives, s.
-    timeout : float
-        The base stops when it has heard no command for so long, s.
-    stamp : float
-        Stamp of the start, s.
+    scale_factor_error, bias, noise : errors of the gyro: 1, rad/s, and rad/s (standard deviation
+        of a sample)
+    latency, lag : time until a command acts, and time constant of the drives, s
+    timeout : the base stops when it has heard no command for so long, s
+    stamp : stamp of the start, s
 
     Attributes
     ----------
-    time : float
-        Since the start, s.
-    heading, rate : float
-        The truth, rad and rad/s.
-    unplugged, stamps_stand, deaf : bool
-        Set by a test: the gyro is silent; stamps do not go on; the base ignores commands and keeps
-        on doing what it did last.
+    time : since the start, s
+    heading, rate : the truth, rad and rad/s
+    unplugged, stamps_stand, deaf : set by a test: the gyro is silent; stamps do not go on; the
+        base ignores commands and keeps on doing what it did last
 
     """
 
@@ -141,24 +132,20 @@ class RosRobot:
     node : rclpy.node.Node
         Its executor is spun by the caller.
     robot : Robot
-    speed : float or None
-        Simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and
-        stamps are those of the node's clock.
-    stamped : bool
-        Commands are TwistStamped.
+    speed : simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and
+        stamps are those of the node's clock
+    stamped : commands are TwistStamped
 
     Attributes
     ----------
     commands : list of (time, rate)
         Everything that came on cmd_vel, by the steady clock, s and rad/s.
-    headings : dict
-        True heading, rad, by the stamp of the sample, ns.
+    headings : true heading, rad, by the stamp of the sample, ns
     moments : list of Moment
         The truth at each step.
-    clock_absent, clock_stands : bool
-        Set by a test: /clock is not published; or no more, and stamps stand. The base goes on.
-    also : callable or None
-        Called with each Imu message after it was published: a second driver.
+    clock_absent, clock_stands : set by a test: /clock is not published; or no more, and stamps
+        stand. The base goes on
+    also : called with each Imu message after it was published: a second driver
 
     """
 
@@ -249,8 +236,7 @@ class SecondCommander:
 
     Attributes
     ----------
-    rate : float or None
-        What it commands, rad/s; None for nothing.
+    rate : what it commands, rad/s; None for nothing
 
     """
 
