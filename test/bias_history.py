@@ -34,26 +34,14 @@ CALIBRATION = SelfCalibration(0.01, 1.0 * DEGREE, ((1e-6, 1e-8), (1e-8, OWN ** 2
 
 @dataclass(frozen=True)
 class History:
-    """
-    Runs of a gyro; all arrays have shape (runs, rests).
+    """Runs of a gyro; all arrays have shape (runs, rests)."""
 
-    Attributes
-    ----------
-    time : s
-    temperature : degC
-    bias : true, rad/s
-    curve : what of it the temperature makes, rad/s; a function of the temperature
-    estimate : what a rest showed, rad/s
-    outlier : whether that was off
-
-    """
-
-    time: np.ndarray
-    temperature: np.ndarray
-    bias: np.ndarray
-    curve: object
-    estimate: np.ndarray
-    outlier: np.ndarray
+    time: np.ndarray  # s
+    temperature: np.ndarray  # degC
+    bias: np.ndarray  # true, rad/s
+    curve: object  # what of it the temperature makes, rad/s; a function of the temperature
+    estimate: np.ndarray  # what a rest showed, rad/s
+    outlier: np.ndarray  # whether that was off
 
 
 def linear(generator, size=1.0):

@@ -78,24 +78,14 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 @dataclass(frozen=True)
 class Target:
-    """
-    Something that reads bytes.
+    """Something that reads bytes."""
 
-    Attributes
-    ----------
-    check : takes any bytes, raises where a claim is broken, and tells whether they were read
-    seeds : returns inputs to begin with, as the project writes them
-    longest : bytes of an input
-    words : what such inputs are made of
-    weight : of its share of the time
-
-    """
-
+    #: Takes any bytes, raises where a claim is broken, and tells whether they were read.
     check: Callable[[bytes], object]
-    seeds: Callable[[], Sequence[bytes]]
-    longest: int = 2048
-    words: Sequence[bytes] = ()
-    weight: float = 1.0
+    seeds: Callable[[], Sequence[bytes]]  # inputs to begin with, as the project writes them
+    longest: int = 2048  # bytes of an input
+    words: Sequence[bytes] = ()  # what such inputs are made of
+    weight: float = 1.0  # of its share of the time
 
 
 def path_of(suffix: str) -> Path:
