@@ -60,7 +60,7 @@ from gyro_calibration.logs.stamps import number_stamps, Stamps
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, uniform_filter1d
 
 #: Chance of a false alarm of each check.
 LEVEL = 2e-4
@@ -335,7 +335,7 @@ _NOISY, _BLURRED = 0.01, 0.25
 #: Rounding explains the error of a heading by an encoder up to this factor. Exact references know
 #: it as noise that is new in each sample; but during a rest it stands, and jumps by up to a step
 #: as the motion goes on. Up to this step, rad, that makes no slips (bench: 0.0055 deg, 50 Hz).
-_EXPLAINED, _FINE = 1.5, 0.05 * DEGREE
+_EXPLAINED, _FINE = 1.5, 0.01 * DEGREE
 #: From this part of a log on, in which a shaft moves evenly or rests, its encoder is not exact.
 _EVEN = 0.5
 #: So many tones are looked for, each of which noise alone shows with this chance.
@@ -384,7 +384,7 @@ def _errs_more(log: Log) -> bool:
 
 def limits(log: Log, reference: Reference) -> bool:
     """Tell whether the errors of a reference, not those of the gyro, limit what a log shows."""
-    if log.time is None or reference.kind == 'rest':
+    if log.time is None or log.output is None or reference.kind == 'rest':
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return log.reference_rate is not None and (
@@ -394,7 +394,9 @@ def limits(log: Log, reference: Reference) -> bool:
     found, step = heading_errors(log), encoder_step(log.reference_heading)
     # while a shaft rests, which may be most of a log, the error of its encoder does not show
     rounding = step / math.sqrt(12.0)
-    if step and rounding > _BLURRED * found.walk and _evenness(log, step) > _EVEN:
+    interval = float(np.median(np.diff(log.time)))
+    of_rate = math.sqrt(2.0) * rounding / interval
+    if of_rate > _NOISY * white_noise(log.output) and _evenness(log, step) > _EVEN:
         return True
     if not (found.larger or replace(found, error=rounding).larger):
         return False
@@ -411,10 +413,13 @@ def _evenness(log: Log, step: float) -> float:
 
     """
     assert log.time is not None and log.output is not None
-    phase = np.diff(angle_of(log.time, bridged(log.output))) * (2.0 * math.pi / step)
-    count = max(round(2.0 * _SPAN / float(np.median(np.diff(log.time)))), _BLOCK)
-    blocks = np.exp(1j * phase[:len(phase) // count * count]).reshape(-1, count)
-    return float(np.mean(np.abs(blocks.mean(axis=1)) ** 2)) if len(blocks) else 1.0
+    interval = float(np.median(np.diff(log.time)))
+    # means over a fifth of a second: the noise of single samples hides how even they are
+    rate = uniform_filter1d(bridged(log.output), max(round(0.2 * _SPAN / interval), 5))
+    count = max(round(2.0 * _SPAN / interval), _BLOCK)
+    blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
+    return float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2)) if len(
+        blocks) else 1.0
 
 
 @dataclass(frozen=True)

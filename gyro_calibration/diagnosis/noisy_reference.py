@@ -110,6 +110,8 @@ MOST, FOLDS = 4, 5
 #: them (two deviations of the prior of a scale factor error), but where a motion makes columns
 #: alike, several that nearly cancel each other fit what none of them is.
 _LARGEST = 2.0 * HEADING.prior[0]
+#: What errors of an encoder that repeat at its places may pass for.
+_OF_MOTION = frozenset({'rate', 'rate_change', 'heading'})
 #: Causes explain a log as well as the best of them up to this likelihood ratio.
 _LIKELY = 25.0
 
@@ -526,8 +528,7 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequ
     columns = data.columns(np.column_stack(widths))
     edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])
     places = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:])]
-    positive = [each.positive for each in open_ones]
-    chances = _evidences(data, columns, places, positive, np.ones(len(data.observed), dtype=bool))
+    chances = _evidences(data, columns, places, open_ones, np.ones(len(data.observed), dtype=bool))
     # what happens once is never established, and does not cost the others a part of the level
     lasting = sum(not each.once for each in open_ones)
     tried = [chance * (len(open_ones) if each.once else lasting)
@@ -548,7 +549,7 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequ
         each.default is None for each in getattr(CATALOGUE.get(open_ones[other].cause), 'shapes',
                                                  ())), tried[other]))
     column, p_value, stretches = open_ones[place], min(tried[place], 1.0), chances[place][2]
-    found = _cross_fitted(data, columns, places, positive, open_ones, alike)
+    found = _cross_fitted(data, columns, places, open_ones, alike)
     # the errors of a course last: there a cause has to predict distant stretches as well
     surely, predicted, chosen = max(found) if done.spans.fine else min(found)
     probability = {name: chance for name, chance in probabilities(
@@ -560,44 +561,46 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequ
                      probability)
 
 
-def _evidences(data: Whitened, columns: Array, places: Sequence[slice], positive: Sequence[bool],
-               rows: Mask) -> list[tuple[float, float, float]]:
+def _evidences(data: Whitened, columns: Array, places: Sequence[slice],
+               open_ones: Sequence[Column], rows: Mask) -> list[tuple[float, float, float]]:
     """Return chance, gain in log-likelihood and effective stretches of each cause."""
     base, _ = np.linalg.qr(data.plain[rows])
     both = np.column_stack([columns, data.observed])[rows]
     both -= base @ (base.T @ both)
     clusters = [each[rows] for each in (data.stretch, *data.places)]
     sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
-    return [(1.0, 0.0, 0.0) if above and float(both[:, place.start] @ both[:, -1]) <= 0.0
-            else _evidence(both[:, place], both[:, -1], clusters, 1e-6 * sizes[place])
-            for place, above in zip(places, positive)]
+    return [(1.0, 0.0, 0.0) if each.positive and float(both[:, place.start] @ both[:, -1]) <= 0.0
+            else _evidence(both[:, place], both[:, -1], clusters if CAUSES[each.cause].along
+                           in _OF_MOTION else clusters[:1], 1e-6 * sizes[place])
+            for place, each in zip(places, open_ones)]
 
 
 def _evidence(x: Array, left: Array, clusters: Sequence[NDArray[np.intp]],
               least: Array) -> tuple[float, float, float]:
-    """Return chance, gain in log-likelihood (both cluster-robust) and effective stretches."""
+    """Return chance, gain in log-likelihood and effective number by the worst clusters."""
     information = x.T @ x
     size = np.sqrt(np.diag(information))
     if not (size > least).all():
         return 1.0, 0.0, 0.0
     # by what the candidate leaves: a score that holds the effect itself would hide it
     off = left - x @ np.linalg.lstsq(x, left, rcond=None)[0]
-    count, more, numbers = x.shape[1], 1.0, []
+    count, found = x.shape[1], []
     root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size**2)))
+    square = float(np.sum((root @ x.T @ left) ** 2))
     for cluster in clusters:
         scores = np.array([np.bincount(cluster, part * off) for part in x.T])
         shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
-        numbers.append(float(shares.sum() ** 2 / (shares ** 2).sum()))
-        scatter = scores @ scores.T * numbers[-1] / max(numbers[-1] - 1.0 - count, 0.5)
-        more = max(more, float(np.linalg.eigvalsh(root @ scatter @ root.T).max()))
-    effective = min(numbers)
-    statistic = float(np.sum((root @ x.T @ left) ** 2)) / more
-    freedom = max(effective - count, 1.0)
-    return float(fisher.sf(statistic / count, count, freedom)), 0.5 * statistic, effective
+        effective = float(shares.sum() ** 2 / (shares ** 2).sum())
+        scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
+        more = float(np.linalg.eigvalsh(root @ scatter @ root.T).max())
+        statistic, freedom = square / max(more, 1.0), max(effective - count, 1.0)
+        found.append((float(fisher.sf(statistic / count, count, freedom)), 0.5 * statistic,
+                      effective))
+    return max(found)
 
 
 def _cross_fitted(data: Whitened, columns: Array, places: Sequence[slice],
-                  positive: Sequence[bool], open_ones: Sequence[Column],
+                  open_ones: Sequence[Column],
                   alike: Mapping[str, int]) -> list[tuple[float, float, float]]:
     """
     Choose and fit without each fold, and predict it.
@@ -619,7 +622,7 @@ def _cross_fitted(data: Whitened, columns: Array, places: Sequence[slice],
         for fold in sets:
             held = np.isin(data.stretch, fold)
             rest = ~held
-            gains = [each[1] for each in _evidences(data, columns, places, positive, rest)]
+            gains = [gain for _, gain, _ in _evidences(data, columns, places, open_ones, rest)]
             best = int(np.argmax(gains))
             same += open_ones[best].cause in alike
             off = []

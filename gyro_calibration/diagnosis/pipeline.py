@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 import math
 
 from gyro_calibration.diagnosis.candidates import (
@@ -92,8 +93,9 @@ from gyro_calibration.diagnosis.search import (
     Search,
     searched,
     SURELY,
-    surely_predicts,
+    sureness_of,
     suspected,
+    without_weakest,
 )
 from gyro_calibration.diagnosis.steps import CHECKS, OnProgress, Steps
 from gyro_calibration.diagnosis.words import amount
@@ -204,12 +206,15 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate, steps)
-    everything, unconfirmed = _confirmed(search, everything)
+    everything, unconfirmed = without_weakest(
+        search, everything, partial(sureness_of, search), SURELY)
     named, unnamed = _withdrawn(search, everything)
-    named, contradicted = _without_contradictions(search, named)
+    named, contradicted = without_weakest(search, named, partial(_sigmas, search), 1.96)
     refuted = {**{each.candidate.cause: 'it does not predict stretches that are held out'
-                  for each in unconfirmed if not lasts(each.candidate)},
-               **dict.fromkeys(contradicted, 'the interval of its size holds 0')}
+                  for each in unconfirmed if is_named(each.candidate)
+                  and not lasts(each.candidate)},
+               **{each.candidate.cause: 'the interval of its size holds 0'
+                  for each in contradicted}}
     steps.begin('alternatives')
     named, sets = _simplest(search, named, unnamed)
     found = FittedValues(fitted(search.problem, named), search.problem.replays)
@@ -223,39 +228,21 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     noise = figures.noise
     steps.begin('cross-validation')
     changed = [] if model is None else _of_model(found, model, noise, rate)
-    causes = {each.candidate.cause for known, members in zip(named, sets) if known not in out
-              for each, _ in members}
-    lasting = any(known not in out and not happens_once(known) for known in named)
-    won = (gain(search, causes, model is not None)
+    within = [(known, members) for known, members in zip(named, sets) if known not in out]
+    lasting = any(not happens_once(known) for known, _ in within)
+    won = (gain(search, {each.candidate.cause for _, members in within for each, _ in members},
+                model is not None)
            if (lasting or changed) and not implausible_scale(found) else None)
     offered = won is None or not won.worse
     steps.begin('findings')
-    findings = []
-    for place, (known, members) in enumerate(zip(named, sets)):
-        cause = known.candidate.cause
-        findings.append(named_finding(
-            search, found, place, _chance(search, (*named, *unnamed), place), members, experiment(
-                cause, [(each.candidate.cause, lack) for each, lack in members
-                        if each.candidate.cause != cause], observed_range(found.replays))))
-    best: dict[str, Finding] = {}  # of the records, by the log that shows it best
-    for each in (each for clean in quality for each in clean.findings):
-        if each.effect not in best or each.p_value < best[each.effect].p_value:
-            best[each.effect] = each
-    covered = {name for each in best.values() for name in each.ambiguous_with}
-    findings += [*best.values(), *(each for each in changed if each.effect not in covered)]
-    if model is not None:
-        findings += _of_noise(figures, model, rate, found.replays)
     more = suspected(search, (*named, *unnamed))
     taken = {each.candidate.cause for each in named}
-    doubtful = [each for each in unconfirmed
-                if lasts(each.candidate) and each.candidate.cause not in taken]
-    for maybe in doubtful or ([more.named[-1]] if more else []):
-        everything = polished(search, (*named, *unnamed, maybe))
-        place, with_more = len(everything) - 1, FittedValues(
-            fitted(search.problem, everything), found.replays)
-        findings.append(as_suspected(named_finding(
-            search, with_more, place, _chance(search, everything, place),
-            [(everything[-1], 0.0)], '')))
+    findings = [*_of_search(search, found, sets, unnamed, [
+        each for each in unconfirmed
+        if lasts(each.candidate) and each.candidate.cause not in taken]
+        or ([more.named[-1]] if more else [])), *_of_records(quality, changed)]
+    if model is not None:
+        findings += _of_noise(figures, model, rate, found.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # the causes that the model can hold, without those that would be a second of a kind
     inside = FittedValues(fitted(search.problem, [each for each in named if each not in out])
@@ -281,6 +268,34 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         heading_shares=of_heading)
 
 
+def _of_search(search: Search, found: FittedValues, sets: Sequence[Members],
+               unnamed: Sequence[Named], doubtful: Sequence[Named]) -> Iterator[Finding]:
+    """Give the named causes, and those in doubt as suspected, each beside all that is named."""
+    for place, (known, members) in enumerate(zip(found.named, sets)):
+        others = [(each.candidate.cause, lack) for each, lack in members
+                  if each.candidate.cause != known.candidate.cause]
+        yield named_finding(
+            search, found, place, _chance(search, (*found.named, *unnamed), place), members,
+            experiment(known.candidate.cause, others, observed_range(found.replays)))
+    for known in doubtful:
+        everything = polished(search, (*found.named, *unnamed, known))
+        with_it = FittedValues(fitted(search.problem, everything), found.replays)
+        place = len(everything) - 1
+        yield as_suspected(named_finding(
+            search, with_it, place, _chance(search, everything, place), [(everything[-1], 0.0)],
+            ''))
+
+
+def _of_records(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
+    """Return what is found in records, by the log that shows it best, and other changed values."""
+    best: dict[str, Finding] = {}
+    for each in (each for clean in quality for each in clean.findings):
+        if each.effect not in best or each.p_value < best[each.effect].p_value:
+            best[each.effect] = each
+    covered = {name for each in best.values() for name in each.ambiguous_with}
+    return [*best.values(), *(each for each in changed if each.effect not in covered)]
+
+
 def _chance(search: Search, named: Sequence[Named], place: int) -> float:
     """Return the chance that noise alone shows as much of a named cause, given the others."""
     return search.chance.p_value(named[place].candidate.cause, evidence_of(search, named, place))
@@ -296,22 +311,6 @@ def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: f
         return search, everything
     search = begin(as_filtered, generator, rate, steps.within)
     return search, searched(search)
-
-
-def _confirmed(search: Search,
-               everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[Named]]:
-    """Take out what does not surely predict stretches that are held out, the least sure first."""
-    unconfirmed: list[Named] = []
-    while everything:
-        surely = [surely_predicts(search, everything, place) for place in range(len(everything))]
-        weakest = int(np.argmin(surely))
-        if surely[weakest] > SURELY:
-            break
-        if is_named(everything[weakest].candidate):
-            unconfirmed.append(everything[weakest])
-        rest = everything[:weakest] + everything[weakest + 1:]
-        everything = polished(search, rest) if rest else rest
-    return everything, unconfirmed
 
 
 def _withdrawn(search: Search,
@@ -354,26 +353,16 @@ def _withdrawn(search: Search,
         for one in kept)), rest
 
 
-def _without_contradictions(
-        search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[str]]:
-    """Take out causes whose interval holds 0, whatever their evidence is, and name them."""
-    contradicted: list[str] = []
-    while named:
-        found = FittedValues(fitted(search.problem, named), search.problem.replays)
-        sigmas = []
-        for place, known in enumerate(named):
-            sizes = found.coefficients(place) or list(found.shapes(place).values())
-            # of a wave, sine and cosine alone may be 0
-            wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
-            sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
-                          else abs(sizes[0].value) / sizes[0].deviation)
-        weakest = int(np.argmin(sigmas))
-        if sigmas[weakest] >= 1.96:
-            break
-        contradicted.append(named[weakest].candidate.cause)
-        rest = named[:weakest] + named[weakest + 1:]
-        named = polished(search, rest) if rest else rest
-    return named, contradicted
+def _sigmas(search: Search, named: tuple[Named, ...]) -> list[float]:
+    """Return of each cause how far its size is from 0; no evidence names one that may be 0."""
+    found, sigmas = FittedValues(fitted(search.problem, named), search.problem.replays), []
+    for place, known in enumerate(named):
+        sizes = found.coefficients(place) or list(found.shapes(place).values())
+        # of a wave, sine and cosine alone may be 0
+        wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
+        sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
+                      else abs(sizes[0].value) / sizes[0].deviation)
+    return sigmas
 
 
 def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> bool:

@@ -20,9 +20,10 @@ better, or none is needed.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as field_of
+import math
 from typing import Any, TypeAlias
 
 from gyro_calibration.diagnosis.candidates import (
@@ -596,7 +597,7 @@ def _first(search: Search, done: Fitted, named: Sequence[Named]) -> list[_First]
 def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
     """Refine all shapes together, and find the values, by the method of Gauss and Newton."""
     current = tuple(named)
-    for _ in range(3):
+    for _ in range(3 if named else 0):
         done = fitted(search.problem, current)
         values, _ = done.estimates
         current = tuple(_updated(done, place, values) for place in range(len(current)))
@@ -657,15 +658,24 @@ def _grown(search: Search) -> tuple[Named, ...]:
 
 def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
     """Take out causes that, given the others, are not beyond chance, the weakest first."""
+    return without_weakest(search, named, lambda some: [
+        search.excess(each.candidate.cause, evidence_of(search, some, place))
+        for place, each in enumerate(some)], 0.0)[0]
+
+
+def without_weakest(search: Search, named: tuple[Named, ...],
+                    strengths: Callable[[tuple[Named, ...]], Sequence[float]],
+                    least: float) -> tuple[tuple[Named, ...], list[Named]]:
+    """Take out the weakest cause, and refine the others, until all exceed a strength."""
+    out: list[Named] = []
     while named:
-        left = [search.excess(each.candidate.cause, evidence_of(search, named, place))
-                for place, each in enumerate(named)]
-        weakest = int(np.argmin(left))
-        if left[weakest] > 0.0:
+        found = strengths(named)
+        weakest = int(np.argmin(found))
+        if found[weakest] > least:
             break
-        rest = named[:weakest] + named[weakest + 1:]
-        named = polished(search, rest) if rest else rest
-    return named
+        out.append(named[weakest])
+        named = polished(search, named[:weakest] + named[weakest + 1:])
+    return named, out
 
 
 def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
@@ -674,7 +684,7 @@ def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
         others = tuple(each for each in named if each is not known)
         step, _ = strongest(search, others)
         if step is None:
-            return polished(search, others) if others else others
+            return polished(search, others)
         if (step.named[-1].candidate.cause != known.candidate.cause
                 and step.score > fitted(search.problem, named).score + 1.0):
             return polished(search, step.named)
@@ -706,22 +716,29 @@ def sureness(won: Array) -> float:
     return float(np.sum(bounded)) / max(scatter, 1e-9) if np.sum(won) > 0.0 else 0.0
 
 
-def surely_predicts(search: Search, named: Sequence[Named], place: int) -> float:
+def sureness_of(search: Search, named: Sequence[Named]) -> list[float]:
     """
-    Return how surely one of the causes predicts stretches of the logs that are held out.
+    Return how surely each of the causes predicts stretches of the logs that are held out.
 
-    What it adds, given the others, is scaled by what fits best without each stretch in turn.
+    What it adds, given the others, is scaled by what fits best without each stretch in turn. Slips
+    are of single moments, and need not predict others.
 
     """
-    full, rest = (fitted(search.problem, some)
-                  for some in (named, [*named[:place], *named[place + 1:]]))
-    left, without = full.white(), rest.white(full)
+    full, found = fitted(search.problem, named), []
+    left = full.white()
     count = max(STRETCHES // len(left), 1)
     stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
                               for run, each in enumerate(left)])
-    off, before = np.concatenate(left), np.concatenate(without)
-    added = before - off
-    score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
-    size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
-    return sureness(0.5 * np.bincount(
-        stretch, before ** 2 - (before - size[stretch] * added) ** 2))
+    off = np.concatenate(left)
+    for place, known in enumerate(named):
+        if known.candidate.cause == 'reference_slip':
+            found.append(math.inf)
+            continue
+        rest = fitted(search.problem, [*named[:place], *named[place + 1:]])
+        before = np.concatenate(rest.white(full))
+        added = before - off
+        score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
+        size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
+        found.append(sureness(0.5 * np.bincount(
+            stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
+    return found

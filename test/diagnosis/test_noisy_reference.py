@@ -250,8 +250,8 @@ def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always
 
 
 def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
-    # at a constant rate the rounding of a fine encoder is a saw, 50 times the noise of the gyro
-    time, step = np.arange(0.0, 300.0, 0.02), 0.017 * DEGREE
+    # at a constant rate the rounding of a fine encoder is a saw, 28 times the noise of the gyro
+    time, step = np.arange(0.0, 300.0, 0.02), 0.0055 * DEGREE
     turned = 20.0 * DEGREE * np.arcsin(np.sin(0.7 * time))
     for heading, even in ((turned, True), (2.0 * np.sin(0.7 * time), False)):
         log = Log(time=time, output=np.gradient(heading, time)

@@ -35,7 +35,7 @@ from gyro_calibration.diagnosis.search import (
     searched,
     strongest,
     SURELY,
-    surely_predicts,
+    sureness_of,
     suspected,
 )
 from gyro_calibration.logs.log import Log
@@ -105,10 +105,10 @@ def test_what_may_be_anywhere_pays_for_the_places_to_the_end(cause, added, place
 def test_what_one_stretch_shows_does_not_predict_the_others():
     lasting, brief = tone(4e-4, 3.3), np.where(abs(TIME - 203.0) < 2.0, tone(2e-2, 3.3), 0.0)
     search, named = found_in([laid(resting(lasting))])
-    assert surely_predicts(search, named, 0) > SURELY
+    assert sureness_of(search, named)[0] > SURELY
     search = begin([laid(resting(brief))], np.random.default_rng(1))
     named = polished(search, named)
-    assert evidence_of(search, named, 0) > 10.0 and surely_predicts(search, named, 0) < SURELY
+    assert evidence_of(search, named, 0) > 10.0 and sureness_of(search, named)[0] < SURELY
 
 
 def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
