@@ -172,15 +172,8 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     late = next((each for each in findings if each.effect == 'time_offset'
                  and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
     base = _model(GyroModel(), plain, log) if model is None else model
-    after = (_model(model or GyroModel(), inside, log)
+    after = (_extended(model, inside, log, late)
              if changed or late or model is None or prior is not None else model)
-    if model is not None and prior is not None:
-        # what is known of this unit now takes the place of what is usual of its type
-        after = replace(after, tolerance=Tolerance(), origin=origins_before(model))
-    if late:
-        size = late.parameters['time_offset']
-        after = with_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))],
-                           np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
     curve, trace = _pictures(extended, parts)
     return Diagnosis(
         tuple(with_remedies(findings, of_heading, after)), (), _noise(extended),
@@ -286,6 +279,20 @@ def _lag(square: float, half: float) -> Estimate:
     low, size, high = (math.sqrt(2.0 * max(each, 0.0))
                        for each in (square - half, square, square + half))
     return Estimate(size, (low, high), 's')
+
+
+def _extended(model: GyroModel | None, inside: SpanFit, log: Log,
+              late: Finding | None) -> GyroModel:
+    """Return the extended model of a fit, with a delay that is of the gyro."""
+    after = _model(model or GyroModel(), inside, log)
+    if model is not None and model.prior is not None:
+        # what is known of this unit now takes the place of what is usual of its type
+        after = replace(after, tolerance=Tolerance(), origin=origins_before(model))
+    if late is None:
+        return after
+    size = late.parameters['time_offset']
+    return with_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))],
+                      np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
 
 
 def _model(given: GyroModel, done: SpanFit, log: Log) -> GyroModel:
