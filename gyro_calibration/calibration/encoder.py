@@ -338,6 +338,9 @@ def _drift(motion: Motion, error: Array, bias: float, noise: Noise, technology: 
     middle, heading = ((np.bincount(piece, values) / np.maximum(np.bincount(piece), 1))[known]
                        for values in (motion.time, error))
     apart, ones = np.diff(middle), np.ones(len(middle) - 1)
+    begins = np.flatnonzero(np.diff(piece, prepend=-1))
+    lasts = motion.time[np.append(begins[1:], len(piece)) - 1] - motion.time[begins]
+    between = (lasts[1:] + lasts[:-1]) / 6.0
     largest = max(PRIORS[technology][1], 3.0 * abs(bias))
     rounding = max(quantization_step(motion.heading), ROUNDING) / math.sqrt(12.0 * len(piece)
                                                                             / len(known))
@@ -346,7 +349,8 @@ def _drift(motion: Motion, error: Array, bias: float, noise: Noise, technology: 
     found = noise_grid(
         np.diff(heading), apart[:, None],
         # means over pieces: of a random walk, and of what repeats itself within them
-        [BandedNoise('angle_random_walk', 2.0 / 3.0 * apart, 0.5 / 3.0 * apart, WHITE),
+        [BandedNoise('angle_random_walk', np.maximum(apart - between, between),
+                     lasts[:-1] / 6.0, WHITE),
          BandedNoise('reference', 2.0 * ones, -ones, repeated)],
         columns, shared, prior_mean=np.array([-bias]), prior_deviation=np.array([largest]),
         prior_sizes=(PriorSize('bias', 0, (0.1 * largest, largest)),))

@@ -55,6 +55,15 @@ def test_a_burst_of_bad_fixes_does_not_move_the_bias():
     assert abs(clean.bias - bad.bias) < 2.0 * math.sqrt(clean.covariance[1, 1])
 
 
+def test_a_course_that_is_lost_for_half_of_the_drive_is_fitted():
+    log = drive(3)
+    lost = log.reference_heading.copy()
+    lost[(log.time > 0.2 * log.time[-1]) & (log.time < 0.7 * log.time[-1])] = np.nan
+    fit = calibrate_encoder(replace(log, reference_heading=lost)).fit
+    error = np.array([fit.scale_factor_error - (SCALE - 1.0), fit.bias - BIAS])
+    assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(fit.covariance)))
+
+
 def test_a_drive_without_turns_leaves_the_scale_to_the_prior():
     consumer, fibre = (calibrate_encoder(drive(3, turning=0.0), technology=name).fit
                        for name in ('mems', 'closed_loop_fog'))
