@@ -131,7 +131,7 @@ def _fit_line(fit: NoiseFit) -> str:
     if fit.process:
         text += (f'; a Gauss-Markov process of {fit.process.deviation * UNITS["B"][1]:.3g} deg/h '
                  f'with a correlation time of {fit.process.correlation_time:.3g} s describes them '
-                 'better than B and K, which stand for it here and may be zero')
+                 'better than B and K, which approximate it and may be zero')
     return f'{text}.'
 
 

@@ -318,8 +318,8 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
         data.update(mean_heading_error_rad=mean, last_heading_error_rad=last[-1])
         lines.append(f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the '
                      f'end {last[-1] / DEGREE:.3f} deg.')
-        lines.append('Both headings count from the first row with a reference. fit takes the mean '
-                     'error off, and a delay of the reference.')
+        lines.append('Both headings start at 0 at the first row with a reference. The error that '
+                     'fit states excludes the mean error and a delay of the reference.')
     if not found.temperature_known and model.looks_at('temperature'):
         lines.append('The log has no temperature: '
                      'the model was used at its reference temperature.')

@@ -21,8 +21,8 @@ from gyro_calibration.cli.verb import Answer, UsageError
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'demo', _demo, 'emulated gyro, driver, compensation, '
-                      'self-calibration and a drive, on this machine', '--out demo')
+    parser = verb.add(verbs, 'demo', _demo, 'run an emulated gyro, its driver, compensation, '
+                      'self-calibration and a drive on this machine', '--out demo')
     parser.add_argument('--out', default='demo', metavar='DIR',
                         help='folder for picture, table and log; default: %(default)s')
     parser.add_argument('--seed', type=verb.whole, default=0,

@@ -133,7 +133,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser(called: str = '') -> argparse.ArgumentParser:
     """Return the parser of the verb that is called, or of all where that is none."""
     parser = _Parser(prog='gyro_calibration',
-                     description='Calibrate a gyro, so that a robot knows its heading.')
+                     description='Calibrate, compensate and diagnose gyros with one axis.')
     parser.add_argument('--version', action='version', version=__version__)
     verbs = parser.add_subparsers(required=True, metavar='VERB')
     name = str(called).replace('-', '_')

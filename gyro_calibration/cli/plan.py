@@ -52,7 +52,7 @@ LENGTHS, LONGEST = (20.0, 30.0, 60.0, 120.0), 300.0
 
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb.add(verbs, 'plan', _plan,
-                      'compute the motion that calibrates best within what a robot can do',
+                      'compute the motion that calibrates best within the limits of a robot',
                       '--limits limits.yaml --seconds 20 --out profile.csv')
     parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
                         help='limits of the robot; config/limits.yaml is an example')

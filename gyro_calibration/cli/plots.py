@@ -99,8 +99,8 @@ def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')
-    return _save(figure, path, 'Above: both turn at the same times. Below: the error before '
-                 'follows the turns; after, it stays near zero.')
+    return _save(figure, path, 'Above: the rates coincide if the log belongs to the motion. '
+                 'Below: the error before follows the turns; after, it stays near zero.')
 
 
 def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
@@ -153,7 +153,7 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
     return _save(figure, path, 'Slope -1/2: white noise, N at 1 s. Flat: flicker, at 0.664 B. '
-                 'Slope +1/2: the bias walks.')
+                 'Slope +1/2: random walk of the bias.')
 
 
 # rate tables
@@ -209,8 +209,8 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
     for text in axes.clabel(lines, fontsize=9, manual=_label_places(lines.allsegs)):
         text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
     axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]',
-             title='Error of the model [deg/s]; dots: dwells' if dwells is not None
-             else 'Error of the model [deg/s]')
+             title='Error of the gyro by the model [deg/s]; dots: dwells' if dwells is not None
+             else 'Error of the gyro by the model [deg/s]')
 
 
 def _label_places(levels: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:

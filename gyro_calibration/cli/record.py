@@ -230,8 +230,8 @@ class _Session:
 
     def _remarks(self) -> list[str]:
         missed = sorted(self._recorder.missed) if isinstance(self._recorder, CsvRecorder) else []
-        return ([f'{", ".join(missed)} came too late for a column of a log; record into .mcap '
-                 'to keep temperature and acceleration from any time on.']
+        return ([f'{", ".join(missed)} began after the header of the log was written, and is '
+                 'not in it; record into .mcap instead.']
                 if missed else [])
 
 

@@ -47,8 +47,8 @@ Bins: TypeAlias = 'list[tuple[float, float, Mask]]'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'turn', _turn, 'error of a full turn over rate and temperature, '
-                      'with a static bias only and with a model',
+    parser = verb.add(verbs, 'turn', _turn, 'compute the error of a full turn over rate and '
+                      'temperature, with a static bias only and with a model',
                       'table.csv --picture turn.png')
     verb.add_log(parser)
     parser.add_argument('--model', metavar='MODEL.yaml',

@@ -235,7 +235,7 @@ def test_a_temperature_of_a_port_that_comes_too_late_for_a_column_is_a_remark(ru
         code, out, _ = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv',
                                       '--seconds', '6', '--json'))
     assert code == 0 and read(tmp_path / 'a.csv').temperature is None
-    assert 'temperature_degc came too late for a column of a log' in out
+    assert 'temperature_degc began after the header of the log was written' in out
 
 
 def test_a_port_that_is_not_there_is_reported_and_leaves_no_file(run, tmp_path):
