@@ -206,13 +206,11 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate, steps)
-    everything, unconfirmed = without_weakest(
-        search, everything, partial(sureness_of, search), SURELY)
     named, unnamed = _withdrawn(search, everything)
+    named, unconfirmed = without_weakest(search, named, partial(sureness_of, search), SURELY)
     named, contradicted = without_weakest(search, named, partial(_sigmas, search), 1.96)
     refuted = {**{each.candidate.cause: 'it does not predict stretches that are held out'
-                  for each in unconfirmed if is_named(each.candidate)
-                  and not lasts(each.candidate)},
+                  for each in unconfirmed if not lasts(each.candidate)},
                **{each.candidate.cause: 'the interval of its size holds 0'
                   for each in contradicted}}
     steps.begin('alternatives')
