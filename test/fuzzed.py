@@ -242,7 +242,7 @@ def check_clock(data: bytes) -> int:
             assert math.isfinite(stamp) and stamp > last, (stamp, last)
             last = stamp
     assert (math.isfinite(clock.period) and clock.period > 0.0
-            and math.isfinite(clock.jitter_before + clock.jitter_after))
+            and math.isfinite(sum(clock.jitter)))
     assert isinstance(clock.lost, int) and clock.lost >= 0, clock.lost
     return len(data)
 
