@@ -392,6 +392,9 @@ def _cannot_show(plain: SpanFit) -> dict[str, str]:
         lacks = sorted(missing & cause.needs)
         if name not in seen:
             shown[name] = (f'the logs have no {" and no ".join(lacks)}'.replace('_', ' ') if lacks
+                           else 'fewer than three stretches turn, which do not distinguish it '
+                           'from a scale factor error'
+                           if plain.scale_held and _follows_the_rate(name)
                            else 'the errors of the reference hide it over short spans')
     return shown
 
@@ -403,7 +406,7 @@ def _remarks(reference: Reference, plain: SpanFit, of_fleet: bool) -> Iterator[s
            'it is another kind, state it with --reference-kind. Its errors: '
            f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and '
            f'{1000.0 * plain.size("motion"):.2g} ms times the rate.')
-    if plain.prior[0] < plain.spans.treatment.prior[0]:
+    if plain.scale_held:
         yield ('The scale factor error rests on fewer than three stretches that turn, and is left '
                f'at 0 +- {100.0 * plain.spans.treatment.prior[0]:g} %: turn more often, both '
                'ways.')
@@ -451,7 +454,26 @@ class Confirmed:
 
 
 def candidates(done: SpanFit) -> Iterator[Column]:
-    """Give the causes that headings over spans can show, for the channels that the log has."""
+    """
+    Give the causes that headings over spans can show, for the channels that the log has.
+
+    Where the scale factor error is left at 0, every cause that follows the rate would take it up,
+    so that none of these is a candidate.
+
+    """
+    return (each for each in _columns(done)
+            if not (done.scale_held and _follows_the_rate(each.cause)))
+
+
+def _follows_the_rate(cause: str) -> bool:
+    """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
+    effect = CATALOGUE.get(cause)
+    return (cause == 'reference_once_per_rev' if effect is None
+            else 'rate' in effect.looks_at)
+
+
+def _columns(done: SpanFit) -> Iterator[Column]:
+    """Give the columns of all causes for the channels that the log has."""
     log, fine, time = done.spans.log, done.spans.fine, done.spans.time
     duration = float(time[-1] - time[0])
     for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
@@ -530,7 +552,9 @@ def _contradiction(done: SpanFit, cause: Column) -> float:
 def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequence[Column],
           level: float) -> Confirmed | None:
     """Return the best of the causes that are open, given those found; None where it is chance."""
-    data = whitened(done, given, rich, most=True)
+    # what a scale factor error that is left at 0 would explain is no evidence of a cause
+    data = whitened(replace(done, prior=np.array(done.spans.treatment.prior)), given, rich,
+                    most=True)
     widths = [done.spans.columns(each) for each in open_ones]
     columns = data.columns(np.column_stack(widths))
     edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])

@@ -344,6 +344,11 @@ class SpanFit:
         prior = self.spans.treatment.prior
         return min(half, 1.96 * prior[place]) if place < len(prior) else half
 
+    @property
+    def scale_held(self) -> bool:
+        """Tell whether the log does not show the scale factor error, which is left at 0."""
+        return bool(self.prior[0] < self.spans.treatment.prior[0])
+
     def places(self, cause: Column) -> slice:
         """Return the places of the values of a cause."""
         start = len(PLAIN)

@@ -108,6 +108,27 @@ def test_a_step_of_the_bias_that_happens_once_is_in_no_model():
                if each.effect in ('bias_step', 'reference_slip'))
 
 
+def turning_once(seed):
+    """Return a log of one turn, of which a course that slips shows 10 % too much."""
+    generator, time = np.random.default_rng(seed), np.arange(0.0, 240.0, 1.0 / RATE)
+    turn = 0.6 * np.sin(np.pi * (time - 200.0) / 6.0) ** 2 * ((time > 200.0) & (time < 206.0))
+    fixes = np.arange(0.0, 240.0, 0.2)
+    course = (1.1 * np.interp(fixes, time, np.cumsum(turn) / RATE)
+              + 0.3 * DEGREE * generator.standard_normal(len(fixes)))
+    return Log(time=time, reference_heading=np.interp(time, fixes, course), output=turn
+               + BIAS_TRUE + 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate(seed):
+    found = diagnosed(turning_once(seed), kind='course')
+    assert 'fewer than three stretches' in ' '.join(found.remarks)
+    follow = {'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
+              'reference_once_per_rev'}
+    assert not follow & {each.effect for each in found.findings}, lines(found)
+    assert all('three stretches' in found.cannot_show[name] for name in follow)
+
+
 def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_reported():
     log = drive(7)
     right = diagnosed(log).model
