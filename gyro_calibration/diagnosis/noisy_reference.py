@@ -180,7 +180,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
         Noise() if model is None else model.noise,
         None if not changed and model is not None else gain, base, after, _cannot_show(plain),
         [curve], heading_curve(parts, time), None,
-        (*record.remarks, *_remarks(reference, plain, prior is not None)), rate, trace=trace,
+        (*record.remarks, *_remarks(reference, extended, prior is not None)), rate, trace=trace,
         method=_METHOD.format(_SPOKEN[reference.kind]), reference=replace(reference, noise=noise),
         heading_shares=of_heading)
 
@@ -399,16 +399,18 @@ def _cannot_show(plain: SpanFit) -> dict[str, str]:
     return shown
 
 
-def _remarks(reference: Reference, plain: SpanFit, of_fleet: bool) -> Iterator[str]:
+def _remarks(reference: Reference, done: SpanFit, of_fleet: bool) -> Iterator[str]:
     if of_fleet:
         yield ('The model, which is of a fleet, is the prior of bias and scale factor error.')
+    errors = (f'{done.size("reference") / DEGREE:.2g} deg from point to point, and '
+              f'{1000.0 * done.size("motion"):.2g} ms times the rate'
+              if done.spans.treatment.of_heading
+              else f'white noise of {done.spans.noisier:.2g} times that of the gyro')
     yield (f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); if '
-           'it is another kind, state it with --reference-kind. Its errors: '
-           f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and '
-           f'{1000.0 * plain.size("motion"):.2g} ms times the rate.')
-    if plain.scale_held:
+           f'it is another kind, state it with --reference-kind. Its errors: {errors}.')
+    if done.scale_held:
         yield ('The scale factor error rests on fewer than three stretches that turn, and is left '
-               f'at 0 +- {100.0 * plain.spans.treatment.prior[0]:g} %: turn more often, both '
+               f'at 0 +- {100.0 * done.spans.treatment.prior[0]:g} %: turn more often, both '
                'ways.')
 
 

@@ -98,6 +98,9 @@ def test_a_large_effect_is_established_by_a_course_and_its_model_predicts_the_he
             and first.share_of_heading_error is not None)
     assert found.gain.models['extended'] < 0.7 * found.gain.models['plain']
     assert first.effect in {term.effect.name for term in found.model.terms}
+    errors = found.reference.noise
+    assert (f'{errors["reference"] / DEGREE:.2g} deg from point to point, and '
+            f'{1000.0 * errors["motion"]:.2g} ms times the rate') in ' '.join(found.remarks)
 
 
 def test_a_step_of_the_bias_that_happens_once_is_in_no_model():
@@ -183,6 +186,7 @@ def test_the_noise_of_a_reference_is_no_effect_of_the_gyro(reference):
     hidden = hide_beside([], 0.0, np.random.default_rng(0), reference)
     found, named = established(hidden)
     assert limits(log_of(hidden), found.reference) and not named, lines(found)
+    assert ('times that of the gyro' in ' '.join(found.remarks)) == (reference.kind == 'rate')
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
 
 
