@@ -211,9 +211,11 @@ class Forecast:
             return weights, left @ left.T
         white = self._noise.angle_random_walk / math.sqrt(self._rest)
         stated = covariance[:2, :2] + np.diag([0.0, self._noise.floor ** 2])
-        variance = rest_variance(self._noise, self._rest, white, 2.0 * white)
+        # the median rest: halves differ by twice the deviation of the mean, times `_MEDIAN`
+        expected, variance = (rest_variance(self._noise, self._rest, white, change)
+                              for change in (0.0, 2.0 * _MEDIAN * white))
         gain, combined = combined_rest(
-            stated, _MEDIAN * math.sqrt(stated[1, 1] + variance), variance)
+            stated, _MEDIAN * math.sqrt(stated[1, 1] + expected), variance)
         of_run = np.eye(2) - np.outer(gain, (0.0, 1.0))
         # the chance that the robot turned otherwise is no noise, but the calibration states it
         more = combined - of_run @ stated @ of_run.T - variance * np.outer(gain, gain)

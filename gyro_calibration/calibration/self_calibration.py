@@ -34,7 +34,6 @@ from gyro_calibration.calibration.likelihood import (
     fit_likelihood,
     FOLLOWING,
     Goodness,
-    TURNED_ODDS,
 )
 from gyro_calibration.calibration.run_faults import (
     EXPLAINED,
@@ -434,10 +433,10 @@ def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Arra
     """
     Combine a run with the rest after it.
 
-    A run may be off by more than its stated deviation (`TURNED_ODDS`): by a slip, by a turn by
-    hand, or by a robot that follows otherwise. How much more is not known: the ratio of that error
-    to the stated deviation has a half-Cauchy prior, as often below 1 as above, and now and then
-    many times more.
+    A run may be off by more than its stated deviation: by a slip, by a turn by hand, or by a robot
+    that follows otherwise. That and a run as stated have even odds before the rest is seen. How
+    much more is not known: the ratio of that error to the stated deviation has a half-Cauchy
+    prior, as often below 1 as above, and now and then many times more.
 
     Parameters
     ----------
@@ -454,7 +453,7 @@ def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Arra
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
     total = (1.0 + ratios ** 2) * stated + variance
     weights = np.exp(-0.5 * rate ** 2 / total) / np.sqrt(total)
-    weights[1:] *= TURNED_ODDS / 100
+    weights[1:] /= len(weights) - 1
     weights /= weights.sum()
     shared = run + np.outer(ratios ** 2 * stated, (0.0, 1.0))
     gains = shared / total[:, None]

@@ -21,6 +21,7 @@ import math
 from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.calibration.self_calibration import (
     calibrate_bias,
+    combined_rest,
     fit_heading,
     fit_likelihood,
     fit_rate,
@@ -276,6 +277,14 @@ def test_the_wander_of_the_bias_is_in_its_standard_deviation():
     without, with_it = (self_calibrate(TIME, run(), CALIBRATION, noise=noise).covariance[1, 1]
                         for noise in (None, flicker))
     assert with_it - without == pytest.approx((ALLAN_FLOOR * flicker.bias_instability) ** 2)
+
+
+@pytest.mark.parametrize('variance', [3.0, 10.0, 20.0])
+def test_a_run_that_is_far_off_is_in_the_interval_after_a_rest_that_hardly_shows_it(variance):
+    """A robot that yawed all the time: a bias of several deviations, and a short rest of noise."""
+    for off in np.arange(2.0, 11.0):
+        gain, covariance = combined_rest(np.diag([1e-6, 1.0]), -off, variance)
+        assert abs(off + gain[1] * -off) < 3.0 * math.sqrt(covariance[1, 1]), off
 
 
 def test_the_bias_is_the_mean_at_rest_and_its_deviation_is_true():
