@@ -40,7 +40,13 @@ from gyro_calibration.calibration.course_over_ground import (
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE
 from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.calibration.noise_grid import BandedNoise, noise_grid, PriorSize, wander
+from gyro_calibration.calibration.noise_grid import (
+    BandedNoise,
+    noise_grid,
+    PriorSize,
+    Tridiagonal,
+    wander,
+)
 from gyro_calibration.calibration.self_calibration import fit_rate, Limits, refuse_scale
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
@@ -93,7 +99,8 @@ class Drift:
     ----------
     time, rate : middles of the intervals between pieces of the log, s, and the drift of the
         heading there, rad/s, shape (m,)
-    angle_random_walk : rad/√s, over times longer than a piece
+    angle_random_walk, largest_walk : rad/√s, over times longer than a piece, and its upper limit
+        (97.5 %) if nothing else moves the heading from piece to piece
     bias, deviation : mean bias over the log and its standard deviation, rad/s
     wander : standard deviation of the mean bias less the bias at the beginning, rad/s
 
@@ -102,6 +109,7 @@ class Drift:
     time: Array
     rate: Array
     angle_random_walk: float
+    largest_walk: float
     bias: float
     deviation: float
     wander: float
@@ -175,10 +183,14 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     _refuse_uncertain(fit, limits)
     before, after = (_residual(time - np.nan_to_num(fit.time_offset), output, motion),
                      _after(time, output, motion, fit))
+    # what repeats within a piece, as a wobble of the shaft does, is no random walk
+    repeats = fit.angle_random_walk > drift.largest_walk
+    fit = replace(fit, angle_random_walk=drift.largest_walk) if repeats else fit
     walk = fit.angle_random_walk if method == 'likelihood' else drift.angle_random_walk
     model = _model(output, log.temperature, fit, noise or Noise(walk))
     # the steps of an encoder hide white noise
-    if noise is None and method == 'likelihood' and quantization_step(motion.heading) < ROUNDED:
+    if (noise is None and method == 'likelihood' and not repeats
+            and quantization_step(motion.heading) < ROUNDED):
         low, high = walk / np.sqrt(stats.chi2.ppf([0.975, 0.025], fit.freedom) / fit.freedom)
         model = replace(model, noise_bounds={'angle_random_walk': (float(low), float(high))})
     return EncoderCalibration(model, method, fit, drift, motion, before, after, _lost(time),
@@ -346,18 +358,23 @@ def _drift(motion: Motion, error: Array, bias: float, noise: Noise, technology: 
                                                                             / len(known))
     repeated = (rounding, max(float(np.ptp(heading)), 2.0 * rounding))
     columns, shared = wander(middle, cosines=COSINES)
+    # means over pieces: of a random walk, and of what repeats itself within them
+    walk = BandedNoise('angle_random_walk', np.maximum(apart - between, between),
+                       lasts[:-1] / 6.0, WHITE)
+    moved, steady = Tridiagonal(walk.diagonal, lasts[:-1] / 6.0).whiten(
+        np.column_stack([np.diff(heading), apart])).T
+    squares = moved @ moved - (moved @ steady) ** 2 / (steady @ steady)
     found = noise_grid(
         np.diff(heading), apart[:, None],
-        # means over pieces: of a random walk, and of what repeats itself within them
-        [BandedNoise('angle_random_walk', np.maximum(apart - between, between),
-                     lasts[:-1] / 6.0, WHITE),
-         BandedNoise('reference', 2.0 * ones, -ones, repeated)],
+        [walk, BandedNoise('reference', 2.0 * ones, -ones, repeated)],
         columns, shared, prior_mean=np.array([-bias]), prior_deviation=np.array([largest]),
         prior_sizes=(PriorSize('bias', 0, (0.1 * largest, largest)),))
     known_wander = sum(getattr(noise, part.name) ** 2 * part.unseen for part in shared)
     return Drift(0.5 * (middle[1:] + middle[:-1]), np.diff(heading) / apart,
-                 found.size('angle_random_walk'), bias + float(found.values[0]),
-                 float(found.deviations[0]), math.sqrt(max(found.unseen, known_wander)))
+                 found.size('angle_random_walk'),
+                 math.sqrt(squares / stats.chi2.ppf(0.025, len(moved) - 1)),
+                 bias + float(found.values[0]), float(found.deviations[0]),
+                 math.sqrt(max(found.unseen, known_wander)))
 
 
 def _with_drift(fit: Fit, drift: Drift) -> Fit:

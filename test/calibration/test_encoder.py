@@ -81,6 +81,16 @@ def test_bounds_of_the_angle_random_walk_hold_it_and_are_written_beside_a_fine_r
     assert not calibrate_encoder(CLEAN).model.noise_bounds, 'its steps hide white noise'
 
 
+def test_a_wobble_that_repeats_itself_is_no_angle_random_walk():
+    """A wobble of 0.5 deg with a period of 2.5 s."""
+    true = 5e-4
+    log = log_of(SWING, 200.0, Noise(angle_random_walk=true), np.random.default_rng(62), step=1e-5)
+    wobble = 0.5 * DEGREE * 0.8 * np.pi * np.cos(0.8 * np.pi * log.time)
+    model = calibrate_encoder(replace(log, output=log.output + wobble)).model
+    assert 0.7 * true < model.noise.angle_random_walk < 2.0 * true
+    assert not model.noise_bounds
+
+
 def test_the_model_has_the_angle_random_walk_that_is_stated_and_it_is_right():
     noise = Noise(angle_random_walk=5e-4)
     found = calibrate_encoder(log_of(SWING, 100.0, noise, np.random.default_rng(8)))
