@@ -9,11 +9,11 @@
 # under the License.
 
 """
-Read files within bounds, whoever wrote them, and write files that are complete or not there.
+Read files within limits of size, and write files atomically.
 
-What is no file (a pipe, a socket, a device, a folder) is neither waited for nor replaced. A
-symbolic link is followed when it is read, and replaced when it is written: what it points to stays
-as it is. A file that is replaced keeps its mode, and its owner and group where that is allowed.
+A pipe, a socket, a device or a folder is neither waited for nor replaced. A symbolic link is
+followed when it is read, and replaced when it is written; its target does not change. A file that
+is replaced keeps its mode, and its owner and group where that is allowed.
 
 """
 
@@ -32,19 +32,19 @@ import select
 import stat
 from typing import BinaryIO
 
-#: Beyond this no value of a gyro lies, not even a count of 64 bits, and products of some such
-#: values still are numbers.
+#: Largest magnitude of a value that is accepted. A count of 64 bits is below it, and products of
+#: several such values do not overflow.
 LARGEST = 1e20
-#: Times that compressed data may grow, where sensor data shrink to a tenth; and bytes that any may
-#: grow to.
+#: Largest ratio of decompressed to compressed size (sensor data compress to about a tenth), and
+#: the size in bytes that is allowed at any ratio.
 GROWTH, GROWN = 100, 1 << 24
-#: ms; how long a pipe is waited for until a program writes to it.
+#: Longest wait for a program to write to a pipe, ms.
 _PATIENCE = 900
 
-#: Kind of what is no regular file -> its name.
+#: File type, other than a regular file -> its name.
 _KINDS = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
           stat.S_IFCHR: 'a device', stat.S_IFBLK: 'a device'}
-#: Number of an error -> what to do about it.
+#: Error number -> remedy.
 _REMEDIES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), 'make room in {folder}'),
     **dict.fromkeys((errno.ENOTDIR, errno.EEXIST),
@@ -57,7 +57,7 @@ _REMEDIES = {
 
 
 class InputError(ValueError):
-    """What was given cannot be used; the message is one printable line: given, wanted, remedy."""
+    """The input cannot be used; the message is one printable line: given, wanted, remedy."""
 
     def __init__(self, message: object = ''):
         super().__init__(plain(message))
@@ -65,11 +65,11 @@ class InputError(ValueError):
 
 def plain(text: object, kept: str = '') -> str:
     r"""
-    Return a text as a terminal, a log of ROS or a page may show it.
+    Return a text that is safe to show in a terminal, a ROS log or a page.
 
-    What cannot be printed (escapes that steer a terminal, ends of lines, marks that turn the
-    direction of writing, bytes of a name that are no text) becomes its escape in Python, such as
-    \\x1b, but for the characters that are to be kept.
+    Characters that cannot be printed (terminal escapes, line ends, marks of writing direction,
+    undecodable bytes of a file name) are replaced by their Python escape, such as \\x1b, except
+    the characters to be kept.
 
     """
     return ''.join(each if each.isprintable() or each in kept else
@@ -77,20 +77,20 @@ def plain(text: object, kept: str = '') -> str:
 
 
 def reason(error: Exception) -> str:
-    """Return what went wrong, as a part of a sentence that names the file itself."""
+    """Return the text of an error, for a sentence that already names the file."""
     if isinstance(error, OSError) and error.strerror:
         return f'{error.strerror[0].lower()}{error.strerror[1:]}'
     return plain(' '.join(str(error).split())[:200] or type(error).__name__)
 
 
 def remedy(error: OSError, path: str | Path) -> str:
-    """Return what to do where a file cannot be read or written."""
+    """Return the remedy for a file that cannot be read or written."""
     words = _REMEDIES.get(error.errno or 0, 'make {path} readable and writable, or name another')
     return plain(words.format(path=path, folder=Path(path).parent))
 
 
 def explained(error: OSError) -> str:
-    """Return an error of the operating system as a sentence with its remedy if it names a file."""
+    """Return an OSError as a sentence, with a remedy if it names a file."""
     if error.filename is None or not error.strerror:
         return plain(error)
     path = str(error.filename)
@@ -99,14 +99,14 @@ def explained(error: OSError) -> str:
 
 def opened(path: str | Path, pipes: bool = False) -> BinaryIO:
     """
-    Open a regular file for reading, or also a pipe that somebody writes to.
+    Open a regular file for reading; on request also a pipe that has a writer.
 
     Raises
     ------
-    OSError : it cannot be opened, or is something else, which might never end
+    OSError : it cannot be opened, or is of another type, which might never end
 
     """
-    # To open a device may already do something; and what is open may be another file than before.
+    # Opening a device may already have an effect; and the file may be replaced between the checks.
     _refuse_kind(path, os.stat(path).st_mode, pipes)
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
@@ -140,14 +140,14 @@ def _refuse_kind(path: str | Path, mode: int, pipes: bool = False) -> None:
 
 
 def _is_written_to(handle: int) -> bool:
-    """Tell whether somebody has a pipe open to write, if only from soon on."""
+    """Tell whether a pipe has a writer, or gets one within the timeout."""
     waiting = select.poll()
     waiting.register(handle, select.POLLIN)
     if waiting.poll(_PATIENCE):
         return True
     try:
         os.read(handle, 1)
-    except BlockingIOError:  # who writes takes time
+    except BlockingIOError:  # there is a writer that has not written yet
         return True
     return False
 
@@ -179,7 +179,7 @@ def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
 
     Raises
     ------
-    OSError : as `replacing`; the old file is as it was
+    OSError : as `replacing`; the old file is unchanged
 
     """
     with replacing(path) as file:
@@ -190,11 +190,11 @@ def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
 
 def version(file: str | Path | int) -> tuple[int, int]:
     """
-    Return what is another after each write of a file, given by its path or open.
+    Return an identifier that differs after each write of a file, given by path or descriptor.
 
     Raises
     ------
-    OSError : there is none
+    OSError : the file does not exist
 
     """
     status = os.stat(file)
@@ -204,13 +204,13 @@ def version(file: str | Path | int) -> tuple[int, int]:
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
     """
-    Give a file to write to, which becomes `path` in one step when all is written.
+    Give a temporary file to write to, which replaces `path` in one step at the end.
 
-    After an error the old file is as it was.
+    After an error the old file is unchanged.
 
     Raises
     ------
-    OSError : the folder cannot be written to, or what is there is no file
+    OSError : the folder cannot be written to, or the path is not a regular file
 
     """
     path, temporary = Path(path), None
@@ -218,8 +218,8 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         path.parent.mkdir(parents=True, exist_ok=True)
         old = _replaceable(path)
         remove_leftovers(path)
-        # only its owner may read it, as may be so of the old file; a new one gets what the umask
-        # leaves
+        # A replacement is readable by its owner alone until it gets the mode of the old file; a
+        # new file gets the mode that the umask allows.
         handle, temporary = _created(path, 0o644 if old is None else 0o600)
         try:
             with os.fdopen(handle, 'wb') as file:
@@ -248,12 +248,12 @@ def _created(path: Path, mode: int) -> tuple[int, str]:
     while True:
         temporary = str(path.parent / f'{_stem(path)}{secrets.token_hex(4)}')
         handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-        with suppress(OSError):  # a file system without locks has leftovers instead
-            # until it is closed, or the process is killed
+        with suppress(OSError):  # without locks, leftovers of killed writers may remain
+            # locked until it is closed or the process ends
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(handle).st_nlink:
             return handle, temporary
-        os.close(handle)  # another writer took it for a leftover before it was locked
+        os.close(handle)  # another writer removed it as a leftover before it was locked
 
 
 def _replaceable(path: str | Path) -> os.stat_result | None:
@@ -262,29 +262,29 @@ def _replaceable(path: str | Path) -> os.stat_result | None:
 
     Raises
     ------
-    OSError : it is a pipe, a socket, a device or a folder, or a link to one; or it cannot be seen
+    OSError : it is a pipe, a socket, a device or a folder, or a link to one; or it cannot be read
 
     """
     try:
         if stat.S_ISREG((here := os.lstat(path)).st_mode):
             return here
         mode = os.stat(path).st_mode
-    except FileNotFoundError:  # also where a link leads nowhere
+    except FileNotFoundError:  # also a link without a target
         return None
     _refuse_kind(path, mode)
     return None
 
 
 def _stem(path: Path) -> str:
-    """Return what the names of temporary files begin with; a long name is cut to leave room."""
+    """Return the prefix of the names of temporary files; a long name is shortened."""
     return f'.{os.fsdecode(os.fsencode(path.name)[:200])}.'
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Remove what killed writers of a file left there, but nothing that is being written."""
+    """Remove the temporary files of killed writers, except those that are locked by a writer."""
     path = Path(path)
     leftover = re.compile(re.escape(_stem(path)) + '[a-z0-9_]{8}')
-    # a folder that cannot be read or written to is reported when it matters
+    # a folder that cannot be read or written to is reported when the file is written
     with suppress(OSError):
         for found in [each for each in path.parent.iterdir() if leftover.fullmatch(each.name)]:
             with suppress(OSError):

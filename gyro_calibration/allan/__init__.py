@@ -12,12 +12,12 @@
 Allan deviation of a gyro at rest, and its noise figures N, B, K, Q and R (IEEE Std 952, annex C).
 
 The output of a gyro at rest is its bias and its noise. The Allan variance at the averaging time
-tau is half the mean square of the difference between neighbouring means over tau. It is taken here
-at every sample (overlapping). Its uncertainty is computed: second differences of the angle are
-Gaussian, and the variances and covariances of their mean squares follow from theirs.
+tau is half the mean square of the difference between neighbouring means over tau. Here it is the
+overlapping one, at every sample. Its uncertainty follows from the covariance of the second
+differences of the angle, which are Gaussian.
 
 Reading order: `deviation` (samples at rest on an even grid, the chart, and the covariance of Allan
-variances), `noise_fit` (parts of the noise).
+variances), `noise_fit` (coefficients of the noise terms).
 
 """
 
@@ -43,10 +43,10 @@ __all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record
 
 class _Folder(ModuleType):
     """
-    This folder, which can be called as `gyro_calibration.api.allan`.
+    This package, which can be called as `gyro_calibration.api.allan`.
 
-    Python binds the name of an imported folder in its package, over the public function of the
-    same name. So both can be called, whichever was imported first.
+    An imported subpackage shadows the public function of the same name. So the subpackage is
+    callable too.
 
     """
 

@@ -13,8 +13,8 @@ Overlapping Allan deviation over averaging time, with bounds, of a record at res
 
 A record has samples on an even grid, without outliers and motion.
 
-Everything but the chart is in samples. An Allan variance is a mean square of second differences of
-the angle, and mean squares of Gaussian values have the covariance 2 c² summed over all pairs
+Times are in samples, except in the chart. An Allan variance is a mean square of second differences
+of the angle, and mean squares of Gaussian values have the covariance 2 c² summed over all pairs
 (Greenhall and Riley, Uncertainty of stability variances based on finite differences, PTTI 2003).
 
 """
@@ -45,14 +45,14 @@ from scipy.signal import medfilt
 from scipy.special import chdtri
 from scipy.stats import pearsonr
 
-#: The least number of samples for a noise figure.
+#: Least number of samples for a noise figure.
 FEWEST = 100
-#: Largest share of lost samples in a window; the variance of its mean changes by at most as much.
+#: Largest share of lost samples in a window; it is also the largest change of the variance.
 _LOST_SHARE = 0.01
-#: At least so many spans show whether a reference turns with the output: it does if most of the
-#: variance is common to both, and is so by chance at rest with at most this probability.
+#: Least number of spans in the test whether a reference turns with the output, and its level: the
+#: probability of such a correlation by chance at rest.
 _SPANS, _FOLLOWS = 8, 1e-4
-#: Share of a record that may be lost.
+#: Largest share of a record that may be lost.
 _MOST_LOST = 0.3
 
 
@@ -77,19 +77,19 @@ class Record:
 def even_record(time: Array, output: Array, moving: Array | None = None,
                 heading: Array | None = None) -> Record:
     """
-    Put samples on an even grid, lost ones marked.
+    Put samples on an even grid; lost ones are nan.
 
     Parameters
     ----------
     time : stamps, s, increasing, shape (n,)
     output : rad/s, shape (n,); nan counts as lost
-    moving : 1 where the log says that the gyro was moved; counts as lost
-    heading : by a reference, rad, which shows motion where the log does not say it
+    moving : 1 where the gyro was moved, by the log; counts as lost
+    heading : by a reference, rad; tested for motion where `moving` is absent
 
     Raises
     ------
-    DataRefused : too few samples, a dead gyro, stamps that belong to no even interval, too much
-        lost, or motion
+    DataRefused : too few samples, a dead gyro, stamps without an even interval, too many losses,
+        or motion
 
     """
     _refuse_few(len(output))
@@ -108,7 +108,7 @@ def even_record(time: Array, output: Array, moving: Array | None = None,
     _refuse_motion(rate, stamps)
     if heading is not None and moving is None:
         _refuse_turning(time, output, heading)
-    # no window reaches across a long gap, so that it need not be kept in full
+    # long gaps are cut, since no window crosses them
     kept = np.ones(len(rate), dtype=bool)
     for gap in runs(np.isnan(rate)):
         kept[gap.start + stamps.longest_gap:gap.stop] = False
@@ -117,7 +117,7 @@ def even_record(time: Array, output: Array, moving: Array | None = None,
     if share > _MOST_LOST:
         raise DataRefused(f'{100 * share:.0f} % of the samples are lost or without output; wanted '
                           f'at most {100 * _MOST_LOST:.0f} %: record again, or give --rate where '
-                          'the stamps are no use')
+                          'the stamps are wrong')
     return Record(rate, stamps.interval, tuple(remarks))
 
 
@@ -129,7 +129,7 @@ def _refuse_few(count: int, samples: str = 'samples') -> None:
 
 
 def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
-    """Refuse a record whose reference turns with the output over spans of some length."""
+    """Refuse a record whose reference heading correlates with the output at some span."""
     sums = np.concatenate([[0.0], np.nancumsum(output)])
     duration = time[-1] - time[0]
     shortest, longest = max(1.0, duration / len(time)), duration / _SPANS
@@ -149,7 +149,7 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
 
 
 def _refuse_dead(time: Array, output: Array) -> None:
-    """Refuse an output that stays the same for a tenth of the record."""
+    """Refuse an output that is constant over a tenth of the record."""
     _refuse_few(len(output), 'samples at rest with an output')
     changes = np.nonzero(np.concatenate([[True], np.diff(output) != 0.0, [True]]))[0]
     longest = int(np.argmax(np.diff(changes)))
@@ -162,15 +162,15 @@ def _refuse_dead(time: Array, output: Array) -> None:
 
 def _remove_outliers(rate: Array, stamps: Stamps) -> list[str]:
     """
-    Take out single samples far beyond the noise, and return a remark on them.
+    Remove single samples far beyond the noise, and return a remark on them.
 
-    A motion or a jolt lasts longer than two samples.
+    A motion or a jolt lasts longer than two samples and is not removed.
 
     """
     values = _filled(rate)
     off = np.abs(values - medfilt(values, 5))
     off[:2] = off[-2:] = 0.0
-    # not the median: where the output walks, half of these are zero
+    # a high quantile, since half of these are zero where the output is a random walk
     usual = float(np.quantile(off, 0.9)) / 1.645 or _scale(off)
     outliers = np.nonzero(off > 1.25 * CHANCE * usual)[0]
     if not outliers.size or outliers.size > 0.001 * len(rate):
@@ -186,7 +186,7 @@ def _scale(values: Array) -> float:
 
 
 def _refuse_motion(rate: Array, stamps: Stamps) -> None:
-    """Refuse a record whose means change by more than noise; give the place and longest rest."""
+    """Refuse a record whose means change by more than noise; name time and longest rest."""
     angle, lost = angle_of(rate), _lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
     for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / LONG)), 0))):
@@ -218,12 +218,7 @@ def _refuse_motion(rate: Array, stamps: Stamps) -> None:
 # lost samples
 
 def angle_of(rate: Array) -> Array:
-    """
-    Return the angle before each sample and after the last, less the mean rate, shape (n + 1,).
-
-    It is in rate units times samples.
-
-    """
+    """Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples."""
     angle = np.empty(len(rate) + 1)
     angle[0] = 0.0
     np.cumsum(_filled(rate), out=angle[1:])
@@ -231,7 +226,7 @@ def angle_of(rate: Array) -> Array:
 
 
 def _filled(rate: Array) -> Array:
-    """Return the rate less its mean; a gap gets the mean of five times its length on each side."""
+    """Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side."""
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
     if known.all():
@@ -254,7 +249,7 @@ def _lost_before(rate: Array) -> Integers | None:
 
 def whole(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mask:
     """
-    Return which second differences over `size` samples, from `begin` to `end`, miss few samples.
+    Return which second differences over `size` samples, from `begin` to `end`, have few losses.
 
     `lost` is the result of `_lost_before`.
 
@@ -263,13 +258,13 @@ def whole(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mas
                       <= _LOST_SHARE * 2 * size)
 
 
-#: Samples in a block: its few arrays stay in the cache for all averaging times.
+#: Samples in a block, whose arrays fit into the cache for all averaging times.
 _BLOCK = 16384
-#: numpy gives longer products to several threads, which costs more than it saves.
+#: Longest dot product that numpy computes in one thread, which is faster here.
 _PRODUCT = 8192
-#: Lags to a window, and to the longer one of two: more change the covariance by less than 1 %.
+#: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
 _FINE, _COARSE = 8, 512
-#: Places of quantization and ramp among the parts, and parts whose second differences are
+#: Indices of quantization and ramp among the terms, and of terms whose second differences are
 #: independent over longer times.
 _QUANTIZATION, _RAMP = PARTS.index(QUANTIZATION), PARTS.index(RATE_RAMP)
 _FORGETTING = [place for place, part in enumerate(PARTS)
@@ -279,9 +274,9 @@ _FORGETTING = [place for place, part in enumerate(PARTS)
 @dataclass(frozen=True)
 class Floor:
     """
-    The lowest point of a chart, by the upper bound.
+    The point of a chart with the lowest upper bound.
 
-    The deviation itself would not do: at the end of the chart single points are low by chance.
+    The lowest deviation is not used: at the end of the chart single points are low by chance.
 
     Attributes
     ----------
@@ -304,11 +299,11 @@ class AllanChart:
     Attributes
     ----------
     interval : between samples, s
-    samples : how many the record has, lost ones included
+    samples : number in the record, lost ones included
     size : averaging times in samples
     deviation : rad/s
-    differences : how many second differences the mean square is taken over
-    degrees_of_freedom : equivalent ones, of the mean square
+    differences : number of second differences in the mean square
+    degrees_of_freedom : equivalent degrees of freedom of the mean square
     lower, upper : bounds of the deviation with 95 % confidence, rad/s
 
     """
@@ -376,8 +371,8 @@ def allan_deviation(rate: Array, interval: float,
     sizes, counts = sizes[some], counts[some]
     variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
     freedom = _degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
-    # A few windows that fit between gaps are nearly the same ones and count less than a single
-    # one, but for rounding: their deviation has no upper bound.
+    # A few overlapping windows between gaps may have less than one degree of freedom: their
+    # deviation has no upper bound.
     bounded = freedom >= 1.0 - 1e-9
     sizes, counts = sizes[bounded], counts[bounded]
     variance, freedom = variance[bounded], freedom[bounded]
@@ -422,7 +417,7 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
     freedom = []
     for size, part in zip(sizes.tolist(), _parts_by_slope(sizes, variance)):
         count = samples + 1 - 2 * size
-        # quantization is white: its covariance is above zero at single lags only
+        # the covariance of quantization is nonzero at single lags only
         stride = 1 if part is QUANTIZATION else max(1, size // _FINE)
         lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
         squares = _lag_covariance(part.covariance, size, size, lags) ** 2 * (count - lags) * stride
@@ -433,10 +428,10 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
 
 def _parts_by_slope(sizes: Integers, variance: Array) -> list[Part]:
     """
-    Return the random part that fits the slope of each Allan variance best.
+    Return the random term that fits the slope of each Allan variance best.
 
-    The slope of the logarithm is that from half to twice each time, -1 for a lone one.
-    Quantization stands at the short end; a steep fall elsewhere is chance.
+    The slope of the logarithm is that from half to twice each time, -1 for a single one.
+    Quantization is assumed at the short end only; a steep slope elsewhere is chance.
 
     """
     low, high = (np.searchsorted(sizes, sizes / 2.0),
@@ -457,7 +452,7 @@ def _lag_covariance(covariance: Callable[[Integers], Array], first: int, second:
     """
     Return the covariance of second differences over `first` and `second` samples at lags.
 
-    Given is that of the angle.
+    `covariance` is that of the angle.
 
     """
     return np.sum([a * b * covariance(lags + (j * second - i * first))
@@ -470,9 +465,10 @@ def covariance_form(samples: int, first: int, second: int,
     """
     Return the covariance of two Allan variances as a form of squared coefficients, shape (5, 5).
 
-    Angle quantization is white: only lags at which two of its samples meet count. A ramp is no
-    noise, but multiplies it: the covariance of squares of values with a mean m also has 4 m² c.
-    With a process, its times in samples, the shape is (6, 6), and its coefficient is 1.
+    Angle quantization is white: only lags at which two of its samples coincide contribute. A ramp
+    is no noise, but adds a mean m to values with the covariance c, and 4 m² c to the covariance of
+    their squares. With a process, its times in samples, the shape is (6, 6), with a coefficient of
+    1.
 
     """
     counts, area = ((samples + 1 - 2 * first, samples + 1 - 2 * second),
@@ -493,15 +489,15 @@ def covariance_form(samples: int, first: int, second: int,
     values = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])
     values[_QUANTIZATION] = 0.0
     if stride > max(1, shorter // 2):
-        values[_FORGETTING] = 0.0  # independent over times so far apart
+        values[_FORGETTING] = 0.0  # independent at lags of this size
         if process is not None and process.correlation_time < stride:
             values[-1] = 0.0
     pairs = pairs_at(lags) * float(stride)
-    # lags at which two samples of quantization meet
+    # lags at which two samples of quantization coincide
     lags = np.unique([i * first - j * second for i in range(3) for j in range(3)])
     meeting = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])
     meeting_pairs = pairs_at(lags)
-    # not a product of matrices, which starts threads
+    # no matrix product, which would start threads
     form = np.array([[2.0 * (pairs * one * other).sum() for other in values] for one in values])
     form[_QUANTIZATION] = form[:, _QUANTIZATION] = 2.0 * (
         meeting * meeting[_QUANTIZATION] * meeting_pairs).sum(axis=1)

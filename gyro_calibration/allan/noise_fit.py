@@ -9,10 +9,10 @@
 # under the License.
 
 """
-The noise figures of a record: the coefficient of each part of the noise, and its bounds.
+The noise figures of a record: the coefficients of the noise terms, and their bounds.
 
-Allan variances at octaves are fitted by every combination of parts (`Description`), which are
-ranked by likelihood (`Ranking`); the best of them gives the figures.
+Every combination of terms is fitted to the Allan variances at octaves (`Description`). The fits
+are ranked by likelihood (`Ranking`), and the best one gives the figures.
 
 """
 
@@ -37,26 +37,26 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc
 
-#: What a further part must take off -2 ln likelihood. White noise alone then shows no further part
-#: in 95 of 100 records.
+#: Least decrease of -2 ln likelihood for a further term. For white noise alone no further term is
+#: then found in 95 of 100 records.
 _EVIDENCE = 10.0
-#: A combination of other parts explains a record as well if its -2 ln likelihood is within this.
+#: Largest difference in -2 ln likelihood of an alternative combination of terms.
 _ALIKE = 6.0
-#: A combination that is likelier by this, but lacks evidence, widens the bounds.
+#: A combination that is likelier by this, but has too many terms, widens the bounds.
 _WIDENS = 1.0
-#: -2 ln likelihood above its least at the ends of an interval of 95 %: that of chi squared.
+#: Increase of -2 ln likelihood at the ends of a 95 % interval: the quantile of chi squared.
 _CONFIDENCE = 3.84
-#: Least probability of a misfit as large as that of an accepted description.
+#: Least p-value of the residuals of an accepted fit.
 _CHANCE = 0.05
-#: Shares by which the Allan deviations may differ from the sum of the parts; the smallest one that
-#: suffices is taken.
+#: Relative differences between the Allan deviations and the sum of the terms that are tried; the
+#: smallest sufficient one is used.
 _MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
-#: The least number of octaves that shows a slope and its end.
+#: Least number of octaves that show a slope and its end.
 _FEWEST_OCTAVES = 4
-#: Places of the parts and of a Gauss-Markov process; then what a filter takes from the variance:
-#: over times beyond its memory that has the slope of quantization, with the other sign.
+#: Indices of the terms, of a Gauss-Markov process, and of the reduction of the variance by a
+#: filter: at times beyond its memory it has the slope of quantization, with a negative sign.
 _N, _B, _K, _Q, _R, _PROCESS, _BEND = range(len(PARTS) + 2)
-#: Combinations of parts, without and with quantization, and with a bend of a random walk.
+#: Combinations of terms, without and with quantization, and with the bend of a filter.
 _COMBINATIONS = [
     combination for count in range(len(PARTS))
     for places in itertools.combinations((_N, _B, _K, _R), count)
@@ -73,12 +73,12 @@ class Octaves:
     ----------
     samples : of the record
     size : averaging times, shape (n,)
-    scarcity : how much wider an Allan deviation scatters where windows are lost, shape (n,)
+    scarcity : factor of the scatter of an Allan deviation by lost windows, shape (n,)
     variance : shape (n,)
-    columns : of each part, a process, and a bend, for a coefficient of 1, shape (n, 7)
+    columns : of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
     forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or (n,
         n, 6, 6) with a process
-    process : one of 1 rad/s, None for none
+    process : a process of 1 rad/s, or None
 
     """
 
@@ -100,7 +100,7 @@ class Octaves:
         return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns, forms)
 
     def since(self, start: int) -> Octaves:
-        """Leave out the shortest averaging times."""
+        """Return the octaves without the shortest averaging times."""
         return Octaves(self.samples, self.size[start:], self.scarcity[start:],
                        self.variance[start:], self.columns[start:], self.forms[start:, start:])
 
@@ -111,7 +111,7 @@ class Octaves:
         return columns
 
     def with_process(self, process: GaussMarkov) -> Octaves:
-        """Add such a process, and its terms of the covariance."""
+        """Add a process of 1 rad/s, and its part of the covariance."""
         forms = _forms(self.samples, tuple(self.size.tolist()), process)
         return replace(self, columns=self.with_column(process), process=process,
                        forms=forms * np.outer(self.scarcity, self.scarcity)[:, :, None, None])
@@ -122,7 +122,7 @@ class Octaves:
         return np.einsum('ijpq,p,q->ij', self.forms, known, known)
 
     def model(self, squares: Array) -> Array:
-        """Return the sum of the parts for these squared coefficients, kept above zero."""
+        """Return the sum of the terms for these squared coefficients, kept above zero."""
         return np.maximum(self.columns @ squares, 1e-3 * self.variance)
 
 
@@ -139,11 +139,11 @@ def _forms(samples: int, sizes: tuple[int, ...], process: GaussMarkov | None = N
 @dataclass(frozen=True)
 class Description:
     """
-    A combination of parts, fitted to octaves.
+    A combination of terms, fitted to octaves.
 
     Attributes
     ----------
-    octaves : the Allan variances that it describes
+    octaves : the fitted Allan variances
     squares : squared coefficients, shape (6,)
     half : Cholesky factor of the covariance of the variances
 
@@ -155,14 +155,14 @@ class Description:
 
     @property
     def held(self) -> list[int]:
-        """Return the places of the parts with a coefficient above zero."""
+        """Return the indices of the terms with a coefficient above zero."""
         return np.nonzero(self.squares)[0].tolist()
 
     def _scores(self) -> tuple[Array, float]:
         """
-        Return standard normal scores, and -2 ln of the density that they stand for.
+        Return standard normal scores, and -2 ln of the normalization of their density.
 
-        A mean square is no Gaussian value; its cube root nearly is (Wilson and Hilferty, 1931).
+        The cube root of a mean square is nearly Gaussian (Wilson and Hilferty, 1931).
 
         """
         model, deviation = self.octaves.model(self.squares), np.sqrt((self.half ** 2).sum(axis=1))
@@ -175,29 +175,29 @@ class Description:
 
     @cached_property
     def surprise(self) -> float:
-        """Return -2 ln likelihood, up to a constant of all combinations."""
+        """Return -2 ln likelihood, up to a constant that all combinations share."""
         normal, density = self._scores()
         return float(normal @ normal) + density
 
     def cost(self) -> float:
         """
-        Return -2 ln likelihood with the evidence that each part must bring.
+        Return -2 ln likelihood plus a penalty for each term.
 
-        A ramp must bring more, since in a single record a random walk looks like one. A
-        Gauss-Markov process has two figures.
+        The penalty of a ramp is larger, since in a single record a random walk looks like one. A
+        Gauss-Markov process counts as two terms.
 
         """
         return (self.surprise + _EVIDENCE * (len(self.held) + (_PROCESS in self.held))
                 + _ALIKE * (_R in self.held))
 
     def likely(self) -> bool:
-        """Return whether chance explains the residuals."""
+        """Return whether the residuals are within chance."""
         normal, _ = self._scores()
         freedom = len(normal) - len(self.held) - (_PROCESS in self.held)
         return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > _CHANCE
 
     def estimate(self, places: Sequence[int]) -> tuple[Array, Array]:
-        """Return the squares of parts by least squares, also negative; standard deviations."""
+        """Return the squared coefficients by least squares, of any sign, and their deviations."""
         white = np.linalg.solve(self.half, self.octaves.columns[:, list(places)])
         size = np.linalg.norm(white, axis=0)
         inverse = np.linalg.pinv((white / size).T @ (white / size))
@@ -205,7 +205,7 @@ class Description:
         return found / size, np.sqrt(inverse.diagonal()) / size
 
     def deviation(self, place: int) -> float:
-        """Return the standard deviation of the square of a part that is held."""
+        """Return the standard deviation of the squared coefficient of a term of the fit."""
         return float(self.estimate(self.held)[1][self.held.index(place)])
 
     def bounds(self, place: int) -> tuple[float, float]:
@@ -219,9 +219,9 @@ class Description:
 def describe(octaves: Octaves, places: tuple[int, ...], misfit: float, held_at: int = -1,
              square: float = 0.0) -> Description:
     """
-    Fit a combination of parts, none negative, with the covariance that the fitted noise implies.
+    Fit a combination of nonnegative terms, with the covariance of the fitted noise.
 
-    For `misfit` see `NoiseFit`. A further part may be held at a squared coefficient.
+    For `misfit` see `NoiseFit`. A further term may be fixed at a squared coefficient.
 
     """
     given = np.zeros(_BEND + 1)
@@ -243,7 +243,7 @@ def describe(octaves: Octaves, places: tuple[int, ...], misfit: float, held_at: 
         try:
             half = np.linalg.cholesky(covariance)
         except np.linalg.LinAlgError:
-            # nearly singular, as that of a ramp alone: correlations are kept away from one
+            # nearly singular, as for a ramp alone: limit the correlations below 1
             size = np.sqrt(np.maximum(covariance.diagonal(), 1e-12 * model ** 2))
             values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
             half = size[:, None] * np.linalg.cholesky(
@@ -254,11 +254,11 @@ def describe(octaves: Octaves, places: tuple[int, ...], misfit: float, held_at: 
 @dataclass(frozen=True)
 class Ranking:
     """
-    All combinations of parts, fitted to the same octaves.
+    All combinations of terms, fitted to the same octaves.
 
     Attributes
     ----------
-    start : the first octave that they describe
+    start : the first octave that is fitted
     misfit : see `NoiseFit`
     descriptions : the likeliest first
     processes : the best with a Gauss-Markov process in place of its flicker and rate random walk,
@@ -273,21 +273,21 @@ class Ranking:
 
     @property
     def best(self) -> Description:
-        """Return the likeliest."""
+        """Return the fit with the least penalized -2 ln likelihood."""
         return self.descriptions[0]
 
     @property
     def process(self) -> Description | None:
-        """Return the likeliest with a process, where it costs less than the best."""
+        """Return the best fit with a process, if it is better than the best without."""
         found = min(self.processes, key=Description.cost, default=None)
         return found if found and found.cost() < self.best.cost() else None
 
     def without(self, place: int) -> bool:
         """
-        Tell whether a process may stand in place of a part.
+        Tell whether a process may replace a term.
 
-        A random walk is a process with an endless correlation time, so that the likelihood alone
-        counts; in place of flicker, its two figures must bring their evidence.
+        A random walk is a process with an infinite correlation time, so the likelihoods are
+        compared. In place of flicker, the penalized likelihoods are compared.
 
         """
         best = self.best
@@ -297,13 +297,13 @@ class Ranking:
 
     @property
     def seen(self) -> list[int]:
-        """Return the places of the best's parts; after a bent end quantization is no figure."""
+        """Return the indices of the detected terms; quantization only from the first octave on."""
         return [place for place in self.best.held if place != _BEND
                 and (place != _Q or self.start == 0)]
 
     @cached_property
     def alternatives(self) -> list[Description]:
-        """Return the combinations of other parts, not more, that are nearly as likely."""
+        """Return the combinations of other terms, not more of them, that are nearly as likely."""
         best = self.best
         return [each for each in self.descriptions
                 if each.surprise < best.surprise + _ALIKE and len(each.held) <= len(best.held)
@@ -311,7 +311,7 @@ class Ranking:
 
     @cached_property
     def possible(self) -> list[Description]:
-        """Return the best, those likelier without evidence, and those with an alternative."""
+        """Return the best, likelier ones with more terms, and those joined with alternatives."""
         best = self.best
         both = [{*best.held, *other.held} for other in self.alternatives]
         return [best, *(each for each in self.descriptions
@@ -320,14 +320,14 @@ class Ranking:
 
 def rank(octaves: Octaves) -> Ranking:
     """
-    Rank all combinations of parts.
+    Rank all combinations of terms.
 
-    The first octave is the earliest one that chance allows; if none is, a misfit is added. The
-    filters that bend the short end fade slowly: one octave more than that is left out.
+    The first octave is the earliest one from which the residuals are within chance; if there is
+    none, a misfit is added. Filters bend the short end gradually: one more octave is left out.
 
     Raises
     ------
-    DataRefused : no combination describes the octaves
+    DataRefused : no combination fits the octaves
 
     """
     last = max(len(octaves.variance) // 2 - 1, 0)
@@ -336,8 +336,8 @@ def rank(octaves: Octaves) -> Ranking:
         if ranking.best.likely() or (ranking.process is not None and ranking.process.likely()):
             return _rank_since(octaves, start + 1, misfit) if 0 < start < last else ranking
     raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum '
-                      'of the five kinds of noise: there is something else in the record, such as '
-                      'a swing or a vibration; record again at rest')
+                      'of the five noise terms: the record contains something else, such as a '
+                      'swing or a vibration; record again at rest')
 
 
 def _rank_since(octaves: Octaves, start: int, misfit: float) -> Ranking:
@@ -353,12 +353,12 @@ def _rank_since(octaves: Octaves, start: int, misfit: float) -> Ranking:
 
 def _with_process(best: Description, kept: tuple[int, ...], misfit: float) -> Description | None:
     """
-    Return the likeliest description by some parts and a Gauss-Markov process, None without one.
+    Return the best fit of some terms and a Gauss-Markov process, or None without one.
 
-    The peak of its Allan deviation, at 1.9 correlation times, is in the chart: a process with a
-    longer correlation time is a random walk. It makes less than half of the first Allan variance:
-    white noise behind a lag of first order is such a process too. To find the time, the covariance
-    of the best is taken, scaled by the Allan deviations.
+    The peak of the Allan deviation of the process, at 1.9 correlation times, must be in the chart:
+    a process with a longer correlation time is a random walk. It must make less than half of the
+    first Allan variance: white noise after a first-order lag is such a process too. The
+    correlation time is found with the covariance of the best fit, scaled by the Allan deviations.
 
     """
     octaves, places = best.octaves, (*kept, _PROCESS)
@@ -385,16 +385,16 @@ def _with_process(best: Description, kept: tuple[int, ...], misfit: float) -> De
 @dataclass(frozen=True)
 class Figure:
     """
-    The coefficient of one part of the noise.
+    The coefficient of one noise term.
 
     Attributes
     ----------
-    part : which
-    value : its coefficient, in the part's unit; 0 where the record shows none
-    standard_deviation : of the coefficient, if there are no parts but those that are seen; nan
-        where the record shows none
-    lower, upper : bounds with 95 % confidence, also if there is a little of other parts; where the
-        record shows none, 0 and the largest coefficient that it can hide
+    part : the term
+    value : its coefficient, in the unit of the term; 0 where it is not detected
+    standard_deviation : of the coefficient, if only the detected terms are present; nan where it
+        is not detected
+    lower, upper : bounds with 95 % confidence, which allow for undetected terms; where it is not
+        detected, 0 and the largest undetectable coefficient
 
     """
 
@@ -405,7 +405,7 @@ class Figure:
     upper: float
 
     def variance(self, time: Array) -> Array:
-        """Return the Allan variance that it makes, (rad/s)²."""
+        """Return the Allan variance of the term, (rad/s)²."""
         return self.value ** 2 * self.part.variance(time)
 
 
@@ -418,13 +418,12 @@ class NoiseFit:
     ----------
     figures : by symbol: N, B, K, Q, R
     chart : the Allan deviations that were fitted, at octaves
-    shortest, longest : the averaging times that the fit holds for, s
-    misfit : by how much more the Allan deviations differ from the sum of the parts than chance
-        allows, as a share of them
-    alternatives : the symbols of other combinations of parts that explain the record nearly as
-        well
-    process : a Gauss-Markov process in place of flicker and rate random walk, where the record
-        asks for one; these two then stand for it at averaging times of the chart
+    shortest, longest : the range of averaging times of the fit, s
+    misfit : relative difference between the Allan deviations and the sum of the terms, beyond
+        chance
+    alternatives : the symbols of other combinations of terms that fit the record nearly as well
+    process : a Gauss-Markov process in place of flicker and rate random walk, where it fits
+        better; these two then approximate it at the averaging times of the chart
 
     """
 
@@ -438,7 +437,7 @@ class NoiseFit:
 
     @property
     def noise(self) -> Noise:
-        """Return the figures that a model holds."""
+        """Return the noise figures of a model."""
         return Noise(*(self.figures[symbol].value for symbol in 'NBK'))
 
     @property
@@ -448,7 +447,7 @@ class NoiseFit:
                 for name, symbol in zip(Noise.__dataclass_fields__, 'NBK')}
 
     def deviation(self, time: Array) -> Array:
-        """Return the Allan deviation, rad/s, that the figures add up to."""
+        """Return the Allan deviation of the sum of the terms, rad/s."""
         return np.sqrt(sum(figure.variance(time) for figure in self.figures.values()))
 
     @property
@@ -462,14 +461,13 @@ class NoiseFit:
 
 def fit_noise(rate: Array, interval: float) -> NoiseFit:
     """
-    Fit the parts of the noise to the Allan variances at octaves, and keep those that are seen.
+    Fit the noise terms to the Allan variances at octaves, and keep those that are detected.
 
     The squared coefficients are found by generalized least squares (as in the generalized method
     of wavelet moments of Guerrier, Skaloud, Stebler and Victoria-Feser, JASA 2013), none of them
-    negative, with the covariance that the fitted noise itself implies. Of all combinations the
-    likeliest is kept, if each further part makes the data likelier by more than chance does. The
-    shortest averaging times are left out until the sum of the parts describes the rest, because
-    the filters of a gyro bend that end.
+    negative, with the covariance of the fitted noise itself. The combination with the largest
+    penalized likelihood is used. The shortest averaging times, which the filters of a gyro bend,
+    are left out until the sum of the terms fits the rest.
 
     Parameters
     ----------
@@ -478,7 +476,7 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
 
     Raises
     ------
-    DataRefused : too few samples, or no sum of the parts describes them
+    DataRefused : too few samples, or no sum of terms fits them
 
     """
     chart = allan_deviation(rate, interval, 2.0 ** np.arange(
@@ -499,7 +497,7 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
 
 
 def _process(ranking: Ranking, interval: float) -> GaussMarkov | None:
-    """Return the process that a record asks for."""
+    """Return the process in SI, if the best fit has one."""
     if ranking.process is None or ranking.process.octaves.process is None:
         return None
     time = ranking.process.octaves.process.correlation_time * interval
@@ -507,9 +505,9 @@ def _process(ranking: Ranking, interval: float) -> GaussMarkov | None:
 
 
 def _figure(ranking: Ranking, place: int, interval: float) -> Figure:
-    """Return a figure with bounds that hold with and without parts of too little evidence."""
+    """Return a figure with bounds that hold with and without undetected terms."""
     part, process = PARTS[place], ranking.process
-    # flicker and rate random walk stand for a process, and the other parts are fitted with it
+    # flicker and rate random walk approximate a process; the other terms are fitted with it
     with_process = process is not None and place not in (_B, _K)
     best = process if process is not None and with_process else ranking.best
     value, deviation = 0.0, math.nan
@@ -532,9 +530,8 @@ def _bounds(ranking: Ranking, place: int, with_process: bool) -> tuple[float, fl
     """
     Return the coefficients between which -2 ln likelihood is within `_CONFIDENCE` of the least.
 
-    At each coefficient the other parts are fitted anew, N, B and K among them, which may be there
-    without being seen, so that what one of them takes from another is in the bounds; so is a
-    process, where it is fitted with the part.
+    At each coefficient the other terms are fitted anew (profile likelihood): those of the best
+    fits, N, B and K, detected or not, and a process where it is fitted with the term.
 
     """
     octaves, misfit = ranking.best.octaves, ranking.misfit

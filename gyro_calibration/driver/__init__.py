@@ -9,7 +9,7 @@
 # under the License.
 
 """
-From bytes on a serial port to stamped samples, whatever happens to the port.
+From bytes on a serial port to stamped samples, with recovery from faults of the port.
 
 Reading order: `protocols` (wire formats), `timestamps`, `connection`, `recorder`,
 `emulator`.

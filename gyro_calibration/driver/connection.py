@@ -9,9 +9,10 @@
 # under the License.
 
 """
-A gyro on a serial port: opened, recognized, read, and opened again after the port was lost.
+A gyro on a serial port: opens, recognizes and reads it, and opens it again after a loss.
 
-No ROS, and no thread: `Connection.chunks` gives the samples, in a thread of the caller or not.
+This module has no ROS and starts no thread: `Connection.chunks` gives the samples in the thread of
+the caller.
 
 """
 
@@ -50,7 +51,7 @@ _REMEDIES = {
 
 
 class PortError(OSError):
-    """A port that cannot be opened, or is lost; the message is one sentence."""
+    """A port cannot be opened, or was lost; the message is one sentence."""
 
 
 class SerialPort:
@@ -73,7 +74,7 @@ class SerialPort:
         self._port: serial.Serial | None = None
 
     def open(self) -> None:  # noqa: A003
-        """Open the port for this program alone, and drop what came before."""
+        """Open the port exclusively, and discard earlier input."""
         self.close()
         try:
             self._port = serial.Serial(self.path, self.baud, timeout=self._timeout,
@@ -82,9 +83,9 @@ class SerialPort:
             raise PortError(f'cannot open {self.path}: {_reason(error)}') from error
 
     def read(self) -> bytes:
-        """Return the bytes that are there, after a short time for the first; none if none came."""
+        """Return the available bytes; wait for the first one up to the timeout."""
         def take(port: serial.Serial) -> bytes:
-            # pyserial's own read gives the first byte alone, and needs two more calls for the rest
+            # read of pyserial returns the first byte alone, and needs two more calls for the rest
             if not select.select([port], [], [], self._timeout)[0]:
                 return b''
             data = os.read(port.fileno(), 65536)
@@ -99,7 +100,7 @@ class SerialPort:
         self._guarded(lambda port: port.write(data))
 
     def set_baud(self, baud: int) -> None:
-        """Change the speed of the port and drop what came; the device sees no opening."""
+        """Change the baud rate and discard input, without opening the port again."""
         self.baud = baud
 
         def change(port: serial.Serial) -> None:
@@ -125,7 +126,7 @@ class SerialPort:
 
 
 def _reason(error: BaseException) -> str:
-    """Return why a port failed, and a remedy; pyserial hides some error numbers in the cause."""
+    """Return why a port failed, with a remedy; pyserial has some error numbers in the cause."""
     cause: BaseException | None = error
     while cause is not None:
         number = getattr(cause, 'errno', None) or next(iter(cause.args), None)
@@ -136,53 +137,54 @@ def _reason(error: BaseException) -> str:
 
 
 AUTO = 'auto'
-"""In place of the name of a protocol: find out by listening."""
+"""Name of the protocol that stands for recognition by listening."""
 
-_SILENCE = 2.0  # s; without a sample, after which the port is opened anew
-_PERIODS = 3.0  # without a sample, for a gyro that is slower than that
-_REOPEN = (0.1, 5.0)  # s; first and longest time before a lost port is opened again
-_RESTART = 5.0  # s; a board that restarts when its port is opened is silent for this time at most
-_ASKING = 0.8  # s; between two requests to send: a gyro that starts does not receive them
-_LISTENING = 1.0  # s; a gyro of 10 Hz has sent enough by then
-_POLLING = 0.1  # s; between two attempts to recognize what came
-_MOST_BYTES = 16384  # of what came last, to be recognized
+_SILENCE = 2.0  # s; time without a sample, after which the port is opened again
+_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
+_REOPEN = (0.1, 5.0)  # s; first and longest delay before a lost port is opened again
+_RESTART = 5.0  # s; longest silence of a board that restarts when its port is opened
+_ASKING = 0.8  # s; interval of requests to send: a gyro that starts does not receive them
+_LISTENING = 1.0  # s; listening time, in which a gyro of 10 Hz sends enough
+_POLLING = 0.1  # s; interval of attempts to recognize the protocol
+_MOST_BYTES = 16384  # last bytes that are used to recognize the protocol
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Samples that came at one time, by the steady clock of the host, s."""
+    """Samples that arrived at one time, by the steady clock of the host, s."""
 
     samples: list[Sample]
-    stamps: list[float]  # when they were sent; they increase strictly over all chunks
+    stamps: list[float]  # times of sending; strictly increasing over all chunks
     arrival: float
 
 
 @dataclass(frozen=True)
 class State:
-    """How a connection stands: opening, listening, reading (samples come) or failed."""
+    """State of a connection: opening, listening, reading (samples come) or failed."""
 
     name: str
-    problem: str = ''  # one sentence while it has failed
-    waiting: float = 0.0  # s; until the port is opened anew, and an open one read, when failed
+    problem: str = ''  # one sentence while failed
+    waiting: float = 0.0  # s; while failed: time until the port is opened again
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What has happened since the start."""
+    """Counts since the start."""
 
     samples: int = 0
     lost_samples: int = 0
     refused_samples: int = 0  # not finite, or beyond full scale
-    refused_temperatures: int = 0  # not finite, or beyond what a sensor can report
-    device_faults: int = 0  # samples that the gyro itself calls invalid
-    discarded_bytes: int = 0  # in no frame
+    refused_temperatures: int = 0  # not finite, or beyond the range of any sensor
+    device_faults: int = 0  # samples that the gyro marks as invalid
+    discarded_bytes: int = 0  # outside of frames
 
 
 def resolve(port: str) -> str:
     """
-    Return the port that a pattern such as ``/dev/serial/by-id/*A9003XYZ*`` stands for now.
+    Return the port that matches a pattern such as ``/dev/serial/by-id/*A9003XYZ*``.
 
-    What is no pattern stands for itself. `PortError` says that none matches, or several devices.
+    A path without wildcards is returned unchanged. `PortError` states that no port matches, or
+    several devices.
 
     """
     if os.path.exists(port) or not glob.has_magic(port):
@@ -198,11 +200,11 @@ def resolve(port: str) -> str:
 
 class _Silence:
     """
-    The time without a sample, since the port was opened or since the last one came.
+    Timer of the silence since the port was opened or since the last sample.
 
-    It ends with the port being opened anew, at `end`, after `timeout`, s. Until the second sample,
-    which shows the period from one to the next, it takes 5 s more: a board that the opening
-    restarts must have begun to send, for it would be restarted again.
+    At `end`, after `timeout`, s, the port is opened again. Until the second sample, which shows
+    the period, the timer allows 5 s more: opening the port again would restart a board that is
+    still starting.
 
     """
 
@@ -211,21 +213,21 @@ class _Silence:
         self.restart(period, now)
 
     def restart(self, period: float, now: float, samples: int = 0) -> None:
-        """Begin anew, as some samples came."""
+        """Start the timer again, after some samples."""
         self._samples += samples
         self.timeout = max(_SILENCE, _PERIODS * period)
         self.end = now + self.timeout + (_RESTART if self._samples < 2 else 0.0)
         self._begin, self._polls = now, 0
 
     def is_to_ask(self, now: float) -> bool:
-        """Tell whether the gyro is to be asked once more to send."""
+        """Tell whether another request to send is due; then count it as sent."""
         if self._samples or now - self._asked < _ASKING:
             return False
         self._asked = now
         return True
 
     def poll(self, now: float) -> bool:
-        """Tell whether half of the timeout has passed since the last time, or all time is over."""
+        """Tell whether another half of the timeout, or all time, has passed."""
         if now < min(self._begin + 0.5 * self.timeout * (self._polls + 1), self.end):
             return False
         self._polls += 1
@@ -233,7 +235,7 @@ class _Silence:
 
     @property
     def is_problem(self) -> bool:
-        """Whether it has lasted for the timeout."""
+        """Whether the silence has lasted for the timeout."""
         return self._polls > 1
 
 
@@ -241,12 +243,12 @@ class Connection:
     """
     Gives the samples of a gyro, with stamps, until it is stopped.
 
-    After the port was lost, or no sample came for 2 s (three periods of a gyro that is slower), it
-    is opened again after 0.1 s, then after twice as long each time, up to 5 s, until samples come.
-    Many a board restarts when its port is opened, so the port then stays open for 5 s more, and
-    the gyro is asked each second to send, until the first sample comes. With the protocol
-    ``'auto'`` it listens first, at each baud in turn unless one is given, and sends nothing
-    meanwhile. What was recognized stays as long as samples of it come after the port was lost.
+    If the port is lost, or no sample comes for 2 s (three periods of a slower gyro), it is opened
+    again after 0.1 s, then with twice the delay each time, up to 5 s, until samples come. Many
+    boards restart when their port is opened, so the port then stays open for 5 s more, and the
+    gyro is requested to send each second, until the first sample. With the protocol ``'auto'`` it
+    first listens, at each baud in turn unless one is given, and sends nothing. The recognized
+    protocol is kept after a loss of the port, as long as its samples come.
 
     Parameters
     ----------
@@ -254,24 +256,24 @@ class Connection:
     protocol : name of a protocol, or ``'auto'``
     baud : bits per second; 0 for that of the protocol
     settings : Settings or None
-    on_change : gets each new `State`, in the thread that takes the samples
+    on_change : is called with each new `State`, in the thread that reads
     clock : returns seconds of a steady clock
-    make_port : returns what reads a port, given its path and baud
+    make_port : makes a `SerialPort` of a path and a baud
 
     Attributes
     ----------
     state : State
     protocol, clock, baud : None and 0 until the protocol is known
-    path : the device behind the port when it was last opened, links followed
-    detected : what was recognized by listening, in a sentence
-    openings : how often the port was opened
-    waited : seconds that were waited for the port altogether
-    longest_gap : longest time between two samples, s; 0 where it was never more than 1.5 periods
+    path : the device of the port when it was last opened, links resolved
+    detected : result of the recognition by listening, in a sentence
+    openings : number of times that the port was opened
+    waited : total waiting time for the port, s
+    longest_gap : longest time between two samples, s; 0 while none exceeds 1.5 periods
     last_error : str
 
     Raises
     ------
-    ValueError : the protocol is not known, or the settings do not suffice for it
+    ValueError : the protocol is unknown, or settings that it needs are missing
 
     """
 
@@ -306,7 +308,7 @@ class Connection:
             self._use(known, baud or known.baud)
 
     def counts(self) -> Counts:
-        """Return what has happened since the start; may be called from any thread."""
+        """Return the counts since the start; may be called from any thread."""
         past, decoder, clock = self._past, self._decoder, self.clock
         if decoder is None or clock is None:
             return replace(past, samples=self._samples)
@@ -318,9 +320,9 @@ class Connection:
 
     def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
         """
-        Give samples as they come, until the event is set; the port is then closed.
+        Give samples as they arrive, until the event is set; the port is then closed.
 
-        A chunk may be long in coming: while the port is missing there is none.
+        While the port is missing, no chunk is given.
 
         """
         try:
@@ -344,7 +346,7 @@ class Connection:
         self.protocol, self.baud = protocol, baud
 
     def _open(self, stop: threading.Event) -> SerialPort:
-        """Open the port, listen if the protocol is not known, and make the gyro send."""
+        """Open the port, listen if the protocol is unknown, and request the gyro to send."""
         path = resolve(self._pattern)
         self.path = os.path.realpath(path)
         self._port = port = self._make_port(path, self.baud if self.protocol else self._bauds[0])
@@ -361,10 +363,10 @@ class Connection:
 
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
         """
-        Find out at which baud which protocol comes; it stays unknown only after a stop.
+        Find protocol and baud; they stay unknown only after a stop.
 
-        The port stays open meanwhile, since opening it restarts many a microcontroller, and one
-        that restarts needs some time until it sends.
+        The port stays open, since opening it restarts many microcontrollers, which then need some
+        time until they send.
 
         """
         self._change(State('listening'))
@@ -391,7 +393,7 @@ class Connection:
                 f'{", ".join(map(str, self._bauds))} bit/s; nearest: {best.words}', end)
 
     def _recognize(self, port: SerialPort, restarted: float, stop: threading.Event) -> Recognition:
-        """Return what is recognized within a second from the first byte on."""
+        """Return the result of the recognition within 1 s after the first byte."""
         data, opened, end, due = b'', self._now(), math.inf, 0.0
         while not stop.is_set():
             data = (data + port.read())[-_MOST_BYTES:]
@@ -406,7 +408,7 @@ class Connection:
         return recognize(b'', self._settings)
 
     def _report_or_raise(self, problem: str, end: float) -> None:
-        """Report a problem while the port stays open until a time; then raise `PortError`."""
+        """Report a problem while the port stays open; raise `PortError` after a time."""
         now = self._now()
         if now >= end:
             raise PortError(problem)
@@ -415,7 +417,7 @@ class Connection:
 
     def _read(self, port: SerialPort, stop: threading.Event) -> Iterator[Chunk]:
         decoder, clock = self._decoder, self.clock
-        if decoder is None or clock is None:  # stopped while it still listened
+        if decoder is None or clock is None:  # stopped while listening
             return
         silence, counts = _Silence(clock.period, self._now()), self._unusable(decoder)
         while not stop.is_set():
@@ -437,7 +439,7 @@ class Connection:
                     self._report_or_raise(problem, silence.end)
 
     def _unusable(self, decoder: Decoder) -> tuple[int, int, int]:
-        """Return the counts of bytes, values that the gyro calls invalid, and refused values."""
+        """Return the counts of bytes, values marked as invalid, and refused values."""
         return self._read_bytes, decoder.faults, decoder.refused_samples
 
     def _why_silent(self, decoder: Decoder, before: tuple[int, int, int], limit: float) -> str:
@@ -492,7 +494,7 @@ class Connection:
 
 
 class Mean(NamedTuple):
-    """The mean stamp, s, and the mean sample, of a number of samples."""
+    """The mean stamp, s, and the mean of a number of samples."""
 
     stamp: float
     sample: Sample
@@ -500,7 +502,7 @@ class Mean(NamedTuple):
 
 
 class Decimation:
-    """Joins so many samples in a group; where some are lost, it has fewer and is not longer."""
+    """Averages groups of samples; a group with losses has fewer samples and the same length."""
 
     def __init__(self, size: int):
         self._size = size
@@ -508,7 +510,7 @@ class Decimation:
 
     def add(self, samples: Sequence[Sample], stamps: Sequence[float],
             period: float) -> Iterator[Mean]:
-        """Take samples with their stamps and the period of the gyro, s; give complete groups."""
+        """Add samples with stamps and the period of the gyro, s; give means of complete groups."""
         longest = (self._size - 0.5) * period
         for sample, stamp in zip(samples, stamps, strict=True):
             if self._group and not 0.0 < stamp - self._group[0][0] < longest:
@@ -518,14 +520,14 @@ class Decimation:
                 yield from self.flush()
 
     def flush(self) -> Iterator[Mean]:
-        """Give a group that has begun: it must not wait where the next sample is not in sight."""
+        """Give the mean of an incomplete group, before a wait for the next sample."""
         if not self._group:
             return
         group, self._group = self._group, []
         if len(group) == 1:
             yield Mean(*group[0], 1)
             return
-        begin = group[0][0]  # seconds since 1970 added up would lose digits
+        begin = group[0][0]  # sums of seconds since 1970 would lose digits
         samples = [sample for _, sample in group]
         yield Mean(
             begin + _mean([stamp - begin for stamp, _ in group]),

@@ -11,7 +11,7 @@
 """
 A gyro on a pseudo-terminal: samples of a simulation or a recording, sent at their times.
 
-A program opens the path of the emulator as it would open the port of a real gyro. What it sends is
+A program opens the path of the emulator like the port of a real gyro. Bytes from the program are
 read and ignored.
 
 """
@@ -31,43 +31,42 @@ import tty
 
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
 
-_POLL = 0.05  # s; how soon a reader, or the wish to stop, is noticed
-_SETTLING = 0.2  # s; a reader that opens a port drops what is in it just afterwards
-_LINGERING = 1.0  # s; closing a pseudo-terminal throws away what its reader has not yet taken
+_POLL = 0.05  # s; interval of checks for a reader or a stop
+_SETTLING = 0.2  # s; delay after a reader has opened the port, which then discards its input
+_LINGERING = 1.0  # s; delay before closing, which discards data that were not read
 
 
 class Emulator:
     """
-    A gyro that programs can open.
+    An emulated gyro that programs can open as a port.
 
     Use it as a context manager, which sends from a thread of its own, or call `emulate`, which
     sends until the samples end.
 
-    Samples are pulled one by one, each after the one before it was sent, so a source may be
-    endless and may follow a motion that is commanded meanwhile. The time of the first is the
-    beginning; a source that is itself slower than its times sets the pace. Above 2 kHz a few
-    samples are pulled before they are sent together. Samples without a sequence are numbered from
-    0 on.
+    Each sample is taken from the source after the one before it was sent, so a source may be
+    endless and may depend on commands. The first sample is sent at once; a source that is slower
+    than its times delays the output. Above 2 kHz a few samples are sent together. Samples without
+    a sequence are numbered from 0 on.
 
     Parameters
     ----------
     protocol : Protocol
     samples : each with its time, in seconds
     settings : Settings or None
-    speed : times real time; inf is as fast as the reader reads. At 1 or slower, bytes that are not
-        read are lost, as on a real line; faster is a replay, which waits for the reader.
-    link : a symbolic link to the pseudo-terminal, whose own name differs from run to run. It is
-        removed at the end.
+    speed : factor of real time; inf is the speed of the reader. Up to 1, bytes that are not read
+        are lost, as on a real line; above 1 the emulator waits for the reader.
+    link : path of a symbolic link to the pseudo-terminal, whose name differs from run to run; it
+        is removed at the end
     wait_for_reader : whether to send the first sample only after a reader has opened the port
 
     Raises
     ------
-    ValueError : the speed is not above 0, or the settings do not suffice for the protocol
-    FileExistsError : the place of the link is taken by a file that is no link
+    ValueError : the speed is not above 0, or settings that the protocol needs are missing
+    FileExistsError : the path of the link exists and is not a link
 
     """
 
-    #: s; samples due within it are written together, as waiting takes too long
+    #: s; samples due within this time are written together, since waits are not shorter
     _BATCH = 0.0005
 
     def __init__(
@@ -94,7 +93,7 @@ class Emulator:
     def open(self) -> None:  # noqa: A003
         """Make the pseudo-terminal and the link to it; `path` is then its name."""
         self._master, slave = os.openpty()
-        tty.setraw(slave)  # else it echoes samples, and its line discipline takes characters out
+        tty.setraw(slave)  # without echo and line discipline
         self.path = os.ttyname(slave)
         os.close(slave)
         os.set_blocking(self._master, False)
@@ -117,7 +116,7 @@ class Emulator:
             self._stop.wait(_LINGERING)
 
     def is_read(self) -> bool:
-        """Return whether a program has the port open; what it has written is dropped."""
+        """Return whether a program has the port open; discard its output."""
         events = dict(self._reader_poll.poll(0)).get(self._master, 0)
         if events & select.POLLIN:
             with contextlib.suppress(OSError):
@@ -129,7 +128,7 @@ class Emulator:
         self._stop.set()
 
     def close(self) -> None:
-        """Unplug the gyro: its reader sees that the port is closed."""
+        """Close the pseudo-terminal and remove the link, as if the gyro was unplugged."""
         link = self.link
         if link is not None and link.is_symlink() and os.readlink(link) == self.path:
             link.unlink()
@@ -162,7 +161,7 @@ class Emulator:
         os.replace(temporary, self.link)
 
     def _frames(self) -> Iterator[tuple[float, bytes]]:
-        """Give when each sample is due after the first, in the time of the host, and its bytes."""
+        """Give the time of each sample after the first, s by the host clock, and its bytes."""
         begin, encode = None, self._protocol.encoder(self._settings)
         for number, sample in enumerate(self._samples):
             if sample.time is None:

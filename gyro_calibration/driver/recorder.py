@@ -9,11 +9,11 @@
 # under the License.
 
 """
-Write the samples of a gyro into a log file or an MCAP recording, so that nothing written is lost.
+Recorders of the samples of a gyro into a log file or an MCAP recording.
 
-A file grows by whole pieces, one about each half second: rows of a log, or a chunk of a recording.
-A program that is killed, or meets a full disk, leaves a file that is complete up to the last
-piece, and none before the first. A file that is there already is never written to.
+A file grows by complete pieces, about two per second: rows of a log, or a chunk of a recording.
+After a kill or on a full disk the file is complete up to the last piece; before the first piece
+there is no file. Existing files are never overwritten.
 
 """
 
@@ -39,28 +39,28 @@ from gyro_calibration.logs.ros_bag import ABOUT, MCAP_END, McapWriter, Message
 
 KINDS = '.csv', '.csv.gz', '.mcap'
 
-#: s; how long what was recorded may stay in memory.
+#: Interval of pieces, s: the longest time that samples stay in memory.
 PIECE = 0.5
-#: s; how long the columns of a log wait for a first temperature.
+#: Longest wait of the first piece of a log for a temperature, s.
 _PATIENCE = 3.0
 _LARGEST_CHUNK = 1 << 22  # bytes
 
 
 class DiskFull(OSError):
-    """No more can be written; what was written stays."""
+    """Nothing more can be written; the written pieces remain."""
 
 
 class AtomicAppender:
     """
-    A new file that grows by whole pieces: each is in it completely, or not at all.
+    A new file that grows by complete pieces.
 
-    The file is made with the first piece, so that a program that is killed before leaves its place
-    free; that it can be made is tried at once, and raises OSError where it is there already.
+    The file is created with the first piece, so that a program killed earlier leaves none. The
+    constructor tests that it can be created, and raises OSError where it exists.
 
     Attributes
     ----------
     size : bytes in the file
-    is_full : whether a piece found no room
+    is_full : whether a piece could not be written
 
     """
 
@@ -71,7 +71,7 @@ class AtomicAppender:
         os.unlink(path)
 
     def append(self, piece: bytes) -> None:
-        """Write a piece, or take back what of it was written and raise `DiskFull`."""
+        """Write a piece; on an error truncate the file to the pieces before, raise `DiskFull`."""
         left = memoryview(piece)
         try:
             file = self._file = self._file or FileIO(self.path, 'xb')
@@ -91,7 +91,7 @@ class AtomicAppender:
         self.size += len(piece)
 
     def close(self) -> None:
-        """Close it; a file without a whole piece is removed."""
+        """Close the file; remove it if it has no complete piece."""
         if self._file is None:
             return
         self._file.close()
@@ -99,12 +99,12 @@ class AtomicAppender:
             os.unlink(self.path)
 
 
-#: Gives the notes of a recording, when the first piece is written: some are found out until then.
+#: Returns the notes of a recording; called with the first piece, when all notes are known.
 Notes = Callable[[], Mapping[str, str]]
 
 
 def about(**details: object) -> dict[str, str]:
-    """Return the notes of a recording: the program, the date, and details that are known."""
+    """Return the notes of a recording: program, date, and details except empty ones."""
     known = {name.replace('_', ' '): str(value)
              for name, value in details.items() if value not in (None, '')}
     date = datetime.now(timezone.utc).isoformat(timespec='seconds')
@@ -112,7 +112,7 @@ def about(**details: object) -> dict[str, str]:
 
 
 class _Recorder:
-    """A new file of a path and its notes; it raises as `AtomicAppender` does."""
+    """A new file with notes; raises as `AtomicAppender` does."""
 
     def __init__(self, path: str, notes: Notes):
         self._file, self._notes = AtomicAppender(path), notes
@@ -125,11 +125,11 @@ class _Recorder:
 
 class McapRecorder(_Recorder):
     """
-    Writes messages as they are into an MCAP file, a chunk a piece.
+    Writes serialized messages into an MCAP file; each piece is a chunk.
 
     Attributes
     ----------
-    variance : of the rate of one sample of a port, (rad/s)²
+    variance : variance of the rate of a sample, (rad/s)²
 
     """
 
@@ -138,7 +138,7 @@ class McapRecorder(_Recorder):
         self._writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
-        """Write a sample of a port as messages on the topics of the driver; the stamp is in ns."""
+        """Write a sample as messages on the topics of the driver; the stamp is in ns."""
         force, temperature = sample.specific_force, sample.temperature
         of_force = cdr.NO_COVARIANCE if force is None else cdr.along_z(ASSUMED_FORCE_NOISE ** 2)
         messages = [] if temperature is None else [
@@ -158,21 +158,21 @@ class McapRecorder(_Recorder):
             self.flush()
 
     def flush(self) -> None:
-        """Write the piece that is due."""
+        """Write the messages so far as a piece."""
         if self._writer.pending:
             head = b'' if self.size else self._writer.begin(
                 f'gyro_calibration {__version__}', ABOUT, self._notes())
             self._file.append(head + self._writer.chunk())
 
     def close(self) -> None:
-        """Write what is left and the closing part; after a full disk, without the index."""
+        """Write the last piece and the closing part; on a full disk without the index."""
         try:
             if not self._file.is_full:
                 self.flush()
                 if self.size:
                     self._file.append(self._writer.end())
             elif self.size:
-                with suppress(DiskFull):  # no room for these bytes either: a reader finds it torn
+                with suppress(DiskFull):  # a reader then takes the file for truncated
                     self._file.append(MCAP_END)
         finally:
             self._file.close()
@@ -180,16 +180,15 @@ class McapRecorder(_Recorder):
 
 class CsvRecorder(_Recorder):
     """
-    Writes samples as rows of the log format, some rows a piece.
+    Writes samples as rows of the log format.
 
-    Which columns there are is decided with the first piece: a file of rows cannot get another one
-    later. Values that come less often than samples, such as the temperature, are held until the
-    next. Whether and how often a gyro sends its temperature is not known before, so the first
-    piece waits for one.
+    The columns are fixed with the first piece. Values that come less often than samples, such as
+    the temperature, are repeated until the next one. The first piece waits for a temperature,
+    since it is not known in advance whether the gyro sends one.
 
     Attributes
     ----------
-    missed : columns that came too late to get into the file
+    missed : columns that came after the first piece and are not in the file
 
     """
 
@@ -203,7 +202,7 @@ class CsvRecorder(_Recorder):
         self.missed: set[str] = set()
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
-        """Write a sample of a port; the stamp is in ns."""
+        """Add a sample; the stamp is in ns."""
         values = {'temperature_degc': sample.temperature,
                   'acceleration_mps2': sample.specific_force, **sample.health}
         self._current |= {name: value for name, value in values.items() if value is not None}
@@ -212,7 +211,7 @@ class CsvRecorder(_Recorder):
         self._rows.append((stamp, {'gyro_rad_s': sample.output, **self._current}))
 
     def flush(self, everything: bool = False) -> None:
-        """Write the piece that is due."""
+        """Write the rows so far as a piece."""
         if not self._rows:
             return
         if not (self._columns or everything):
@@ -231,7 +230,7 @@ class CsvRecorder(_Recorder):
         self._rows.clear()
 
     def close(self) -> None:
-        """Write what is left, unless a piece found no room: the header may have been in it."""
+        """Write the last piece, unless one failed before: it may have had the header."""
         try:
             if not self._file.is_full:
                 self.flush(everything=True)
@@ -239,7 +238,7 @@ class CsvRecorder(_Recorder):
             self._file.close()
 
     def _open(self, text: io.StringIO, writer: Any) -> None:
-        """Write notes and header; what came first holds from the beginning."""
+        """Write notes and header; the first value of each column applies from the beginning."""
         first: dict[str, float] = {}
         for _, values in reversed(self._rows):
             first |= values

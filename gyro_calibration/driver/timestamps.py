@@ -9,18 +9,18 @@
 # under the License.
 
 """
-Clocks: when each sample was sent, and one axis of time where a clock is set.
+Clocks: the time of sending of each sample, and continuous time where a clock is set.
 
 `SampleClock` stamps samples. They arrive late, because a USB adapter holds bytes for 16 ms or the
 host is busy, but never early. So the time of a sample is a straight line over its number: the line
 under all arrivals of the last 20 s with the least sum of distances [1]_. The number is the
-sequence of the device, or its time, or a count. Samples lost without a trace show as well: all
-samples since are late by whole periods. Samples counted twice show at the next arrival, which is
-early.
+sequence of the device, or its time, or a count. Lost samples without other evidence are detected
+too: all later samples are late by whole periods. Samples counted twice are detected at the next
+arrival, which is early.
 
-`ClockSteps` detects clocks that are set. A computer without a battery begins in the wrong year and
-is set by months when it finds a time server; then stamps jump, and nothing else has happened.
-`NodeTime` gives stamps of such a clock, `HostClock` takes them to an even axis.
+`ClockSteps` detects that a clock was set. A computer without a battery starts with a wrong date
+and is set by months when it finds a time server; then the stamps jump. `NodeTime` converts a
+steady clock to stamps of such a clock, `HostClock` converts its stamps to a continuous time.
 
 No clock is read here, except by `steady`: the caller gives the time of arrival.
 
@@ -43,36 +43,36 @@ from gyro_calibration.driver.protocols import Sample
 
 _Point = tuple[float, float]
 
-_LEAST_STEP = 1e-6  # s; what double precision resolves in seconds since 1970
-_WINDOW = 20.0  # s; holds the least delay of 200 arrivals; a warming clock drifts little in it
-_BLOCKS = 32  # fewest in a full window; twice as many are the most
-_SETTLED = 2.0  # s; a younger line does not know the period well enough to miss samples by it
-_SLEW = (0.2, 1.0)  # s; in which stamps follow the line, before and after it has settled
-_HOLD = 0.3  # s; arrivals must be late for this long to prove a loss: a stalled host catches up
-_LONG = 1.5  # s; after which the lateness itself counts, not only its change
-_CHANCE = 1e-6  # that as many arrivals are late without any loss
-_WINDOWS = 64  # of `_HOLD` each, over which a slow sweep of the lateness is learned
-_SWEEPING = 0.2  # of those windows; by chance alone it is a few
-_MEMORY = 256  # arrivals, over which the share of late ones without any loss is learned
-_JITTER_TIME = 10.0  # s; over which jitter is averaged
-_DRIFT = 2e-5  # by which the clock of a device may become faster while counts are uncertain
-_FINEST = 0.5e-3  # s; a host that wakes up later than before is no proof of a loss below this
-_OUTLYING = 0.02  # s; above the 16 ms of a burst: with a sequence, no sample is off by more
-_ODD = 8  # advances in a row that do not fit their size show that the size is wrong
-_LARGEST_JUMP = 3.0  # s; beyond it the time of the device does not continue
-_SET = 0.1  # s; a clock that differs by more was set, and was not slewed
-_MIXED = 10.0  # s; after a clock was set, stamps of before and after it may come for this long
-_TOGETHER = 0.05  # s; clocks that are read with more between them are not read at one time
-_FOLLOWING = 2.0  # s; in which the difference of two clocks is followed
+_LEAST_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
+_WINDOW = 20.0  # s; window of the line: 200 arrivals at 10 Hz, little drift of a warming clock
+_BLOCKS = 32  # least number of blocks in a full window; the largest is twice this
+_SETTLED = 2.0  # s; least span of a line before its period shows lost samples
+_SLEW = (0.2, 1.0)  # s; time constant of stamps to the line, before and after it has settled
+_HOLD = 0.3  # s; least duration of lateness that proves a loss: a stalled host catches up
+_LONG = 1.5  # s; duration after which the lateness itself is tested, not only its change
+_CHANCE = 1e-6  # probability that as many arrivals are late without a loss
+_WINDOWS = 64  # windows of `_HOLD` each, over which a slow sweep of the lateness is averaged
+_SWEEPING = 0.2  # share of those windows that shows a sweep; by chance it is a few
+_MEMORY = 256  # arrivals, over which the share of late ones without a loss is averaged
+_JITTER_TIME = 10.0  # s; averaging time of the jitter
+_DRIFT = 2e-5  # largest increase of the device clock rate while counts are uncertain, 1
+_FINEST = 0.5e-3  # s; least lateness that proves a loss: the host may wake up later than before
+_OUTLYING = 0.02  # s; largest lateness with a correct sequence, above the 16 ms of a burst
+_ODD = 8  # successive advances that do not fit the mean one show that it is wrong
+_LARGEST_JUMP = 3.0  # s; largest continuous step of the time of a device
+_SET = 0.1  # s; largest difference of a clock that is slewed; beyond it the clock was set
+_MIXED = 10.0  # s; after a clock was set, older stamps may still arrive for this time
+_TOGETHER = 0.05  # s; longest duration of a simultaneous reading of two clocks
+_FOLLOWING = 2.0  # s; time constant of the difference of two clocks
 
 
 class LowerLine:
     """
-    The line under points that may lie too high, with the least sum of distances.
+    The line below all points with the least sum of distances.
 
-    Of each block of time only the lowest point is kept. The line is the edge of their lower hull
-    that spans their mean. Blocks grow with the time that the points span, up to 20 s altogether;
-    older points are dropped. Until there are two, the slope is the given one.
+    Only the lowest point of each block of time is kept. The line is the edge of their lower hull
+    over their mean. Blocks grow with the time span of the points, up to 20 s in total; older
+    points are dropped. With less than two points, the slope is the given one.
 
     """
 
@@ -92,11 +92,11 @@ class LowerLine:
         return self._anchor[1] + self.slope * (x - self._anchor[0])
 
     def span(self) -> float:
-        """Return how high the last point is above the first that was ever added."""
+        """Return the height of the last point above the first one ever added."""
         return self._points[-1][1] - self._begin if self._points else 0.0
 
     def add(self, x: float, y: float) -> None:
-        """Add a point that is not lower than the one before; x may be anything above it."""
+        """Add a point that is not lower than the one before; x is larger than before."""
         if not self._points:
             self._begin, self._anchor = y, (x, y)
         if y - self._block_begin >= self._length:
@@ -110,13 +110,13 @@ class LowerLine:
         self._fit()
 
     def shift(self, since: float, by: float) -> None:
-        """Move the points from a height on along x, and drop those that they overtake."""
+        """Shift the points from a height on along x, and drop points that they overtake."""
         moved = [(x + by, y) for x, y in self._points if y >= since]
         first = moved[0][0] if moved else math.inf
         self._points = [(x, y) for x, y in self._points if y < since and x < first] + moved
 
     def _limit(self) -> None:
-        """Merge blocks in pairs while they are short, and drop the oldest when they are not."""
+        """Merge blocks in pairs while they are short, then drop the oldest."""
         if len(self._points) <= 2 * _BLOCKS:
             return
         if self._length >= _WINDOW / 2 / _BLOCKS:
@@ -153,10 +153,10 @@ def _lower_hull(points: Sequence[_Point]) -> list[_Point]:
 
 class _Numbers:
     """
-    How far each sample is from the one before, in nominal periods: `size` on average.
+    Numbers samples in nominal periods; the mean advance is `size`.
 
-    By the sequence of the device, by its time, or by counting. The number may be wrong by `unit`
-    samples, or a multiple, which is 0 where the device gives its time.
+    By the sequence of the device, by its time, or by counting. The number may be wrong by a
+    multiple of `unit` samples; `unit` is 0 where the device gives its time.
 
     """
 
@@ -175,10 +175,10 @@ class _Numbers:
     def step(self, sample: Sample, most: float = math.inf,
              round_fits: bool = False) -> tuple[float, int]:
         """
-        Return how far it is to this sample, and how many were lost before it.
+        Return the advance to this sample, and the number of samples lost before it.
 
-        A time of the device that is further than `most` is wrong: the sample came too early.
-        A sequence that repeats stands still, unless a whole round of it fits into the time.
+        A time of the device beyond `most` is wrong: the sample came too early. A repeated sequence
+        is stuck, unless a whole cycle of it fits into the time.
 
         """
         if self.modulus and sample.sequence is not None:
@@ -195,10 +195,10 @@ class _Numbers:
         self.unit = 1 if self._stands else self.modulus
         if last is None:
             return 1, 0
-        if self._stands or stood:  # where it stood, it shows only from the next sample on
+        if self._stands or stood:  # after it was stuck, it counts from the next sample on
             return 1 + missing, missing
         advance = (sequence - last) % self.modulus or self.modulus
-        # Missing is counted from damaged bytes, to a few: enough for how often it wrapped.
+        # The number of missing samples by damaged bytes gives the number of wraps.
         advance += self.modulus * max(0, round((1 + missing - advance) / self.modulus))
         return advance, advance - 1
 
@@ -207,7 +207,7 @@ class _Numbers:
         largest = min(_LARGEST_JUMP, most / self._rate)
         elapsed = next((time - last for last in (self._time, self._outlier)
                         if last is not None and _LEAST_STEP <= time - last <= largest), None)
-        if elapsed is None:  # this one time alone shows it
+        if elapsed is None:  # a single outlier in the time of the device
             self._outlier = time
             advance = self.size * (1 + missing)
             self._time = time if self._time is None else self._time + advance / self._rate
@@ -215,7 +215,7 @@ class _Numbers:
         self._time, self._outlier = time, None
         advance = elapsed * self._rate
         lost = self._lost(advance)
-        if lost >= 0:  # damaged bytes show what coarse times do not, up to the time that passed
+        if lost >= 0:  # damaged bytes show losses that coarse times do not
             lost = max(lost, min(missing, round(advance / self.size) - 1))
         return advance, lost
 
@@ -224,7 +224,7 @@ class _Numbers:
             self.size, self._unevenness = advance, 0.01
             return 0
         steps = advance / self.size
-        # Times that are coarse against the period do not show single samples.
+        # Times with a resolution near the period do not show single samples.
         lost = round(steps) - 1 if steps > 2.5 or steps > 1.5 and self._unevenness < 0.15 else 0
         if not 0.3 <= steps <= 2.5:
             return self._odd(advance, max(lost, 0))
@@ -234,7 +234,7 @@ class _Numbers:
         return lost
 
     def _odd(self, advance: float, lost: int) -> int:
-        """Take the size from advances where none fits it; what seemed lost by it was not."""
+        """Set the mean advance from odd ones in a row; cancel the losses that they showed."""
         self._odd_advances.append(advance)
         self._odd_lost += lost
         if len(self._odd_advances) < _ODD:
@@ -247,21 +247,21 @@ class _Numbers:
 
 class _Lateness:
     """
-    Whether samples have been late for so long that some must be lost.
+    Test whether samples have been late for so long that some must be lost.
 
-    Where bursts come nearly as often as samples, or a multiple, the lateness grows slowly to a
-    period and falls to zero. So the step of the least lateness counts; the lateness itself counts
-    only when it has lasted for longer. Where it sweeps like this, a step to one period is a sample
-    that has slipped into the next burst, and no loss.
+    Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly to a
+    period and falls to zero (a sweep). So the step of the least lateness is tested; the lateness
+    itself is tested only after a longer time. During a sweep, a step by one period is a sample
+    that moved into the next burst, and no loss.
 
     """
 
     def __init__(self) -> None:
         self.since: float | None = None
-        self._usual = 0.5  # part of the arrivals that are not late
-        self._in_time = math.inf  # the last arrival that was not
+        self._usual = 0.5  # share of the arrivals in time
+        self._in_time = math.inf  # the last arrival in time
         self._least_in_time, self._least_before, self._window = math.inf, math.inf, -math.inf
-        self._sweeping = 0.0  # part of the windows in which no arrival was in time by half
+        self._sweeping = 0.0  # share of windows whose least lateness exceeds half of the bound
         self.reset()
 
     def reset(self) -> None:
@@ -271,7 +271,7 @@ class _Lateness:
     def is_proven(self, lateness: float, bound: float, number: float, arrival: float,
                   period: float) -> bool:
         """
-        Take one arrival; tell whether for long enough all are late by more than the bound.
+        Add an arrival; tell whether all have been late beyond the bound for long enough.
 
         They are late by `step`, since `since`.
 
@@ -279,7 +279,7 @@ class _Lateness:
         if lateness <= bound:
             self._is_in_time(lateness, bound, arrival)
             return False
-        # Lateness before a silence does not show what was lost in it.
+        # Lateness before a silence does not show losses in the silence.
         if self.since is None or arrival - self._arrival > max(0.5 * _HOLD, 3.0 * period):
             self.since, self._number, self._count, self._least = arrival, number, 0, math.inf
         self._least, self._arrival = min(self._least, lateness), arrival
@@ -292,13 +292,13 @@ class _Lateness:
         return lasts >= _HOLD and self._count >= needed and self.step > bound and not is_slip
 
     def is_no_loss(self, number: float, arrival: float, slope: float) -> bool:
-        """Tell whether samples became slower, or later than the time since the last in time."""
+        """Tell whether the sample rate fell, or the lateness exceeds the time that it lasts."""
         assert self.since is not None
         grows = (number - self._number) * slope < 0.5 * (arrival - self.since)
         return grows or self._least > self.since - self._in_time + _HOLD
 
     def _is_in_time(self, lateness: float, bound: float, arrival: float) -> None:
-        # Learn from one arrival in time, and from the late ones before it without any loss.
+        # Average over one arrival in time, and the late ones before it without a loss.
         self._usual *= (1.0 - 1.0 / _MEMORY) ** self._count
         self._usual += (1.0 - self._usual) / _MEMORY
         self.reset()
@@ -313,25 +313,25 @@ class _Lateness:
 
 class SampleClock:
     """
-    Gives each sample its stamp; stamps increase strictly.
+    Stamps samples; stamps increase strictly.
 
     Corrections by the line, see `LowerLine`, are slewed. A stamp jumps only where later arrivals
-    show that samples were lost. The nominal rate of the gyro is used for the first piece only: its
-    clock is 2 to 3 % off from unit to unit.
+    show that samples were lost. The nominal rate of the gyro is used for the first samples only:
+    its clock is 2 to 3 % off from unit to unit.
 
     Parameters
     ----------
     rate : nominal samples per second
-    modulus : at which `Sample.sequence` begins anew; 0 for a device without one
-    after : all stamps are later than this, the last one of another clock
+    modulus : modulus of `Sample.sequence`; 0 for a device without a sequence
+    after : lower limit of the stamps: the last stamp of another clock
 
     Attributes
     ----------
     lost : samples lost so far while the port was open: missing in the sequence or in the time of
-        the device, or damaged, or shown by the lateness of all samples since
-    period : seconds from one sample to the next, as fitted
-    jitter : root mean square over the last ten seconds, s: how late samples arrive, and how far
-        stamps are from the line
+        the device, damaged, or shown by the lateness of all later samples
+    period : fitted interval between samples, s
+    jitter : root mean squares over the last 10 s: lateness of samples, and deviation of stamps
+        from the line, s
 
     """
 
@@ -352,21 +352,21 @@ class SampleClock:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the period has been watched for long enough."""
+        """Whether the line spans enough time to know the period."""
         return self._line.span() >= _SETTLED
 
     @property
     def jitter(self) -> tuple[float, float]:
-        """How late samples arrive, and how far stamps are from the line, s."""
+        """Root mean squares of lateness and of the deviation of stamps from the line, s."""
         return math.sqrt(self._squares[0]), math.sqrt(self._squares[1])
 
     def interrupt(self) -> None:
-        """Begin a new line, as after the port was lost; that time does not count as lost."""
+        """Start a new line, as after a loss of the port; no samples count as lost meanwhile."""
         self._numbers.reset()
         self._begin_anew()
 
     def stamp(self, samples: Sequence[Sample], arrival: float) -> list[float]:
-        """Return stamps of the samples that came at a time, s, by a clock that never goes back."""
+        """Return stamps of samples by their time of arrival on a steady clock, s."""
         if not samples:
             return []
         self._before, self._arrival = self._arrival, max(arrival, self._arrival)
@@ -395,7 +395,7 @@ class SampleClock:
         return numbers
 
     def _most(self, number: float, arrival: float) -> float:
-        """Return how far it may be from a number to one that has come by now."""
+        """Return the largest advance from a number to a sample that has arrived."""
         if not self._line.is_known:
             return math.inf
         margin = 0.5 * max(self.period, _FINEST) if self.is_settled else _OUTLYING
@@ -403,7 +403,7 @@ class SampleClock:
         return max(left, 1.5 * self._numbers.size)
 
     def _evidence(self, number: float, arrival: float) -> int:
-        """Correct the count of lost samples by the arrivals; return by how much it was wrong."""
+        """Correct the count of lost samples by the arrivals; return the correction."""
         if not self.is_settled:
             return 0
         unit, lateness = self._numbers.unit, arrival - self._line.at(number)
@@ -413,7 +413,7 @@ class SampleClock:
         late = lateness, 0.75 * bound, number, arrival, self.period
         if unit and self._lateness.is_proven(*late):
             return self._lost_without_trace(unit, number, arrival)
-        # Where the sequence began anew, all are off by the same part of it.
+        # After a restart of the sequence, all samples are off by the same part of it.
         least = max(3.0 * self.period, _OUTLYING)
         if unit > 1 and (lateness < -least or lateness < 0.75 * bound and self._outlying.is_proven(
                 lateness, least, number, arrival, self.period)):
@@ -424,9 +424,9 @@ class SampleClock:
         excess = unit and unit * round(-lateness / (unit * self.period))
         if excess and excess <= self._uncertain:
             return self._renumber(self._uncertain_since, -excess)
-        if not unit:  # a wrong time of the device: what it seemed to skip was not lost
+        if not unit:  # a wrong time of the device: the apparent losses are cancelled
             self.lost -= self._just_lost
-        if unit != 1:  # or a sequence that began anew
+        if unit != 1:  # or a sequence that was restarted
             self._begin_anew()
         return 0
 
@@ -470,7 +470,7 @@ class SampleClock:
     def _increasing(self, stamps: list[float], arrival: float) -> list[float]:
         first, last = (arrival - stamp + self._slew for stamp in (stamps[0], stamps[-1]))
         weight = min(1.0, len(stamps) * self.period / _JITTER_TIME)
-        # the mean square of lateness that is spread evenly
+        # mean square of a lateness that is linear from the first sample to the last
         late, (before, after) = (first * first + first * last + last * last) / 3.0, self._squares
         self._squares = (before + weight * (late - before),
                          after + weight * (self._slew * self._slew - after))
@@ -482,7 +482,7 @@ class SampleClock:
 
 
 def steady() -> float:
-    """Return seconds of the steady clock; they include suspension of the host, where possible."""
+    """Return seconds of the steady clock, including suspension of the host if supported."""
     return time.clock_gettime(_STEADY)
 
 
@@ -491,7 +491,7 @@ _STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 def read_together(even: Callable[[], float], other: Callable[[], float]
                   ) -> tuple[float, float] | None:
-    """Return two clocks at one time, s; None where each reading of both was held up."""
+    """Read two clocks at one time, s; None if five readings were all interrupted."""
     for _ in range(5):
         before, value = even(), other()
         after = even()
@@ -502,10 +502,10 @@ def read_together(even: Callable[[], float], other: Callable[[], float]
 
 class ClockSteps:
     """
-    Detects a clock that is set, by comparing it with a steady one; all in s.
+    Detects that a clock was set, by comparison with a steady one; all in s.
 
-    A clock that runs does not change by more than `ahead` or `behind` against the steady one, and
-    does not go back by more than `back`. It counts how often it was set, and by how much `last`.
+    A clock that was not set gains at most `ahead`, loses at most `behind` against the steady one,
+    and goes back by at most `back`. `count` is the number of steps, `last` the size of the last.
 
     """
 
@@ -515,14 +515,14 @@ class ClockSteps:
         self._even = self._other = math.nan
 
     def step(self, even: float, other: float) -> float:
-        """Return by how much the clock was set since the last `watch`, s; 0 where it was not."""
+        """Return the step of the clock since the last `watch`, s; 0 without one."""
         interval = other - self._other
         step = interval - (even - self._even)
         was_set = step > self._ahead or step < -self._behind or interval < -self._back
         return step if was_set else 0.0
 
     def watch(self, even: float, other: float) -> float:
-        """Take the times of both clocks at one time, s, and return what `step` does."""
+        """Take the times of both clocks, s, and return the step as `step` does."""
         step = self.step(even, other)
         self._even, self._other = even, other
         if step:
@@ -532,9 +532,9 @@ class ClockSteps:
 
 class NodeTime:
     """
-    From a steady clock to that of a node, which may be set or follow a simulation.
+    Conversion of a steady clock to that of a node, which may be set or simulated.
 
-    The difference is followed slowly, and at once where the clock was set.
+    The difference is filtered, and taken at once where the clock was set.
 
     """
 
@@ -544,7 +544,7 @@ class NodeTime:
         self._even, self._node, self._last = -math.inf, -math.inf, -math.inf
 
     def watch(self, even: float, node: float) -> float:
-        """Take the times of both clocks at one time, s; return by how much the node's was set."""
+        """Take the times of both clocks, s; return the step of the node's clock."""
         elapsed, was_set_back = even - self._even, node < self._node
         self._even, self._node = even, node
         step = self.steps.watch(even, node)
@@ -558,14 +558,14 @@ class NodeTime:
         return step
 
     def of(self, stamp: float) -> float:
-        """Return a time by the clock of the node; stamps increase until it is set back."""
+        """Convert a time to the clock of the node; stamps increase until it is set back."""
         self._last = max(stamp + self._difference, self._last + _LEAST_STEP)
         return self._last
 
 
 @dataclass
 class _Step:
-    """A step of the clock, s, when it was seen on the steady clock, and if stamps showed it."""
+    """A step of the clock, s, its time on the steady clock, and whether stamps showed it."""
 
     size: float
     seen: float
@@ -574,9 +574,9 @@ class _Step:
 
 class HostClock:
     """
-    Converts stamps to one axis of time, s, also where the clock of the host is set.
+    Conversion of stamps to a continuous time, s, also where the clock of the host is set.
 
-    A jump of the stamps counts as none if that clock has just made the same one against the
+    A jump of the stamps is removed if the clock of the host has just made the same one against the
     steady clock: one of `steps`.
 
     """
@@ -587,7 +587,7 @@ class HostClock:
         self._recent: list[_Step] = []
 
     def watch(self, even: float, date: float) -> float:
-        """Take the times of both clocks at one time, s; return by how much the date was set."""
+        """Take the times of both clocks, s; return the step of the date."""
         if self._recent and even - self._recent[0].seen > _MIXED:
             del self._recent[0]
         step = self.steps.watch(even, date)
@@ -603,11 +603,10 @@ class HostClock:
         Parameters
         ----------
         stamp : seconds
-        before : time of the sample before it, s; -inf for the first, which shows no step of the
-            clock
+        before : time of the previous sample, s; -inf for the first, which shows no step
         usual : interval, s; inf while it is not known
-        silence : time between their arrivals, s: over a gap it is as long as the jump of the
-            stamps, over a step of the clock it is not
+        silence : time between their arrivals, s; it equals the jump of the stamps over a gap, but
+            not over a step of the clock
 
         """
         if before == -math.inf:
@@ -627,7 +626,7 @@ class HostClock:
         return before + bridged
 
     def of_other(self, stamp: float, sample: float) -> float:
-        """Return the time of a message other than a sample, s, from before or after a step."""
+        """Return the time of another message, s, with a stamp from before or after a step."""
         there = stamp - self._offset
         shifts = [sign * step.size for step in self._recent for sign in (1.0, -1.0)]
         return min((there, *(there + shift for shift in shifts)),

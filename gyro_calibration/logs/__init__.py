@@ -9,7 +9,7 @@
 # under the License.
 
 """
-What was recorded: logs, ROS 2 recordings, and their time stamps.
+Recorded data: logs, ROS 2 recordings, time stamps and the quality of samples.
 
 Reading order: `columns`, `log`, `cdr`, `ros_bag`, `recording`, `stamps`, `quality`.
 

@@ -9,11 +9,11 @@
 # under the License.
 
 """
-ROS 2 messages of gyros, temperatures and references, as bytes; no ROS is needed for them.
+Serialized ROS 2 messages of gyros, temperatures and references, without ROS.
 
-A message is in the common data representation (CDR): four bytes give the order of bytes, then come
-the fields, each aligned to its own size. The definition of its kind, which recordings carry, says
-which fields there are. It is parsed here into a table of formats; nothing in it is run.
+A message is in the common data representation (CDR): four bytes state the byte order, then come
+the fields, each aligned to its own size. The message definition, which recordings contain, lists
+the fields. It is parsed here into a table of formats; nothing in it is run.
 
 """
 
@@ -38,9 +38,9 @@ NOT_REPORTED = -1.0
 
 UNMEASURED_VARIANCE = 1e6
 """
-Variance of what a gyro with one axis does not measure, in (rad/s)², (m/s²)², rad² or m².
+Variance of quantities that a single-axis gyro does not measure, in (rad/s)², (m/s²)², rad² or m².
 
-All zeros would say that the whole covariance is unknown, z included. A standard deviation of
+All zeros would declare the whole covariance unknown, z included. A standard deviation of
 1000 rad/s gives these axes no weight in a filter, and the matrix can still be inverted.
 
 """
@@ -51,10 +51,10 @@ def along_z(variance: float) -> tuple[float, ...]:
     return (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, variance)
 
 
-#: Covariances of quantities that the message does not report, and that are not measured.
+#: Covariance of a quantity that the message does not report, and of one that is not measured.
 NO_COVARIANCE, UNMEASURED = (NOT_REPORTED, *8 * (0.0,)), along_z(UNMEASURED_VARIANCE)
 
-#: Most parts of a message, how deep they may be nested, and characters of a definition.
+#: Largest number of fields, depth of nesting, and length of a definition in characters.
 _MOST, _DEEPEST, _LONGEST = 5000, 10, 100_000
 LINE = '=' * 80
 _CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
@@ -63,7 +63,7 @@ _CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int
 _FIELD = re.compile(r'(?P<kind>[\w/]+)(?:<=\d+)?(?:\[(?P<most><=)?(?P<count>\d{0,9})\])?'
                     r' +(?P<name>\w+) *(?P<constant>=?)')
 
-#: Where messages have a quantity: the first of these fields that there is. `{}` is the axis.
+#: Quantity -> fields that may hold it; the first one present is used. `{}` is the axis.
 _QUANTITIES = {
     **{f'orientation.{each}': tuple(f'{where}{each}' for where in (
         'orientation.', 'pose.pose.orientation.', 'pose.orientation.', 'transform.rotation.',
@@ -109,28 +109,28 @@ def _with_parts(text: str) -> str:
     return text
 
 
-#: Kind -> its fields, as ROS 2 writes them, for recordings without definitions, and for recorders.
+#: Message type -> definition as ROS 2 writes it, for recordings without definitions and recorders.
 DEFINITIONS: Mapping[str, str] = {kind: _with_parts(f'std_msgs/Header header\n{fields}\n')
                                   for kind, fields in _FIELDS.items()}
 
 
 class MessageError(ValueError):
-    """Bytes are not a message of the kind that they should be, or a definition is none."""
+    """Bytes are not a message of the expected type, or a definition is not valid."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How a kind of message lies in bytes, as far as it says something of gyro or reference."""
+    """The layout in bytes of a message type, with the quantities of a gyro or reference."""
 
-    #: Of numbers that follow each other: bytes of an element of the text or sequence before the
+    #: Runs of contiguous numbers: size in bytes of an element of the text or sequence before the
     #: run, 0 for the first run; and formats of the numbers.
     runs: tuple[tuple[int, str], ...]
-    quantities: Mapping[str, int]  # name -> which of the numbers it is
+    quantities: Mapping[str, int]  # name -> index among the numbers
 
 
 @cache
 def layout_of(definition: str, axis: str = 'z') -> Layout:
-    """Return the layout of a kind of message by its definition, of rates about an axis."""
+    """Return the layout of a message type by its definition, with the rate about an axis."""
     if len(definition) > _LONGEST:
         raise MessageError(f'it has more than {_LONGEST} characters')
     parts: dict[str, list[re.Match[str]]] = {}
@@ -139,7 +139,7 @@ def layout_of(definition: str, axis: str = 'z') -> Layout:
         fields = [found for line in text.split('\n')
                   if (found := _FIELD.match(line.partition('#')[0].strip()))]
         name = name.removeprefix('MSG: ').strip()
-        # In a definition, a message of the same package is named without the package.
+        # Definitions name messages of the same package without the package.
         parts[name] = parts[name.rpartition('/')[2] or name] = [
             field for field in fields if not field['constant']]
     names, runs = list[str](), [['', '']]
@@ -164,7 +164,7 @@ def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
     """
     Give name and format of each number; texts and sequences have no name, messages no format.
 
-    What comes after a sequence of texts or of messages cannot be found, and is left out.
+    Fields after a sequence of texts or of messages are left out: their offset is not fixed.
 
     """
     for field in parts[part]:
@@ -184,13 +184,13 @@ def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
                 yield from _flat(parts, kind, f'{each}.', depth + 1)
 
 
-#: Kind -> layout, of an Imu about and along z.
+#: Message type -> layout, with the rate about z.
 LAYOUTS: Mapping[str, Layout] = {kind: layout_of(text) for kind, text in DEFINITIONS.items()}
 
 
 @cache
 def _struct(order: str, codes: str, place: int) -> struct.Struct:
-    """Return the format of numbers from a place on, counted from a multiple of eight bytes."""
+    """Return the format of numbers with padding, from an offset modulo 8 bytes on."""
     text = [order]
     for code in codes:
         size = struct.calcsize(code)
@@ -220,13 +220,13 @@ def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
                 numbers += run.unpack_from(data, place)
                 place += run.size
     except (struct.error, OverflowError) as error:
-        raise MessageError(f'a message of {len(data)} bytes is too short for what it should '
-                           'hold') from error
+        raise MessageError(f'a message of {len(data)} bytes is shorter than its definition '
+                           'requires') from error
     return int(numbers[0]) * NSEC_PER_SEC + int(numbers[1]), numbers[2:]
 
 
 def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:
-    """Return a message of a header, with a stamp in ns since 1970, and of numbers, for `parse`."""
+    """Return a message with a header (stamp in ns since 1970) and numbers, as `parse` reads it."""
     text = frame.encode() + b'\0'
     head = struct.pack(f'<4xiII{len(text)}s', stamp // NSEC_PER_SEC, stamp % NSEC_PER_SEC,
                        len(text), text)

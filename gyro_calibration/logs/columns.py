@@ -11,8 +11,8 @@
 """
 Names and units of the columns of a log.
 
-A name of the log format says quantity and unit. Other names are given by the user, with a unit,
-as `gyro=wz:deg/s`; without one the unit is that of SI.
+A name of the log format states quantity and unit. The user assigns other names, with a unit, as
+`gyro=wz:deg/s`; without a unit, SI is assumed.
 
 """
 
@@ -45,7 +45,7 @@ COLUMNS: Mapping[str, tuple[str, float]] = {
     'moving': ('moving', 1.0),
 }
 QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
-#: Axes of a gyro; the names of columns may say one, such as gyro_x_dps.
+#: Axes of a gyro; column names may contain one, such as gyro_x_dps.
 AXES = ('x', 'y', 'z')
 
 _RATES = {'rad/s': 1.0, 'deg/s': _DEGREE, 'dps': _DEGREE, 'mrad/s': 1e-3,
@@ -63,8 +63,8 @@ _QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
     'moving': ('moving', {'1': 1.0}),
 }
-#: Name of a quantity in options -> names that other programs give its column, without case, marks
-#: and the unit.
+#: Name of a quantity in options -> pattern of column names in other programs, in lower case,
+#: letters only, without the unit.
 _USUAL = {
     'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
     'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|gyroscope|gyroscopez|omega|omegaz|.*angularvelocityz|'
@@ -74,13 +74,13 @@ _USUAL = {
     'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
     'supply': r'vdd|vcc|supply|voltage|volts',
 }
-#: Ends of names that say a unit.
+#: Suffixes of names -> unit.
 _ENDS = {'dps': 'deg/s', 'degs': 'deg/s', 'deg': 'deg', 'rads': 'rad/s', 'rad': 'rad',
          'ms': 'ms', 'us': 'us', 'ns': 'ns'}
 
 
 class Column(NamedTuple):
-    """Where a quantity stands in a file, and how it becomes SI: ``factor * value + offset``."""
+    """Column of a quantity in a file, and its conversion to SI: ``factor * value + offset``."""
 
     place: int
     factor: float
@@ -90,13 +90,13 @@ class Column(NamedTuple):
 def found_in(header: Sequence[str], given: Mapping[str, str] = {},
              axis: str = 'z') -> dict[str, Column]:
     """
-    Return where each quantity of a log stands.
+    Find the column of each quantity of a log.
 
     Parameters
     ----------
     header : names of the columns
-    given : what a user calls a quantity -> name of its column, or name:unit
-    axis : x, y or z; the one that is meant where names say one
+    given : quantity, as in options -> name of its column, or name:unit
+    axis : x, y or z, for names that contain an axis
 
     Returns
     -------
@@ -104,8 +104,7 @@ def found_in(header: Sequence[str], given: Mapping[str, str] = {},
 
     Raises
     ------
-    InputError : a quantity, column or unit that there is not, a quantity that stands twice, or no
-        output
+    InputError : an unknown quantity, column or unit, a quantity in two columns, or no output
 
     """
     found = {}
@@ -135,7 +134,7 @@ def found_in(header: Sequence[str], given: Mapping[str, str] = {},
 
 
 def _column(header: Sequence[str], name: str, text: str, units: Mapping[str, float]) -> Column:
-    """Return the column that a user names, with or without a unit."""
+    """Return a column that the user named, with or without a unit."""
     column, unit = text, next(iter(units))
     if text not in header and ':' in text:
         column, _, unit = text.rpartition(':')
@@ -150,19 +149,19 @@ def _column(header: Sequence[str], name: str, text: str, units: Mapping[str, flo
 
 
 def _without_axis(name: str, axis: str) -> str:
-    """Return the name of a column of the axis without it: gyro_dps for gyro_z_dps."""
+    """Return a column name without the axis: gyro_dps for gyro_z_dps."""
     first, _, rest = name.partition(f'_{axis}_')
     return f'{first}_{rest}' if rest and first in ('gyro', 'acceleration') else name
 
 
 def is_header(header: Sequence[str], given: Mapping[str, str], axis: str) -> bool:
-    """Tell whether a row holds at least one name of a column."""
+    """Tell whether a row contains at least one known column name."""
     named = {text for name in given.values() for text in (name, name.rpartition(':')[0])}
     return any(name in named or _without_axis(name, axis) in COLUMNS for name in header)
 
 
 def suggestion(header: Sequence[str]) -> str:
-    """Return how a user would name the columns of a header, or rename one; '' for no idea."""
+    """Suggest the option --columns for a header, or another name; '' without a suggestion."""
     wanted = []
     names = [name for name in header if name == _short(name) and not set(name) & set(',=:')]
     for quantity, pattern in _USUAL.items():
@@ -183,7 +182,7 @@ def suggestion(header: Sequence[str]) -> str:
 
 
 def _letters_and_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
-    """Return the letters of a name without its unit, and the unit, UNIT if the name has none."""
+    """Return the letters of a name without its unit, and the unit; UNIT if there is none."""
     base, _, rest = name.replace('[', '(').partition('(')
     unit = rest.rstrip(')] ').replace('°', 'deg').replace('sec', 's')
     letters = re.sub(r'[^a-z]', '', (base if unit in units else name).lower())
@@ -196,7 +195,7 @@ def _letters_and_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
 
 
 def _short(text: str) -> str:
-    """Return at most 100 characters of a text, as a terminal may show it."""
+    """Return at most 100 characters of a text, safe for a terminal."""
     return plain(text[:100])[:100]
 
 

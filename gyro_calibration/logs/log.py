@@ -55,31 +55,31 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-#: Goes through some items, and may show how far it has come.
+#: Iterates over items, and may show the progress.
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
-#: Standard deviations of a normal distribution that hold 95 %.
+#: Half-width of the central 95 % interval of a normal distribution, standard deviations.
 NORMAL_95 = 1.96
 
-#: Samples of a dozen columns that fit into the cache of a processor, twice as fast as memory.
+#: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
 CACHED = 1 << 14
-#: Rows of a block of a log that is read piece by piece.
+#: Rows in a block of a log.
 ROWS = 1 << 16
-#: No gyro gives samples closer than this, s.
+#: Least interval between samples, s.
 SHORTEST = 1e-9
-#: Characters of a line, of what is before the rows, and of a block of lines, or of one row that
-#: goes over several.
+#: Largest number of characters of a line, of notes and header, and of a block of lines or of a row
+#: that spans several lines.
 _LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
-#: Numbers of a log that is held whole, 4 GB; a text takes as much as ten.
+#: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _WHOLE = 1 << 29
 
 _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
 
 
-#: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns
-#: that are not ours as text.
+#: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
+#: as text.
 _Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
 
@@ -94,22 +94,22 @@ class DataRefused(InputError):
 @dataclass(frozen=True)
 class Log:
     """
-    What was recorded, as arrays in SI, each of shape (n,) or absent.
+    A log: arrays in SI, each of shape (n,) or absent.
 
     Attributes
     ----------
     time : s, increasing; without it the rows are dwells of a rate table
-    output : what the gyro reported, rad/s, counter-clockwise positive
-    counts : the same before any scaling, 1
-    temperature : the gyro's own sensor, degC
+    output : output of the gyro, rad/s, counter-clockwise positive
+    counts : raw output before any scaling, 1
+    temperature : by the sensor of the gyro, degC
     reference_rate, reference_heading : rad/s and rad; nan where the reference was lost; the
         heading is continuous
     specific_force : along the input axis, m/s²
     supply : V
     moving : 1 or 0
     notes : the lines before the header, without their '#'
-    others : columns of the file that are not ours, as text, in their order; of one name, the
-        second is called `name.1`
+    others : other columns of the file, as text, in their order; the second of two equal names
+        becomes `name.1`
 
     """
 
@@ -126,7 +126,7 @@ class Log:
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Take lists and columns of a DataFrame as well."""
+        """Convert lists and columns of a DataFrame to arrays."""
         for quantity in QUANTITIES:
             values = getattr(self, quantity)
             if values is not None:
@@ -148,11 +148,11 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     Parameters
     ----------
     path : the file
-    sensitivity : rad/s a count; used where the file has raw counts alone
-    rate : Hz; the samples came at this rate, whatever the file says of time
-    columns : names of columns that are not those of the log format: time, gyro, counts,
-        temperature, rate, heading, acceleration, supply or moving -> name, or name:unit
-    axis : x, y or z, of columns such as gyro_x_dps
+    sensitivity : rad/s per count; used where the file has raw counts only
+    rate : sample rate, Hz, which replaces the time in the file
+    columns : names of columns outside of the log format: time, gyro, counts, temperature, rate,
+        heading, acceleration, supply or moving -> name, or name:unit
+    axis : x, y or z, for columns such as gyro_x_dps
     on_progress : as for `read_log_blocks`
 
     Raises
@@ -182,15 +182,15 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                     rows: int = ROWS, on_progress: Callable[[int], object] | None = None,
                     columns: Mapping[str, str] = {}, axis: str = 'z') -> Iterator[Log]:
     """
-    Read a log file row by row, and give blocks of it, so that any length needs little memory.
+    Read a log file in blocks, so that memory does not grow with its length.
 
     Parameters
     ----------
     path, sensitivity, rate, columns, axis : as for `read_log`
-    rows : of a block, at least 2; the last block has less, and so have those with texts that go
-        over several lines
-    on_progress : is called after each block with the bytes of the file that are read, unless it
-        is a pipe
+    rows : rows in a block, at least 2; the last block may have fewer, as may blocks with texts
+        that span lines
+    on_progress : is called after each block with the number of bytes read, unless the file is a
+        pipe
 
     Raises
     ------
@@ -242,7 +242,7 @@ def _refusing(path: str | Path) -> Iterator[None]:
 
 
 def _lines(text: io.TextIOWrapper) -> Iterator[str]:
-    """Give the lines of a file, but for empty ones at its end."""
+    """Give the lines of a file, without empty ones at its end."""
     empty: list[str] = []
     for line in iter(partial(text.readline, _LINE + 1), ''):
         if len(line) < 3 and not line.strip('\r\n') and len(empty) < _BLOCK:
@@ -256,7 +256,7 @@ def _lines(text: io.TextIOWrapper) -> Iterator[str]:
 
 
 def _block(lines: Iterator[str], rows: int) -> list[str]:
-    """Return the next lines: so many, or fewer where they are long."""
+    """Return the next lines: `rows` of them, or fewer where they are long."""
     block: list[str] = []
     length = 0
     while length < _BLOCK and (more := list(itertools.islice(lines, min(rows - len(block), 256)))):
@@ -266,7 +266,7 @@ def _block(lines: Iterator[str], rows: int) -> list[str]:
 
 
 def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
-    """Give the lines of one row, or of what is before the rows, up to so many characters."""
+    """Give lines, and raise csv.Error beyond a number of characters."""
     left = most
     for line in lines:
         left -= len(line)
@@ -277,7 +277,7 @@ def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class _Table:
-    """What the head of a file says of its rows: notes, names, quantity -> column, delimiter."""
+    """Notes and header of a file: notes, names, quantity -> column, delimiter."""
 
     notes: tuple[str, ...]
     header: list[str]
@@ -286,7 +286,7 @@ class _Table:
 
     @property
     def others(self) -> dict[str, int]:
-        """Return the names of columns that are no quantity, each once, with their places."""
+        """Return the names of columns without a quantity, made unique, with their indices."""
         taken = {column.place for column in self.columns.values()}
         return {name: index for index, name in enumerate(_distinct(self.header))
                 if index not in taken and self.header[index] not in COLUMNS}
@@ -294,7 +294,7 @@ class _Table:
 
 def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
           axis: str) -> tuple[_Table, int]:
-    """Take notes and header off the lines, and return them with the number of the next line."""
+    """Read notes and header, and return them with the number of the next line."""
     notes, line = [], next(lines, '')
     while line.startswith('#'):
         notes.append(line[1:].strip())
@@ -316,7 +316,7 @@ def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
 
 
 def _distinct(header: list[str]) -> list[str]:
-    """Return the names of columns, each once: a second x is x.1."""
+    """Return the names of columns, made unique: a second x becomes x.1."""
     taken, numbers, names = set(header), dict[str, int](), list[str]()
     for name in header:
         tried = name
@@ -330,7 +330,7 @@ def _distinct(header: list[str]) -> list[str]:
 
 
 def _quickly(lines: list[str], first_line: int, table: _Table) -> _Parsed | None:
-    """Parse rows of numbers by numpy; None where they hold anything else."""
+    """Parse rows of numbers by numpy; None where they contain anything else."""
     if table.others:
         return None
     if table.delimiter != ',':
@@ -354,9 +354,9 @@ def _quickly(lines: list[str], first_line: int, table: _Table) -> _Parsed | None
 def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int,
                table: _Table) -> _Parsed:
     """
-    Parse rows one by one, with the texts of columns that are not ours, and name what is wrong.
+    Parse rows one by one, with the texts of other columns, and name the faulty row and column.
 
-    A text in quotes may go on in the next line, and so take lines of the rest.
+    A quoted text may span lines, and so take lines of the rest.
 
     """
     reader = csv.reader(itertools.chain(lines, _bounded(rest, _BLOCK)), delimiter=table.delimiter)
@@ -385,7 +385,7 @@ def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[st
     try:
         values = np.array(texts, dtype=np.float64)
     except ValueError:
-        row = 0  # of the first that is no number
+        row = 0  # the first that is no number
         with suppress(ValueError):
             for text in texts:
                 float(text)
@@ -415,13 +415,13 @@ def _most(quantity: str) -> float:
 
 
 def shown(text: str) -> str:
-    """Return a text of a file for a message: not more than a line."""
+    """Return the first 100 characters of a text of a file, for a message."""
     return plain(text[:100])
 
 
 def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None,
                  before: float) -> float:
-    """Refuse time that does not increase, from the block before on, and return the last one."""
+    """Refuse time that does not increase, also from block to block; return the last time."""
     if time is None:
         return before
     late = ~(np.diff(time, prepend=before) >= SHORTEST)
@@ -480,11 +480,11 @@ def part(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
 
 def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Array, bool]:
     """
-    Return a heading without its jumps by whole turns.
+    Unwrap a heading, and return it with whether the gyro determined a number of turns.
 
     Where the reference was lost or is slow, it may turn by more than half a turn from one value to
-    the next. The integral of the gyro gives the number of turns, with its sign and bias against
-    the reference, which are found where the values lie close together.
+    the next. The integral of the gyro then gives the number of turns. Its sign and bias against
+    the reference are estimated from the values that lie close together.
 
     Parameters
     ----------
@@ -502,7 +502,7 @@ def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Ar
     plainly, rates = np.unwrap(wrapped[known]), np.nan_to_num(output)
     angle = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(time))])
     turned, steps = np.interp(at[known], time, angle), np.diff(at[known])
-    # as rates, since over a gap the plain change may be anything
+    # as rates, since over a gap the unwrapped change may be wrong by any number of turns
     plain_rate, gyro_rate = np.diff(plainly) / steps, np.diff(turned) / steps
     sign = -1.0 if np.dot(plain_rate, gyro_rate) < 0.0 else 1.0
     bias = float(np.median(plain_rate - sign * gyro_rate))
@@ -518,7 +518,7 @@ def refuse_wrapped(log: Log) -> None:
     known = np.isfinite(log.reference_heading)
     time, change = log.time[known], np.diff(log.reference_heading[known])
     turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < 0.1
-    # no vehicle turns faster than 35 rad/s
+    # vehicles do not turn faster than 35 rad/s
     jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time)))
     if len(jumps):
         raise DataRefused(
@@ -528,9 +528,9 @@ def refuse_wrapped(log: Log) -> None:
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
     """
-    Write a log, .csv or .csv.gz, in SI columns and its other columns, completely or not at all.
+    Write a log, .csv or .csv.gz, in SI columns and its other columns, atomically.
 
-    More columns may be given: name -> array of shape (n,).
+    `more` holds further columns: name -> array of shape (n,).
 
     """
     write_log_blocks(path, [(log, more or {})])
@@ -540,7 +540,7 @@ def write_log_blocks(path: str | Path,
                      blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
     """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
     with (replacing(path) as file,
-          # without a time in it, since the same log must give the same file
+          # without a time, so that the same log gives the same file
           gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
           if str(path).endswith('.gz') else nullcontext(file) as data):
         for number, (log, more) in enumerate(blocks):
@@ -566,5 +566,5 @@ def _text(log: Log, more: Mapping[str, Array], headed: bool) -> str:
 
 
 def _unix(text: str) -> str:
-    """Return a text with the ends of lines that a writer of CSV puts in quotes."""
+    """Return a text with its line ends as newlines."""
     return text.replace('\r\n', '\n').replace('\r', '\n') if '\r' in text else text

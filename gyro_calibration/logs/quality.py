@@ -19,12 +19,13 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 import numpy as np
 from scipy.special import ndtri
 
-#: Least length of the mean phase of codes on a lattice: 1 for exact codes, 0 for any values.
+#: Least alignment of codes on a lattice (length of the mean phasor): 1 for exact codes, 0 for
+#: continuous values.
 _ALIGNED = 0.7
 
 
 def robust_deviation(values: Array) -> float:
-    """Return the standard deviation of Gaussian values about zero, some of them outliers."""
+    """Return a robust standard deviation about zero, 1.4826 times the median magnitude."""
     return 1.4826 * float(np.median(np.abs(values)))
 
 
@@ -35,39 +36,38 @@ def white_noise(values: Array, order: int = 3) -> float:
     Parameters
     ----------
     values : shape (n,); differences with nan are left out
-    order : of the differences: 3 in motion; 1 at rest, where noise that a filter has smoothed
-        shows best
+    order : order of the differences: 3 in motion; 1 at rest, which shows filtered noise best
 
     """
     off = np.abs(np.diff(values, order))
     off = off[np.isfinite(off)]
-    # Not by the median: an output of few codes has differences of zero mostly.
+    # A high quantile, since most differences of a coarsely quantized output are zero.
     return (float(np.quantile(off, 0.9)) / -float(ndtri(0.05)) / math.sqrt(math.comb(
         2 * order, order)) if off.size else math.inf)
 
 
 @dataclass(frozen=True)
 class Codes:
-    """The values that occur, in order, and how often: arrays of shape (m,)."""
+    """The distinct values of an output in order, and their counts: arrays of shape (m,)."""
 
     values: Array
     counts: Array
     step: float = 0.0  # between neighbouring codes; 0 where there is no such step
-    aligned: float = 0.0  # how well the codes lie on it, 0 to 1
+    aligned: float = 0.0  # alignment of the codes with multiples of the step, 0 to 1
     deviation: float = 0.0  # standard deviation of the step
 
 
 def codes_of(values: Array) -> Codes:
-    """Return the codes of values without nan: the coarsest lattice, up to rounding in print."""
+    """Return the codes of values without nan, with the coarsest step that fits them."""
     found, counts = np.unique(values, return_counts=True)
-    # a change of units rounds values that are one
+    # a conversion of units may round equal values differently
     apart = np.concatenate([[True], np.diff(found) > 1e-12 * np.abs(found[[0, -1]]).max()])
     first = np.flatnonzero(apart)
     codes = Codes(found[first], np.add.reduceat(counts, first))
     gaps = np.diff(codes.values)
     if not gaps.size:
         return codes
-    # where codes are left out, only few gaps are as small as the step
+    # where many codes do not occur, few gaps are as small as the step
     for start in sorted({float(gap) for gap in np.quantile(
             gaps, (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5))}, reverse=True):
         step, aligned, deviation = _lattice(codes, start)
@@ -77,11 +77,11 @@ def codes_of(values: Array) -> Codes:
 
 
 def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
-    """Refine a step from near to far codes; return it, the alignment, and its deviation."""
+    """Refine a step from near to far codes; return step, alignment and deviation."""
     gaps = np.diff(codes.values)
     near = gaps < 8.5 * step
     step = float(gaps[near].sum() / max(np.rint(gaps[near] / step).sum(), 1.0))
-    # begin among the 16 densest codes, and go on to four times as many steps each time
+    # begin with the 16 densest codes, and increase the range by a factor of 4 each time
     width = min(16, len(codes.values) - 1)
     span = codes.values[width:] - codes.values[:-width]
     first = int(np.argmin(span))
@@ -106,10 +106,9 @@ def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
 
 def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
     """
-    Return the length of the mean phase of places on a lattice, and the shift of the lattice.
+    Return the length of the mean phasor of positions on a lattice, and the shift of the lattice.
 
-    The place that occurs most is left out: a value that comes at every rest would outweigh all
-    others.
+    The most frequent position is left out: a value at every rest would outweigh all others.
 
     """
     counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
@@ -119,7 +118,7 @@ def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
 
 
 def _line(number: Array, place: Array) -> tuple[float, Array, float]:
-    """Return a slope, the residuals of places, and the root of the sum of squares of numbers."""
+    """Return slope and residuals of positions, and the root of the sum of squares of numbers."""
     centred, apart = number - number.mean(), place - place.mean()
     squares = float(centred @ centred)
     slope = float(centred @ apart) / squares
@@ -127,21 +126,21 @@ def _line(number: Array, place: Array) -> tuple[float, Array, float]:
 
 
 def quantization_step(values: Array) -> float:
-    """Return the step of an encoder or another digital output; 0 where it has none."""
+    """Return the quantization step of an encoder or a digital output; 0 without one."""
     return codes_of(values).step
 
 
 def runs(mask: Mask) -> list[slice]:
-    """Return each run of true values."""
+    """Return the slices of consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
     return [slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2])]
 
 
 def outliers(values: Array, limit: float) -> Mask:
     """
-    Mark single samples far from their neighbours and the median; not drift or vibration.
+    Mark single samples beyond a limit from their neighbours and from the median.
 
-    The limit is in robust standard deviations.
+    The limit is in robust standard deviations. Drift and vibration are not marked.
 
     """
     if len(values) < 4:
@@ -157,11 +156,11 @@ def outliers(values: Array, limit: float) -> Mask:
 
 
 def repeated_samples(output: Array) -> Mask:
-    """Mark the repeats in runs of one value that are too long for its share of the samples."""
+    """Mark repeats of a value in runs longer than its share of the samples explains."""
     repeated = np.zeros(len(output), dtype=bool)
     share = np.unique(output, return_counts=True)[1].max() / len(output)
-    # Mostly one value: a coarsely quantized gyro at rest, or a simulation without noise. It cannot
-    # be distinguished from a gyro that repeats samples.
+    # A coarsely quantized gyro at rest, or a simulation without noise, cannot be distinguished
+    # from a gyro that repeats samples.
     if share > 0.9:
         return repeated
     longest = math.log(1e-6 / len(output)) / math.log(share)
@@ -171,24 +170,23 @@ def repeated_samples(output: Array) -> Mask:
 
 
 def refuse_dead(output: Array) -> None:
-    """Refuse samples of one value, or nearly all of one."""
+    """Refuse samples of which more than 90 % have one value."""
     values, counts = np.unique(output, return_counts=True)
     share, value = counts.max() / len(output), float(values[counts.argmax()])
     if len(values) == 1:
         raise DataRefused(f'all {len(output)} samples have the same value, {value:g} rad/s: '
                           'the gyro is dead or not powered')
-    if share > 0.9:  # even if its last bit toggles
+    if share > 0.9:  # the last bit may toggle
         raise DataRefused(f'{100 * share:.1f} % of the samples have the same value, {value:g} '
                           'rad/s: the gyro is dead, not powered, or did not move')
 
 
 def refuse_saturated(output: Array) -> None:
     """
-    Refuse an output that stays at its largest or smallest value as no noise does.
+    Refuse an output that is clipped at its largest or smallest value.
 
-    A flat top has at least 10 samples and 0.5 % of all at a limit, three times as many as at the
-    next value. Codes so coarse that they hide the noise stay honestly: only the profile can show a
-    limit then.
+    A clipped output has at least 10 samples and 0.5 % of all at a limit, and three times as many
+    as at the next value. An output whose codes are too coarse to show its noise is not refused.
 
     """
     values, counts = np.unique(output, return_counts=True)

@@ -9,12 +9,12 @@
 # under the License.
 
 """
-A ROS 2 recording as a `Log`: Imu is the gyro, Temperature and a reference come onto its stamps.
+Conversion of a ROS 2 recording to a `Log` at the stamps of the gyro.
 
-Other kinds of messages with a rate, an orientation or a temperature serve where they are named.
-Times are the stamps of the headers, at which something was measured. Times of receiving are taken
-only where headers have no stamps, and a note says so. Everything else that was mended is in a note
-as well.
+The gyro is an Imu; temperature and reference are interpolated at its stamps. Other message types
+with a rate, an orientation or a temperature are used where their topic is named. Times are the
+stamps of the headers; times of receipt are used only where headers have no stamps. Notes list this
+and all other corrections.
 
 """
 
@@ -37,22 +37,22 @@ from numpy.typing import NDArray
 _Nanoseconds = NDArray[np.int64]
 
 REFERENCES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
-#: Role of a topic -> the option that names it, and the kinds of messages that it may have.
+#: Role of a topic -> the option that names it, and its possible message types.
 _ROLES = {
     'gyro': ('--topic', (cdr.IMU,)),
     'temperature': ('--temperature-topic', (cdr.TEMPERATURE,)),
     'reference': ('--reference-topic', REFERENCES),
 }
 
-#: s; a stamp so much before an earlier one shows that a clock was set; a smaller step shows that
-#: messages overtook each other.
+#: Largest step back of stamps by messages out of order, s; a larger one means that a clock was
+#: set.
 _LARGEST_STEP_BACK = 1.0
-#: Topics that a sentence names at most.
+#: Largest number of topics in a message.
 _MOST_LISTED = 20
-#: s without a temperature, beyond which a note says so; gyros take minutes to warm up.
+#: Time without a temperature beyond which a note is made, s; gyros take minutes to warm up.
 _LONG_WITHOUT_TEMPERATURE = 30.0
 
-#: Role -> quantities that a topic must have one of.
+#: Role -> quantities, of which its topic must have one.
 _NEEDED = {'gyro': {'rate'}, 'temperature': {'temperature'},
            'reference': {'rate', 'orientation.w'}}
 
@@ -60,7 +60,7 @@ _NEEDED = {'gyro': {'rate'}, 'temperature': {'temperature'},
 @dataclass(frozen=True)
 class Topics:
     """
-    Which topics of a recording are meant; None is the only one, or for the reference none.
+    The selected topics of a recording; None selects the only one, and no reference.
 
     The axis is that of the gyro: x, y or z.
 
@@ -73,7 +73,7 @@ class Topics:
 
 
 def wrong_kind(role: str, topic: str, kind: str) -> str:
-    """Return what is wrong with the kind of a topic for its role; empty where nothing is."""
+    """Return why the message type of a topic does not fit its role; '' if it does."""
     option, kinds = _ROLES[role]
     return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_listed(kinds, "or")}'
 
@@ -83,7 +83,7 @@ def _same(topic: str, other: str | None) -> bool:
 
 
 class _Series:
-    """Messages of one topic as they come: stamps and times of receiving, ns, and numbers kept."""
+    """Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities."""
 
     def __init__(self, topic: str, kind: str, definition: str, axis: str):
         self.topic, self.kind, self.damaged = topic, kind, 0
@@ -96,7 +96,7 @@ class _Series:
         return len(self._stamps)
 
     def add(self, message: Message) -> None:
-        """Keep what matters of a message; a damaged one is counted."""
+        """Store the quantities of a message; count a damaged one."""
         try:
             stamp, numbers = cdr.parse(message.data, self._layout)
             self._received.append(message.received)
@@ -107,19 +107,19 @@ class _Series:
         self._numbers.extend([numbers[place] for place in self._kept])
 
     def by_arrival(self) -> _Course:
-        """Return what came, in the order in which it was received."""
+        """Return the messages in the order of receipt."""
         received = np.frombuffer(self._received, np.int64)
         numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
         course = _Course(self.topic, self.kind, np.frombuffer(self._stamps, np.int64), received,
                          numbers, self.quantities)
-        # Long recordings are hardly ever out of order, and need no copy then.
+        # no copy where they are in order already
         return (course if (received[1:] >= received[:-1]).all()
                 else course.taken(np.argsort(received, kind='stable')))
 
 
 @dataclass(frozen=True)
 class _Course:
-    """Stamps and times of receiving of a topic, ns, shape (n,), and numbers, shape (n, m)."""
+    """Stamps and times of receipt of a topic, ns, shape (n,), and numbers, shape (n, m)."""
 
     topic: str
     kind: str
@@ -152,7 +152,7 @@ class _Course:
                        numbers=self.numbers[which])
 
     def timed(self, use_stamps: bool) -> _Course:
-        """Return it with the times that are to be used as its stamps."""
+        """Return the series with stamps, or times of receipt, as its stamps."""
         if not use_stamps:
             return replace(self, stamps=self.received)
         return self if self.stamps.all() else self.taken(self.stamps != 0)
@@ -167,14 +167,14 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     Parameters
     ----------
     path : the recording
-    topics : which of its topics are meant
-    rate : Hz; the samples came at this rate, whatever their stamps say
-    on_progress : is called with the bytes that are read
-    on_note : is called with each note: what was taken, and what was corrected
+    topics : the selected topics
+    rate : sample rate, Hz, which replaces the stamps
+    on_progress : is called with the number of bytes read
+    on_note : is called with each note on selections and corrections
 
     Raises
     ------
-    LogError : it cannot be read, holds no gyro, or several; names the topics that there are
+    LogError : it cannot be read, or has no gyro or several; names its topics
 
     """
     contents, series = Contents(), dict[str, _Series]()
@@ -200,7 +200,7 @@ def blocks_of(log: Log, rows: int = ROWS) -> Iterator[Log]:
 
 
 class _Reader:
-    """Makes a log of what was read of a recording, and notes what had to be done for it."""
+    """Makes a log of the messages of a recording, with notes on selections and corrections."""
 
     def __init__(self, path: str | Path, topics: Topics, contents: Contents,
                  series: dict[str, _Series]):
@@ -312,7 +312,7 @@ class _Reader:
     # The gyro
 
     def _in_order(self, gyro: _Course, rate: float | None) -> _Course:
-        """Sort samples that overtook each other, leave out doubled ones, refuse unusable times."""
+        """Sort samples by their stamps, leave out duplicates, and refuse unusable times."""
         gyro = (self._single(self._sorted(gyro)) if rate is None
                 else replace(gyro, stamps=np.maximum.accumulate(gyro.stamps)))
         if len(gyro) < 2:
@@ -365,8 +365,8 @@ class _Reader:
         """
         Return the temperature at the samples, by linear interpolation between readings.
 
-        Before the first reading and after the last it is held. A housing takes minutes to warm up,
-        so interpolation is nearer than the last reading, which a robot has to take.
+        Before the first reading and after the last it is constant. A housing takes minutes to warm
+        up, so interpolation is closer than the last reading, which a robot has to use.
 
         """
         course = _rising(course.taken(np.isfinite(course.values('temperature'))))
@@ -420,12 +420,12 @@ class _Reader:
 
 
 def _rising(course: _Course) -> _Course:
-    """Return it sorted by its stamps, each of them once."""
+    """Return the series sorted by stamps, without duplicates."""
     return course.taken(np.unique(course.stamps, return_index=True)[1])
 
 
 def _headings(course: _Course) -> Array | None:
-    """Return the rotation about z, wrapped, nan where there is none; None without any."""
+    """Return the rotation about z, wrapped, nan where invalid; None if not reported."""
     if not course.reports('orientation.w'):
         return None
     x, y, z, w = (course.values(f'orientation.{each}') for each in 'xyzw')
@@ -441,9 +441,9 @@ def _headings(course: _Course) -> Array | None:
 
 def interpolated(time: Array, at: Array, values: Array) -> Array:
     """
-    Return values interpolated at other times; nan where two values are too far apart.
+    Return values interpolated at other times; nan in gaps.
 
-    That is more than 5 of their intervals, and more than 0.1 s.
+    A gap is longer than 5 median intervals and longer than 0.1 s.
 
     """
     at, values = at[np.isfinite(values)], values[np.isfinite(values)]

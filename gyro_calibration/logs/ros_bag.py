@@ -11,14 +11,14 @@
 """
 ROS 2 recordings: messages read from a folder, an .mcap or a .db3 file, and written as .mcap.
 
-A recording whose program was killed lacks its closing part and the index, so neither is used: the
-records are read from the beginning, up to the end or the tear. Nothing in a file may take
-more memory than `LARGEST`, or grow to more than `GROWTH` times the file.
+The recording of a killed program lacks its closing part and index, so neither is used: records
+are read from the beginning up to the end, or to the point of truncation. No record may take more
+memory than `LARGEST`, and no file may expand to more than `GROWTH` times its size.
 
-Libraries do not keep such bounds: rosbags 0.11.9 takes 2.6 GB for a database of 12 kB whose
-columns are computed, 3.7 GB for an MCAP file of 131 kB, and refuses a torn one. An installed ROS 2
-has none that writes MCAP in pieces of which each is complete. The records of both are those of the
-specification, https://mcap.dev/spec.
+Existing libraries have no such limits: rosbags 0.11.9 takes 2.6 GB for a database of 12 kB with
+computed columns and 3.7 GB for an MCAP file of 131 kB, and refuses a truncated file. ROS 2 has no
+writer of MCAP files that are complete after each chunk. The records follow the specification,
+https://mcap.dev/spec.
 
 """
 
@@ -48,13 +48,13 @@ from gyro_calibration.files import GROWN, GROWTH, opened, plain, reason, remedy
 from gyro_calibration.logs.cdr import DEFINITIONS, layout_of, MessageError
 from gyro_calibration.logs.log import LogError, shown
 
-#: Bytes of a record or chunk, beyond which it is left out; recorders make chunks of 1 to 10 MB.
+#: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
 LARGEST = 1 << 28
 _PIECE = 1 << 20
 
 _MAGIC = b'\x89MCAP0\r\n'
 _ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
-#: Name of the metadata of a recorder of this program.
+#: Name of the metadata record of this program.
 ABOUT = 'gyro_calibration'
 
 _TABLES = {'topics', 'messages', 'message_definitions'}
@@ -64,17 +64,17 @@ _ROWS = """
            CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
            CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
     FROM messages"""
-#: The errors of SQLite in a damaged file: its own, whose words need not be text, and a length that
-#: asks for more memory than there may be.
+#: Errors of SQLite in a damaged file: its own, with texts that may not be UTF-8, and lengths
+#: beyond the memory.
 _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
-#: Is called with the bytes of all files that are read.
+#: Is called with the number of bytes read of all files.
 OnProgress = Callable[[int], object]
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message as recorded: its topic, its kind, the time of receiving, ns, and its bytes."""
+    """A recorded message: topic, type, time of receipt, ns, and serialized data."""
 
     topic: str
     kind: str
@@ -84,19 +84,19 @@ class Message:
 
 @dataclass
 class Contents:
-    """The contents of a recording so far."""
+    """Contents of a recording as far as it was read."""
 
-    #: Topic -> kind; kind that may be of use -> definition.
+    #: Topic -> message type; type with known quantities -> definition.
     topics: dict[str, str] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
-    #: Notes of its recorder, and remarks on what was read.
+    #: Notes of the recorder, and notes on the reading.
     about: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    #: Parts that are damaged or too large.
+    #: Number of parts that are damaged or too large.
     left_out: int = 0
 
     def is_useful(self, kind: str, definition: str) -> bool:
-        """Tell whether a kind of messages holds anything of use, and keep its definition."""
+        """Tell whether a message type has known quantities, and store its definition."""
         if kind not in self.definitions:
             with suppress(MessageError):
                 definition = DEFINITIONS.get(kind, definition)
@@ -106,20 +106,20 @@ class Contents:
 
 
 def _printable(text: object) -> str:
-    """Return a text of a file for a sentence: one line, not too long, no control characters."""
+    """Return a text of a file as one line of at most 200 printable characters."""
     return plain(' '.join(str(text).split()))[:200]
 
 
 def is_recording(path: str | Path) -> bool:
-    """Return whether a path is that of a recording, by its name."""
+    """Return whether a path is a folder or has the name of a recording."""
     return os.path.isdir(path) or _kind_of(Path(path)) is not None
 
 
 def files_of(path: str | Path) -> list[Path]:
     """
-    Return the files of a recording, in their order, or raise `LogError` where there are none.
+    Return the files of a recording in order, or raise `LogError` where there are none.
 
-    The list in metadata.yaml is not asked for: a recorder that was killed leaves none.
+    The list in metadata.yaml is not used: a killed recorder does not write it.
 
     """
     path = Path(path)
@@ -140,17 +140,17 @@ def files_of(path: str | Path) -> list[Path]:
 def read_messages(path: str | Path, contents: Contents,
                   on_progress: OnProgress = lambda place: None) -> Iterator[Message]:
     """
-    Give the messages of a recording that may be of use for a gyro, and fill in its contents.
+    Give the messages of a recording with known quantities, and fill in its contents.
 
     Parameters
     ----------
-    path : a folder, or a file .mcap or .db3, each perhaps with .zstd
+    path : a folder, or a file .mcap, .db3, .mcap.zstd or .db3.zstd
     contents : is filled in
-    on_progress : is called with the bytes that are read
+    on_progress : is called with the number of bytes read
 
     Raises
     ------
-    LogError : a file is no recording
+    LogError : a file is not a recording
 
     """
     done = 0
@@ -180,7 +180,7 @@ def _kind_of(path: Path) -> str | None:
 
 @contextmanager
 def _unpacked_file(path: Path) -> Iterator[Path]:
-    """Give a file without its compression."""
+    """Give the path of a file, or of a temporary decompressed copy."""
     with opened(path) as packed:
         if path.suffix != '.zstd':
             yield path
@@ -195,13 +195,13 @@ def _unpacked_file(path: Path) -> Iterator[Path]:
 
 
 class _Budget:
-    """What the content of a file may grow to where it is compressed."""
+    """The number of bytes to which the content of a compressed file may expand."""
 
     def __init__(self, path: Path):
         self._path, self._left = path, GROWN + GROWTH * path.stat().st_size
 
     def spend(self, size: int) -> None:
-        """Take some bytes, or raise `LogError` where there are too many."""
+        """Count bytes, and raise `LogError` beyond the limit."""
         self._left -= size
         if self._left < 0:
             raise LogError(f'{self._path}: decompresses to more than {GROWTH} times its size, '
@@ -210,7 +210,7 @@ class _Budget:
 
 
 def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
-    """Give what Zstandard made smaller piece by piece, up to a tear or damage."""
+    """Give the decompressed data of a Zstandard stream, up to a truncation or damage."""
     zstandard = _library('zstandard')
     reader = zstandard.ZstdDecompressor(max_window_size=LARGEST).stream_reader(
         packed, read_across_frames=True)
@@ -222,7 +222,7 @@ def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
 
 
 def _library(name: str) -> Any:
-    """Return a library that compresses; only compressed recordings need one."""
+    """Import a compression library; only compressed recordings need one."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -237,7 +237,7 @@ _Code = IntEnum('_Code', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_IND
                 'ATTACHMENT ATTACHMENT_INDEX STATISTICS METADATA METADATA_INDEX SUMMARY_OFFSET '
                 'DATA_END')
 _READ = _Code.SCHEMA, _Code.CHANNEL, _Code.MESSAGE, _Code.CHUNK, _Code.METADATA
-#: Closing part of an MCAP file without index and checksum: the end of the data, a footer of zeros.
+#: Closing part of an MCAP file without index and checksum: end of data, and a footer of zeros.
 MCAP_END = (struct.pack('<BQ4x', _Code.DATA_END, 4) + struct.pack('<BQ20x', _Code.FOOTER, 20)
             + _MAGIC)
 
@@ -262,7 +262,7 @@ def _from_mcap(source: Path, path: Path, contents: Contents,
 
 def _records(stream: BinaryIO, end: int, contents: Contents,
              wanted: tuple[_Code, ...] = _READ) -> Iterator[tuple[int, bytes]]:
-    """Give code and content of the records of a file or a chunk; a torn chunk is cut short."""
+    """Give code and content of the records of a file or a chunk, also of a truncated chunk."""
     while len(head := stream.read(9)) == 9:
         code, length = struct.unpack('<BQ', head)
         left = end - stream.tell()
@@ -283,7 +283,7 @@ def _records(stream: BinaryIO, end: int, contents: Contents,
 
 
 class _McapReader:
-    """Reads the records of one file; it remembers channels and their schemas."""
+    """Reads the records of one file, with its channels and schemas."""
 
     def __init__(self, contents: Contents, budget: _Budget):
         self._contents, self._budget = contents, budget
@@ -291,7 +291,7 @@ class _McapReader:
         self._channels: dict[int, tuple[str, str]] = {}
 
     def read(self, code: int, body: bytes, torn: bool = False) -> Iterator[Message]:
-        """Give the messages in a record; a torn chunk is read as far as it goes."""
+        """Give the messages in a record; a truncated chunk is read up to its end."""
         try:
             if code == _Code.CHUNK:
                 data = _chunk_data(body, torn, self._budget)
@@ -317,7 +317,7 @@ class _McapReader:
                     self._channels[number] = topic, kind
             elif code == _Code.METADATA:
                 name, pairs = _metadata(body)
-                if name == ABOUT:  # of a recorder of this program
+                if name == ABOUT:  # written by this program
                     self._contents.about += [_printable(f'{key}: {value}')
                                              for key, value in pairs.items()]
         except (_Damaged, struct.error):
@@ -325,7 +325,7 @@ class _McapReader:
 
 
 class _Damaged(ValueError):
-    """A part of a recording is not what it should be."""
+    """A part of a recording is damaged."""
 
 
 def _text(body: bytes, place: int) -> tuple[str, int]:
@@ -336,7 +336,7 @@ def _text(body: bytes, place: int) -> tuple[str, int]:
 
 
 def _metadata(body: bytes) -> tuple[str, dict[str, str]]:
-    """Return the name of a record of metadata, and its pairs."""
+    """Return name and pairs of a metadata record."""
     name, place = _text(body, 0)
     pairs, place = {}, place + 4
     while place < len(body):
@@ -346,7 +346,7 @@ def _metadata(body: bytes) -> tuple[str, dict[str, str]]:
 
 
 def metadata_of(path: str | Path) -> dict[str, str]:
-    """Return all metadata of an MCAP file, without those that are damaged."""
+    """Return the pairs of all undamaged metadata records of an MCAP file."""
     found: dict[str, str] = {}
     with opened(path) as file:
         if file.read(len(_MAGIC)) == _MAGIC:
@@ -358,7 +358,7 @@ def metadata_of(path: str | Path) -> dict[str, str]:
 
 
 def _chunk_data(body: bytes, torn: bool, budget: _Budget) -> bytes:
-    """Return the records of a chunk as bytes, and of a torn one those that are there."""
+    """Return the records of a chunk as bytes; of a truncated one those before its end."""
     _, _, size, check = struct.unpack_from('<QQQI', body)
     compression, place = _text(body, 28)
     if size > LARGEST:
@@ -370,7 +370,7 @@ def _chunk_data(body: bytes, torn: bool, budget: _Budget) -> bytes:
 
 
 def _expanded(compression: str, data: bytes, size: int, budget: _Budget) -> bytes:
-    """Return what is in compressed data, and not more than the size that it should have."""
+    """Return decompressed data, up to the stated size."""
     if compression == '':
         return data[:size]
     if compression not in _COMPRESSIONS:
@@ -401,7 +401,7 @@ _COMPRESSIONS: dict[str, Callable[[bytes], Iterator[bytes]]] = {
 
 
 def _message_data(data: bytes, budget: _Budget) -> bytes:
-    """Return the bytes of a message that may be compressed by itself."""
+    """Return the bytes of a message, decompressed if the message itself is compressed."""
     return _expanded('zstd', data, 1 << 16, budget) if data.startswith(_ZSTANDARD_MAGIC) else data
 
 
@@ -416,7 +416,7 @@ def _sized(data: bytes | str) -> bytes:
 
 
 class McapWriter:
-    """Gives the bytes of an uncompressed MCAP file of ROS 2 messages, piece by piece."""
+    """Makes the bytes of an uncompressed MCAP file of ROS 2 messages, chunk by chunk."""
 
     def __init__(self) -> None:
         self._place = 0
@@ -431,11 +431,11 @@ class McapWriter:
 
     @property
     def pending(self) -> int:
-        """Bytes of the messages that are not in a chunk yet."""
+        """Bytes of the messages that are not yet in a chunk."""
         return len(self._records)
 
     def begin(self, library: str, name: str, notes: Mapping[str, str]) -> bytes:
-        """Return what a file begins with: who writes it, and metadata with a name."""
+        """Return the beginning of a file: header with the program, and a metadata record."""
         head = _MAGIC + _record(_Code.HEADER, _sized('ros2'), _sized(library))
         pairs = b''.join(_sized(key) + _sized(value) for key, value in notes.items())
         metadata = _record(_Code.METADATA, _sized(name), _sized(pairs))
@@ -445,7 +445,7 @@ class McapWriter:
         return head + metadata
 
     def add(self, topic: str, kind: str, definition: str, received: int, data: bytes) -> None:
-        """Take a message, in CDR, for the next chunk; the time is in ns."""
+        """Add a message, in CDR, to the next chunk; the time is in ns."""
         if kind not in self._schemas:
             schema = _record(_Code.SCHEMA, struct.pack('<H', len(self._schemas) + 1), _sized(kind),
                              _sized('ros2msg'), _sized(definition))
@@ -463,7 +463,7 @@ class McapWriter:
         self._records += _record(_Code.MESSAGE, head, data)
 
     def chunk(self) -> bytes:
-        """Return the messages since the last chunk as one, with its index; nothing without any."""
+        """Return the messages since the last chunk as a chunk with index; b'' without any."""
         if not self._indexes:
             return b''
         times = [time for index in self._indexes.values() for time, _ in index]
@@ -487,7 +487,7 @@ class McapWriter:
         return chunk + indexes
 
     def end(self) -> bytes:
-        """Return what a file ends with: the index of all chunks."""
+        """Return the end of a file: the summary with the index of all chunks."""
         data_end = _record(_Code.DATA_END, struct.pack('<I', 0))
         begin = self._place + len(data_end)
         sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
@@ -520,7 +520,7 @@ def _from_database(source: Path, path: Path, contents: Contents,
     with _database(source, path) as (database, tables):
         channels, budget = _topics(database, tables, path, contents), _Budget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
-        with suppress(*_DATABASE_ERRORS):  # only to show how far the reading is
+        with suppress(*_DATABASE_ERRORS):  # used for the progress only
             last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
         try:
             for row, topic, received, data in database.execute(_ROWS):
@@ -541,11 +541,11 @@ def _from_database(source: Path, path: Path, contents: Contents,
 @contextmanager
 def _database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """
-    Open a database for reading only, and give it with the names of its tables.
+    Open a database read-only, and give it with the names of its tables.
 
-    It is tried with the files that a killed writer left in its folder, without them, and at last
-    as the part that is there. Its tables are read as they are stored: nothing in its schema is
-    computed, since nothing in the file would bound the cost.
+    Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
+    count corrected. Only stored columns are read: the cost of computed ones is not limited by the
+    size of the file.
 
     """
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
@@ -573,12 +573,12 @@ def _why(error: Exception | None) -> str:
 
 
 def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
-    """Return a database and the names of its plain tables, which show whether it can be read."""
+    """Return a database and the names of its tables without computed columns."""
     database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{how}', uri=True)
     try:
         database.text_factory = partial(str, encoding='utf-8', errors='replace')
-        # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite; a query
-        # that takes more than ten a byte, and a million anyway, is ended.
+        # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite. A query
+        # is ended after a million steps plus ten per byte.
         thousands = iter(range(file.stat().st_size // 100 + 1000))
         database.set_progress_handler(lambda: next(thousands, None) is None, 1000)
         if sys.version_info >= (3, 11):
@@ -598,7 +598,7 @@ def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
 
 def _authorized(action: int, first: str | None, second: str | None, _: str | None,
                 within: str | None) -> int:
-    """Allow SQLite to read its tables, with the functions used here, and nothing of a view."""
+    """Allow SQLite to read the tables with the functions used here, but no views."""
     reads = action == sqlite3.SQLITE_READ and first in _TABLES
     computes = action == sqlite3.SQLITE_FUNCTION and second in ('length', 'max', 'typeof')
     allowed = within is None and (action == sqlite3.SQLITE_SELECT or reads or computes)
@@ -606,7 +606,7 @@ def _authorized(action: int, first: str | None, second: str | None, _: str | Non
 
 
 def _shortened(source: Path, folder: Path) -> Path:
-    """Return a copy of a torn database with its true length, as SQLite refuses a shorter file."""
+    """Return a copy of a truncated database with its page count corrected, as SQLite wants it."""
     copy = Path(shutil.copy(source, folder))
     with open(copy, 'r+b') as file:
         head = file.read(100)

@@ -9,11 +9,11 @@
 # under the License.
 
 """
-Stamps of samples, and the even grid that they belong to.
+Stamps of samples on an even grid.
 
-A gyro samples by its own clock, which the stamps of a host do not show: so the samples are
-numbered, and a straight line through the stamps gives the interval. Samples are lost where the
-stamps stay late after a long step. Where the stamps catch up again, samples only came late.
+A gyro samples by its own clock, and the stamps of a host jitter. So the samples are numbered, and
+a line fitted to the stamps gives the interval. Samples are lost where the stamps stay late after a
+long step. Where the stamps catch up again, samples were only delayed.
 
 """
 
@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 
 Integers = NDArray[np.integer]
 
-#: Samples that come within this part of the usual interval were waiting; from this share of them
-#: on, stamps are taken to come in bursts.
+#: Steps below this fraction of the usual interval are those of delayed samples; above this share
+#: of such steps, stamps are taken to come in bursts.
 _WAITING, _BURSTS = 0.5, 0.02
 
-#: A gap of more than 1 / LONG of the record is crossed by no window; a longer window is too long
-#: to show a motion.
+#: Least number of windows in a record. Windows do not cross gaps of more than 1 / LONG of the
+#: record, and longer windows do not show a motion.
 LONG = 50
 
 
@@ -42,19 +42,19 @@ class Stamps:
 
     time: Array  # s, shape (n,)
     lost: Integers  # how many samples are lost after each but the last, shape (n - 1,)
-    number: Integers  # of each on the grid, shape (n,); long gaps are cut to `longest_gap`
+    number: Integers  # index on the grid, shape (n,); long gaps are cut to `longest_gap`
     interval: float  # of the grid, s
-    wander: float  # how far the stamps are off it at most, s
-    bursts: bool  # the stamps come in bursts or with jitter, and the grid is believed instead
+    wander: float  # largest deviation of the stamps from the grid, s
+    bursts: bool  # the stamps come in bursts or with jitter; the grid is used instead
 
     @property
     def longest_gap(self) -> int:
-        """Return how many samples of a gap are kept; no window crosses more."""
+        """Return the length to which longer gaps are cut, samples."""
         return _longest_gap(self.time)
 
     @property
     def burst_remarks(self) -> list[str]:
-        """Return how far stamps are off their grid, if they come in bursts."""
+        """Return a sentence on the deviation from the grid, if stamps come in bursts."""
         if not (self.bursts and self.wander):
             return []
         return [f'The stamps come in bursts or with jitter, up to {self.wander:.3g} s off an even '
@@ -62,7 +62,7 @@ class Stamps:
 
     @property
     def loss_remarks(self) -> list[str]:
-        """Return how many samples are lost, if any are."""
+        """Return a sentence on lost samples, if any."""
         if not self.lost.any():
             return []
         longest, gaps = int(np.argmax(self.lost)), int(np.count_nonzero(self.lost))
@@ -70,12 +70,12 @@ class Stamps:
                 f'the longest, of {self.lost[longest]}, is at {self.time[longest]:.3f} s.']
 
     def at(self, number: int | np.integer) -> float:
-        """Return the time of a place on the grid, s."""
+        """Return the time at an index on the grid, s."""
         return float(np.interp(number, self.number, self.time))
 
 
 def number_stamps(time: Array) -> Stamps:
-    """Find the even grid that stamps belong to, or raise `DataRefused` where there is none."""
+    """Fit an even grid to stamps, or raise `DataRefused` where there is none."""
     steps = np.diff(time)
     usual = _usual_interval(time, steps)
     bursts = float((steps < _WAITING * usual).mean()) > _BURSTS
@@ -130,7 +130,7 @@ def _usual_interval(time: Array, steps: Array) -> float:
             f'{100 * interval:.4g} s: either most samples are lost, or they come in long bursts; '
             'give the sample rate with --rate, or record again')
     whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
-    # samples are lost where nine of ten steps are whole multiples of the middle one
+    # nine of ten steps are whole multiples of the median one: samples are lost
     return (float(steps[whole & (steps < 1.5 * usual)].mean())
             if alike and float(whole.mean()) > 0.9 else interval)
 
@@ -139,13 +139,13 @@ def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> I
     """
     Return how many samples are lost in each step.
 
-    It is the number of intervals by which the stamps are late before they have caught up. What
-    waited at a host comes all at once, however much it is; the time to catch up begins after it.
+    It is the number of intervals by which the stamps remain late. Samples that were delayed at a
+    host arrive in one burst of any size; the time to catch up begins after it.
 
     """
     lost: Integers = np.zeros(len(steps), dtype=np.int64)
     shift, done = 0, 0
-    # samples over which delayed stamps catch up, and how many lost ones their wander cannot be
+    # samples within which delayed stamps catch up, and the least loss beyond their jitter
     span, least = (300, 10) if bursts else (10, 1)
     late = (time - time[0]) / interval - np.arange(len(time))
     due = np.append(np.flatnonzero(steps >= _WAITING * interval), len(steps))
@@ -162,5 +162,5 @@ def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> I
 
 
 def _numbers(lost: Integers) -> Integers:
-    """Return the number of each sample, if so many are lost before each but the first."""
+    """Return the number of each sample, by the samples lost after each but the last."""
     return np.arange(len(lost) + 1) + np.cumsum(np.concatenate([[0], lost]))

@@ -9,7 +9,7 @@
 # under the License.
 
 """
-What a gyro is: effects with values, noise; simulation and compensation with them.
+Models of gyros: effects with values, and noise; simulation and compensation.
 
 Reading order: `effects`, `channels`, `noise`, `gyro_model`, `presets`, `settings_file`,
 `model_file`, `motion`, `simulator_export`, `compensation`.

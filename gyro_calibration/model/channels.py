@@ -9,11 +9,11 @@
 # under the License.
 
 """
-Channels that need a history: time since power-on, lagged channels, the branch of a temperature.
+Channels that need a history: time since power-on, lagged channels, the sign of heating.
 
-A `History` follows a stream sample by sample, or a log in one piece or in blocks, with the same
-numbers. It remembers the lags that it is asked for: each starts at the value that its channel has
-then.
+A `History` takes a stream sample by sample, or a log as a whole or in blocks, with the same
+results. Each lag that is requested starts at the value of its channel at that time and is updated
+from then on.
 
 A lag is solved exactly for signals that are linear between their stamps. Over arrays it is a
 recurrence in rows of sqrt(n) samples, without a loop over samples; a stream and a log differ by
@@ -32,16 +32,16 @@ from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.effects.effect import lag_ahead
 import numpy as np
 
-#: What the next sample needs to know, by (channel, time constant) of a lag and ('heating', filter
-#: time, threshold) of a branch.
+#: State at the last sample, by (channel, time constant) of a lag and ('heating', filter time,
+#: threshold) of the sign of heating.
 Known = dict[tuple[Any, ...], float]
 
 
 class History:
-    """What has been, as far as effects look at it."""
+    """The state of all channels that depend on earlier samples."""
 
     def __init__(self, stand_in: float = 25.0, low: float = -math.inf, high: float = math.inf):
-        """Begin with nothing known but a temperature that stands in, and its bounds, degC."""
+        """Begin without samples; a default temperature and the bounds of temperatures, degC."""
         self._stand_in, self._low, self._high = stand_in, low, high
         self._piece: _Piece | None = None
         self._begin = 0.0
@@ -82,7 +82,7 @@ class History:
 
 
 class _Piece:
-    """One sample, or the samples of a block, after what was before."""
+    """One sample, or the samples of a block, with the state at the end of the one before."""
 
     def __init__(self, time: Number, known: Mapping[str, Number], before: _Piece | None):
         self._known = dict(known)
@@ -100,12 +100,12 @@ class _Piece:
     def signal(self, channel: str) -> Number:
         """Return a channel."""
         if channel == 'vibration' and channel not in self._known:
-            ahead = self.ahead('specific_force', 1.0)  # s: off its mean over that time
+            ahead = self.ahead('specific_force', 1.0)  # deviation from its mean over 1 s
             self._known[channel] = ahead * ahead
         return self._known.get(channel, 0.0)
 
     def ahead(self, channel: str, time_constant: float) -> Number:
-        """Return the lagged channel less the channel, which is held while it is not known."""
+        """Return the lagged channel minus the channel; the channel is held while it is unknown."""
         signal, key = self.signal(channel), (channel, time_constant)
         change = (_change(signal, self._last.get(channel, _end(signal, 0)))
                   if channel in self._known else 0.0 * self._interval)
@@ -114,7 +114,7 @@ class _Piece:
         return ahead
 
     def heating(self, filter_time: float, threshold: float) -> Number:
-        """Return the branch: the sign of the temperature rate if beyond a threshold, K/s."""
+        """Return the last sign of the temperature rate while it exceeded a threshold, K/s."""
         fast, slow = (self.ahead('temperature', lag) for lag in (0.5 * filter_time, filter_time))
         rate, key = (fast - slow) / (0.5 * filter_time), ('heating', filter_time, threshold)
         branch = _held(np.sign(rate) * (abs(rate) > threshold), self._state.get(key, 0.0))
@@ -122,7 +122,7 @@ class _Piece:
         return branch
 
     def ended(self) -> Known:
-        """Return what the next piece has to know, also of lags that were not asked for now."""
+        """Return the state at the end, including lags that were not requested in this block."""
         for key in self._state.keys() - self._ended.keys():
             (self.heating if key[0] == 'heating' else self.ahead)(*key[-2:])
         return self._ended
@@ -132,8 +132,7 @@ def channels_of(log: Log) -> Channels:
     """
     Return the channels of a whole log, with rate and output 0.
 
-    Without stamps no row is earlier than another. The heading is that of the reference, and 0
-    where there is none.
+    Without stamps all rows have time 0. The heading is that of the reference, or 0 without one.
 
     """
     time = np.zeros(len(log)) if log.time is None else log.time
@@ -143,7 +142,7 @@ def channels_of(log: Log) -> Channels:
 
 def clip(value: Number, low: float, high: float) -> Number:
     """Return a number, or an array, within bounds."""
-    # numpy makes a numpy scalar of a number, and all computations with it three times slower
+    # np.clip turns a number into a numpy scalar, which makes later computations 3 times slower
     return (np.clip(value, low, high) if isinstance(value, np.ndarray)
             else min(max(value, low), high))
 

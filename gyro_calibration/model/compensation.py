@@ -9,12 +9,12 @@
 # under the License.
 
 """
-From the output of a gyro to the rate, the same for one sample and for a whole log.
+Compensation: from the output of a gyro to the rate, the same for one sample and for a whole log.
 
-Where an effect is a function of the true rate, the equation of the model is solved by repetition
-along the secant, with a fixed number of passes, so that a sample and a log take the same steps. A
-constant slope is solved in one pass; a model of output alone needs none. There is no inverse
-formula that could differ from the simulation.
+Where an effect is a function of the true rate, the model equation is solved by secant iteration
+with a fixed number of passes, so that a sample and a log take the same steps. A constant slope
+needs one pass, and a model of the output alone none. No separate inverse formula exists that could
+differ from the simulation.
 
 """
 
@@ -28,7 +28,7 @@ from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
-#: A rate of this size, rad/s, comes of a model whose values are too large to be computed with.
+#: Rates beyond this, rad/s, are treated as overflow: the model's values are too large.
 _LARGEST = 1e300
 
 
@@ -39,15 +39,16 @@ class Compensated:
 
     Attributes
     ----------
-    modelled : rate after the model and before the self-calibration, rad/s; for self-calibrations
+    modelled : rate after the model and before the self-calibration, rad/s; input of the next
+        self-calibration
     rate : rad/s
-    temperature : degC; the nearest plausible one where the one given is not plausible
+    temperature : degC, limited to plausible temperatures
     temperature_clipped : the temperature is outside the calibrated range. Up to
         `GyroModel.used_temperatures` the correction is extrapolated, beyond that it is held
     beyond_range : the output is outside the calibrated range of rates, or not plausible, or no
-        rate explains it. Up to `GyroModel.rate_limit` the correction is extrapolated; beyond that,
-        and from where the response no longer grows with the rate, the last correction is held, so
-        that the rate is finite whatever the output
+        rate has this output. Up to `GyroModel.rate_limit` the correction is extrapolated. Beyond
+        that, and where the response no longer grows with the rate, the last correction is held, so
+        that the rate is always finite
 
     """
 
@@ -67,8 +68,8 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     ----------
     output : rad/s, a number or shape (n,)
     temperature : degC, alike; the model's reference temperature where it is None
-    surroundings : what else effects look at, from the `GyroModel.history` that followed the same
-        temperatures; needed where the model `looks_around`
+    surroundings : further channels, from the `GyroModel.history` that took the same temperatures;
+        needed where the model `looks_around`
 
     """
     given = model.reference_temperature if temperature is None else temperature
@@ -80,7 +81,7 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
 
 def _of_one(model: GyroModel, output: float, given: float,
             surroundings: Channels | None) -> Compensated:
-    """Compensate a sample that comes alone, with the same result as in a log."""
+    """Compensate a single sample, with the same result as in a log."""
     (low, high), (slowest, fastest), limit = (
         model.used_temperatures, model.rate_range, model.rate_limit)
     used, seen = min(max(given, low), high), min(max(output, -limit), limit)
@@ -101,7 +102,7 @@ def _of_one(model: GyroModel, output: float, given: float,
 def _compensated(model: GyroModel, output: Array, given: Number,
                  surroundings: Channels | None = None) -> Compensated:
     (slowest, fastest), limit = model.rate_range, model.rate_limit
-    # where all samples are inside, which two numbers show, no masks are made
+    # no masks are made where the extremes show that all samples are inside
     beyond = _outside(output, max(slowest, -limit), min(fastest, limit))
     seen = output if beyond is False else np.clip(output, -limit, limit)
     clipped, used, plausible = _outside(given, *model.valid_temperatures), given, given
@@ -112,7 +113,7 @@ def _compensated(model: GyroModel, output: Array, given: Number,
         modelled, unexplained = model.rate_in(Channels(seen, seen, used) if surroundings is None
                                               else surroundings.moving(seen, seen))
         if not -_LARGEST < modelled.sum() < _LARGEST:
-            # the model itself cannot be computed there: nothing is corrected
+            # the model overflows there: these samples are not corrected
             computed = abs(modelled) < _LARGEST
             modelled, unexplained = np.where(computed, modelled, seen), unexplained | ~computed
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
@@ -132,7 +133,7 @@ def _outside(values: Number, low: float, high: float) -> Number:
 
 
 def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
-    """Compensate what the cache holds at a time; only what is returned goes through memory."""
+    """Compensate in blocks that fit into the cache of the processor."""
     modelled, clipped, beyond = (
         np.empty(len(output)), np.zeros(len(output), bool), np.zeros(len(output), bool))
     rate = modelled if model.self_calibration is None else np.empty(len(output))
@@ -154,13 +155,13 @@ def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
 def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number,
                      surroundings: Channels | None = None) -> np.ndarray:
     """
-    Return what the rate changes by for each uncertain value of the model, shape (m, ...).
+    Return the derivative of the rate by each uncertain value of the model, shape (m, ...).
 
     First the fitted values of the model, if it has a covariance, then the `GyroModel.tolerated`
     errors, then (s, b) of the self-calibration, if there is one; the order of `covariance`. The
-    rate of the model solves ``rate = output - error(rate)``, so that what a value adds to the
-    error is divided by the steepness there: 0.5 for a sine response at 60 degrees of its phase.
-    What cannot be undone is not compensated, and changes nothing.
+    rate of the model solves ``rate = output - error(rate)``, so the derivative of the error is
+    divided by the slope of the output there: 0.5 for a sine response at a phase of 60 deg. Effects
+    that compensation cannot undo have a derivative of 0.
 
     """
     calibration, rows = model.self_calibration, []
@@ -189,7 +190,7 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
 
 def covariance(model: GyroModel) -> np.ndarray:
     """
-    Return the covariance of the uncertain values of a model, shape (m, m); nan is not known.
+    Return the covariance of the uncertain values of a model, shape (m, m); nan where unknown.
 
     The order is that of `rate_sensitivity`.
 

@@ -27,12 +27,12 @@ import numpy as np
 
 #: Plausible temperatures, degC, where no valid range is stated.
 _TEMPERATURES = (-100.0, 200.0)
-#: The response is inverted where the output grows by at least so much with the rate, 1.
+#: The response is inverted where the slope of the output over the rate is at least this, 1.
 _FLATTEST = 0.1
-#: Numbers of Python overflow without a word, and to say so for each sample would take time.
+#: Python floats need no error state of numpy; setting one for each sample would cost time.
 _AS_IT_IS = nullcontext()
-#: Largest last step of the repetition for a solution, as a part of 1 rad/s plus the rate; the
-#: error is far smaller.
+#: Largest last step of a converged iteration, relative to 1 rad/s plus the rate; the error is much
+#: smaller.
 _SETTLED = 1e-10
 
 
@@ -58,12 +58,12 @@ class Term:
 
     @cached_property
     def fitted(self) -> tuple[int, ...]:
-        """Return the places of the values that a fit finds: parameters without a default."""
+        """Return the indices of the fitted values: parameters without a default."""
         return tuple(place for place, parameter in enumerate(self.effect.parameters)
                      if parameter.default is None)
 
     def sensitivity(self, channels: Channels) -> list[Number]:
-        """Return the derivative of the error for each fitted value; 0 where nothing is added."""
+        """Return the derivative of the error by each fitted value."""
         columns, shapes = self.columns(channels), len(self.effect.shapes)
         return [self._derivative(place, channels) if place < shapes else columns[place - shapes]
                 for place in self.fitted]
@@ -79,7 +79,7 @@ class Term:
 @dataclass(frozen=True)
 class SelfCalibration:
     """
-    Scale factor error s and bias b that a run found behind the model (Hong and Park, eq. 1 to 3).
+    Scale factor error s and bias b that remain after the model (Hong and Park, eq. 1 to 3).
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class SelfCalibration:
         return self.scale * rate + self.offset
 
     def figures(self) -> dict[str, Any]:
-        """Return what there is to know, by name, in SI; None for what is not known."""
+        """Return all values by name, in SI; None for unknown ones."""
         scale_deviation, bias_deviation = (None if math.isnan(value) else value
                                            for value in self.standard_deviations)
         return {'scale_factor_error': self.scale_factor_error,
@@ -144,15 +144,15 @@ class SelfCalibration:
 @dataclass(frozen=True)
 class Tolerance:
     """
-    What a rate may be off by beyond the covariance of the values: standard deviations.
+    Errors of the rate beyond the covariance of the values: standard deviations.
 
     Attributes
     ----------
-    bias, scale_factor_error : their change from one run to the next, rad/s and 1; a
-        self-calibration finds these, and they do not count where there is one
-    bias_per_kelvin, scale_factor_error_per_kelvin : for each K beyond the temperatures that were
-        seen, rad/s/K and 1/K
-    per_rate : error of the rate for each rad/s of the output beyond those that were seen, 1
+    bias, scale_factor_error : their change from one run to the next, rad/s and 1; not used where
+        there is a self-calibration, which estimates them
+    bias_per_kelvin, scale_factor_error_per_kelvin : per K outside of the calibrated temperatures,
+        rad/s/K and 1/K
+    per_rate : error of the rate per rad/s of the output outside of the calibrated range, 1
 
     """
 
@@ -166,19 +166,19 @@ class Tolerance:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    What is known of one gyro.
+    The model of one gyro.
 
     Attributes
     ----------
     terms : its effects
     covariance : of all fitted values in the order of the terms, shape (m, m); None if unknown
-    rate_range, temperature_range : what the values were fitted on, rad/s and degC
+    rate_range, temperature_range : calibrated range of the fit, rad/s and degC
     noise : its noise figures
     noise_bounds : by name of a noise figure, the bounds that hold it with 95 % confidence
     gyro : name, serial_number, technology, as text
-    origin : files, date and program that it comes from
+    origin : files, date and program of the calibration
     self_calibration : the last one
-    tolerance : what a rate may be off by beyond the covariance
+    tolerance : errors of the rate beyond the covariance
 
     """
 
@@ -211,7 +211,7 @@ class GyroModel:
         sought = self._terms_by_rate[1]
         if not sought:
             return 1.0
-        # rad/s; small against what bends an effect, and large against the rounding of its error
+        # rad/s; small against the curvature of effects, and large against rounding errors
         step = 1e-5
         below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output))
                         for change in (-step, step))
@@ -220,10 +220,10 @@ class GyroModel:
     @cached_property
     def rate_limit(self) -> float:
         """
-        Return the largest plausible output, rad/s; this gyro reports no sample beyond it.
+        Return the largest plausible output, rad/s.
 
-        It is twice the farther end of the valid range of rates, but at least what robots reach,
-        for a model may have been fitted at rest.
+        It is twice the largest valid rate, but at least 10 rad/s, which robots reach: a model may
+        have been fitted at rest.
 
         """
         farther = max(map(abs, self.rate_range))
@@ -231,14 +231,14 @@ class GyroModel:
 
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
-        """Return plausible temperatures, degC: usual ones, and three times a stated range."""
+        """Return the plausible temperatures, degC: at least -100 to 200, and 3 times the range."""
         low, high = self.valid_temperatures
         reach = high - low if math.isfinite(sum(map(abs, self.temperature_range))) else 0.0
         return min(low - reach, _TEMPERATURES[0]), max(high + reach, _TEMPERATURES[1])
 
     @cached_property
     def valid_temperatures(self) -> tuple[float, float]:
-        """Return the temperatures, degC, that were seen; plausible ones where none is stated."""
+        """Return the calibrated temperatures, degC; the plausible ones where none are stated."""
         low, high = ((value if math.isfinite(value) else usual)
                      for value, usual in zip(self.temperature_range, _TEMPERATURES))
         return low, max(low, high)
@@ -247,13 +247,13 @@ class GyroModel:
     def used_temperatures(self) -> tuple[float, float]:
         """Return the temperatures, degC, up to which the correction is extrapolated."""
         (low, high), (coldest, hottest) = self.valid_temperatures, self.temperature_limits
-        # the width of the valid ones, but at least what a robot warms up by after a cold start
+        # the width of the valid range, but at least the warm-up of a robot after a cold start
         reach = max(high - low, 20.0)
         return max(low - reach, coldest), min(high + reach, hottest)
 
     @cached_property
     def tolerated(self) -> tuple[str, ...]:
-        """Return the names of the tolerances that count."""
+        """Return the names of the tolerances above 0 that no self-calibration replaces."""
         found = ('bias', 'scale_factor_error') if self.self_calibration else ()
         return tuple(name for name, value in vars(self.tolerance).items()
                      if value > 0.0 and name not in found)
@@ -261,10 +261,10 @@ class GyroModel:
     @cached_property
     def prior(self) -> Array | None:
         """
-        Return the standard deviations of (s, b) before a calibration, shape (2,); inf where open.
+        Return the standard deviations of (s, b) before a calibration, shape (2,); inf if unknown.
 
-        A model of a fleet holds what is usual of its type, and by its tolerance how far a unit may
-        be from that; other tolerances are those of one gyro in a laboratory, and no prior.
+        The tolerance of a fleet model is the spread between units of a type. Tolerances of other
+        models are those of one gyro in a laboratory, and not used as a prior.
 
         """
         if 'fleet' not in self.origin:
@@ -274,9 +274,9 @@ class GyroModel:
 
     def beyond(self, output: Number, temperature: Number) -> tuple[Number, Number]:
         """
-        Return how far outputs and temperatures are outside of those that were seen, rad/s and K.
+        Return how far outputs and temperatures are outside of the calibrated ranges, rad/s and K.
 
-        A temperature at which the gyro was self-calibrated was seen.
+        The range of temperatures includes that of the self-calibration.
 
         """
         low, high = self.valid_temperatures
@@ -290,8 +290,8 @@ class GyroModel:
         """
         Return the rates between which the response is inverted, rad/s.
 
-        From the valid rate nearest to zero they reach as far as the output grows with the rate at
-        all temperatures that are used, and to no rate whose output would not be plausible.
+        They begin at the valid rate nearest to zero, and end where the output no longer grows with
+        the rate at some used temperature, or where the output would not be plausible.
 
         """
         low, high = self.rate_range
@@ -318,7 +318,7 @@ class GyroModel:
             if good.all():
                 return float(distances[-1])
             first = int(np.argmin(good))
-            # the bend lies between two of these steps
+            # bisect between the last good step and the first bad one
             near, far = (np.array([steps[first + place]]) for place in (0, 1))
             for _ in range(50):
                 middle = 0.5 * (near + far)
@@ -341,7 +341,7 @@ class GyroModel:
         return any(term.effect.moved is not None for term in self.terms)
 
     def history(self) -> History:
-        """Return a history that begins now, of the temperatures that the model uses."""
+        """Return a new history, with the reference temperature and the bounds of this model."""
         return History(self.reference_temperature, *self.used_temperatures)
 
     def output(self, rate: Number, temperature: Number) -> Number:
@@ -364,7 +364,7 @@ class GyroModel:
         """
         Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``.
 
-        Effects that cannot be undone stay in it.
+        Effects that compensation cannot undo are left in it.
 
         """
         return self.rate_in(Channels(output, output, temperature))[0]
@@ -373,8 +373,8 @@ class GyroModel:
         """
         Return the rate, rad/s, at the output and the surroundings of channels.
 
-        Their rate does not matter. Also tell whether no rate of the `rate_domain` has this output;
-        the correction at the end of the domain is held there.
+        The rate of the channels is not used. The second value tells whether no rate of the
+        `rate_domain` has this output; the correction at the end of the domain is held there.
 
         """
         output, (known, sought) = channels.output, self._terms_by_rate
@@ -384,22 +384,22 @@ class GyroModel:
         seen = channels.moving(output, output)
 
         def added(rate: Number) -> Number:
-            # only here is it known, and new channels would take as long as the computation
+            # `seen` is local to this call; new channels would take as long as the computation
             seen.__dict__['rate'] = rate
             return _sum(sought, seen)
 
         return _inverse(added, given, output, self.rate_domain)
 
     def distorted(self, stage: str, signal: Array, time: Array) -> Array:
-        """Return a whole log's signal after the effects that change it at 'rate' or 'output'."""
+        """Return the signal of a log after the effects of a stage, 'rate' or 'output'."""
         for term in self.terms:
             if term.effect.distortion is not None and term.effect.stage == stage:
                 signal = term.effect.distortion(signal, time, *term.values)
         return signal
 
     def true_time(self, time: Number) -> Number:
-        """Return when a sample with a stamp of `time` was taken, both in s since power-on."""
-        # the inverse order of `distorted`: the last effect changed a signal that was moved already
+        """Return the time of measurement of a sample by its stamp, both in s since power-on."""
+        # in the inverse order of `distorted`
         for term in reversed(self.terms):
             if term.effect.moved is not None:
                 time = term.effect.moved(time, *term.values)
@@ -414,7 +414,7 @@ class GyroModel:
         return _split([term for term in self.terms if not term.effect.undone], 'rate')
 
 
-#: Effects that do not look at what is sought, which need no repetition to solve for it; others.
+#: Terms that do not depend on the unknown, which need no iteration, and terms that do.
 _Split = tuple[list[Term], list[Term]]
 
 
@@ -437,10 +437,9 @@ def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.i
     """
     Solve x = g(x) for a slope of g well below one; return x, and the last step.
 
-    The plain repetition wins a factor of the slope a pass; along the secant each pass wins more
-    than the one before, and a constant slope is solved at once. The number of passes is fixed, so
-    that a sample and a whole log take the same steps. A single sample skips those that would
-    change nothing, and is held at the bounds.
+    The secant iteration converges faster than linearly, and in one pass for a constant slope. The
+    number of passes is fixed, so that a sample and a log take the same steps. A single sample
+    skips passes that would change nothing, and is limited to the bounds.
 
     """
     a, b = start, g(start)
@@ -465,21 +464,21 @@ def _inverse(added: Callable[[Number], Number], given: Number, start: Number,
 
     Parameters
     ----------
-    added : rate -> what is added to it, rad/s
-    given : rad/s, a number or shape (n,)
-    start : where to begin, rad/s, alike
+    added : rate -> error at that rate, rad/s
+    given : output, rad/s, a number or shape (n,)
+    start : first value of the iteration, rad/s, a number or shape (n,)
     domain : lowest and highest rate, rad/s
 
     Returns
     -------
-    the rate, and whether there is none in the domain: the correction at its nearer end is used
-    there
+    the rate, and whether there is none in the domain; the correction at the nearer end of the
+    domain is used then
 
     """
     low, high = domain
     many = isinstance(given, np.ndarray)
     with np.errstate(all='ignore') if many else _AS_IT_IS:
-        # a single sample may step out of the domain and back, but only as far as can be computed
+        # a single sample may leave the domain by at most 1 rad/s during the iteration
         rate, step = _repeated(lambda x: given - added(x), start, low - 1.0, high + 1.0)
         solved = (low <= rate) & (rate <= high) & (abs(step) <= _SETTLED * (1.0 + abs(rate)))
     if solved.all() if many else solved:
@@ -504,7 +503,7 @@ def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None)
 
 
 def same_effects(model: GyroModel, other: GyroModel) -> bool:
-    """Tell whether two models compensate alike, so that a self-calibration holds for both."""
+    """Tell whether two models have the same effects, so that a self-calibration fits both."""
     first, second = ([(term.effect.name, term.values) for term in each.terms]
                      for each in (model, other))
     return first == second

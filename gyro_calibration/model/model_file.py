@@ -44,8 +44,8 @@ POLYNOMIAL = 'rate_temperature_polynomial'
 _NOISES = tuple(Noise.__dataclass_fields__)
 #: Highest order of a polynomial.
 _HIGHEST = 20
-#: Largest standard deviation of a self-calibration, rad/s and 1; beyond it double precision does
-#: not carry the variance of the heading.
+#: Largest standard deviation of a self-calibration, rad/s and 1; beyond it the variance of the
+#: heading exceeds double precision.
 _LEAST_KNOWN = 100.0
 
 
@@ -54,7 +54,7 @@ class ModelError(InputError):
 
 
 class ModelMissing(ModelError):
-    """There is no such file."""
+    """The model file does not exist."""
 
 
 def read_model(path: str | Path) -> GyroModel:
@@ -117,7 +117,7 @@ def _size(place: str, value: Any) -> float:
 
 
 def _noise(place: str, value: Any) -> float:
-    """Read a figure whose square can be divided by: 0, or none that vanishes."""
+    """Read a noise figure: 0, or large enough that its square does not underflow."""
     if 0.0 < (size := _size(place, value)) < 1.0 / LARGEST:
         raise WrongValue(place, value, f'0 where it is not known, or at least {1.0 / LARGEST}')
     return size
@@ -209,7 +209,7 @@ _OF_A_RUN = {'scale_factor_error': lambda place, value: number(place, value, low
 
 
 def _self_calibration(value: Any) -> SelfCalibration | None:
-    """Read a self-calibration; its covariance may be given by standard deviations alone."""
+    """Read a self-calibration; standard deviations may stand in for its covariance."""
     if value is None:
         return None
     place, needed = 'self_calibration', {'scale_factor_error': None, 'bias': None}
@@ -227,12 +227,12 @@ def _self_calibration(value: Any) -> SelfCalibration | None:
 
 
 def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
-    """Write a model file, completely or not at all, and return its version (see `files`)."""
+    """Write a model file atomically, and return its version (see `files`)."""
     return write_atomically(path, model_text(model).encode())
 
 
 def model_text(model: GyroModel) -> str:
-    """Return what a model file holds."""
+    """Return the text of a model file."""
     content: dict[str, Any] = {'format': FORMAT, 'version': VERSION}
     content['effects'] = effects = dict[str, Any]()
     for term in model.terms:

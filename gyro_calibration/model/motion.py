@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A known motion about one axis, of a calibration or a drive, and what a gyro reports of it."""
+"""Motion profiles about one axis, and the simulated output of a gyro in them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import simulate_noise
 import numpy as np
 
-#: Bytes of a motion profile: an hour at 100 Hz has half of it.
+#: Largest motion profile, bytes: twice the size of an hour at 100 Hz.
 BYTES = 16_000_000
 
 
@@ -38,10 +38,10 @@ class MotionError(InputError):
 @dataclass(frozen=True)
 class Motion:
     """
-    A motion, known at some times.
+    A motion, given at some times.
 
-    Between them the rate is linear where the rates are known, and the heading is linear where only
-    headings are known.
+    Between them the rate is linear where rates are given, and the heading is linear where only
+    headings are given.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Motion:
         return float(self.time[-1])
 
     def heading_at(self, time: Array) -> Array:
-        """Return the heading, rad, at any times; before and after, the motion stands."""
+        """Return the heading, rad, at any times; before and after the motion it is constant."""
         time = np.clip(time, 0.0, self.duration)
         if self.rate is None:
             return np.interp(time, self.time, self.heading)
@@ -71,7 +71,7 @@ class Motion:
         return self.heading[index] + since * (self.rate[index] + 0.5 * slope * since)
 
     def rate_at(self, time: Array) -> Array:
-        """Return the rate, rad/s, at any times; before and after it is 0."""
+        """Return the rate, rad/s, at any times; before and after the motion it is 0."""
         rate = np.gradient(self.heading, self.time) if self.rate is None else self.rate
         return np.interp(time, self.time, rate, left=0.0, right=0.0)
 
@@ -91,7 +91,10 @@ def motion_of(log: Log) -> tuple[Motion, float]:
     """
     Return the motion of the reference of a log with a time, and the time of its beginning, s.
 
-    InputError says that there is none, DataRefused that it is lost everywhere.
+    Raises
+    ------
+    InputError : the log has no reference over time
+    DataRefused : the reference has fewer than two values
 
     """
     for values, motion in ((log.reference_heading, from_headings),
@@ -107,9 +110,12 @@ def motion_of(log: Log) -> tuple[Motion, float]:
 
 def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
     """
-    Return a motion of constant rates: (duration s, rate deg/s) of each stretch.
+    Return a motion of constant rates.
 
-    The ramp to its rate, s, is at its beginning.
+    Parameters
+    ----------
+    rates : (duration, s, rate, deg/s) of each stretch
+    ramp : duration of the linear ramp at the beginning of each stretch, s
 
     """
     time, rate = [0.0], [0.0]
@@ -120,11 +126,11 @@ def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
     return from_rates(np.array(time), np.array(rate))
 
 
-#: 20 s that separate scale factor error from bias: both signs, two speeds, rests, gentle ramps,
-#: and back to the first heading.
+#: 20 s that separate scale factor error from bias: both signs, two speeds, rests, ramps of 0.5 s,
+#: and the first heading at the end.
 CALIBRATION = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30),
                      (1, 0)])
-#: 160 s of a robot on its way through a building, half of it standing or going straight.
+#: 160 s of a robot in a building, half of it at rest or on straight paths.
 ROBOT = turns([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10), (6, 0), (9.5, 10),
                (6, 0), (5, 20), (8, 0), (5, -20), (7, 0), (5, -20), (8, 0), (5, 20), (7, 0),
                (9.5, 10), (6, 0), (9.5, -10), (8, 0), (9, 0)])

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Noise of a gyro after IEEE Std 952: its parts, their Allan variances, processes and samples."""
+"""Noise of a gyro by IEEE Std 952: terms, Allan variances, processes and simulated samples."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
-#: A bias is known as the mean over so long, s, as a self-calibration takes.
+#: Averaging time of the bias estimate, s: the length of a self-calibration.
 CALIBRATED = 20.0
-#: Time constants, s, a factor of 10 apart, of the processes that stand for flicker from a second
-#: to some hours.
+#: Time constants, s, a factor of 10 apart, of the Gauss-Markov processes that approximate flicker
+#: from 1 s to some hours.
 _FLICKER = np.array([3.0, 30.0, 300.0, 3000.0])
 
 
@@ -36,8 +36,8 @@ class Noise:
 
     Attributes
     ----------
-    angle_random_walk : N, rad/√s; 0 says that it is not known
-    bias_instability : B, rad/s, so that the floor of the Allan deviation is 0.664 B
+    angle_random_walk : N, rad/√s; 0 where it is not known
+    bias_instability : B, rad/s; the floor of the Allan deviation is 0.664 B
     rate_random_walk : K, rad/s/√s
 
     """
@@ -47,12 +47,12 @@ class Noise:
     rate_random_walk: float = 0.0
 
     def rate_variance(self, interval: float) -> float:
-        """Return the variance of one sample, (rad/s)², that comes every `interval` s."""
+        """Return the variance of the white noise of samples every `interval` s, (rad/s)²."""
         return self.angle_random_walk ** 2 / interval
 
     @property
     def floor(self) -> float:
-        """Return the floor of the Allan deviation that the flicker makes, rad/s."""
+        """Return the floor of the Allan deviation by the flicker alone, rad/s."""
         return ALLAN_FLOOR * self.bias_instability
 
     def allan_variance(self, duration: Number) -> Number:
@@ -64,9 +64,9 @@ class Noise:
         """
         Return the variance of the change of a mean over `duration` s after `age` s, (rad/s)².
 
-        White noise is not included. Flicker of spectrum B² / (2 pi f), on both sides of zero, has
-        the generalized covariance -B² / pi log|t|. For means over T that are a time t apart that
-        gives 2 B² / pi (log(t / T) + 3/2), for t far above T.
+        White noise is not included. Flicker with the two-sided spectrum B² / (2 pi f) has the
+        generalized covariance -B² / pi log|t|. Means over T at a distance t far above T then
+        differ with the variance 2 B² / pi (log(t / T) + 3/2).
 
         """
         flicker = 2.0 / math.pi * self.bias_instability ** 2 * (
@@ -78,8 +78,8 @@ class Noise:
         Return time constants, s, and variance, (rad/s)², of k Gauss-Markov processes for flicker.
 
         The constants have shape (k,); all processes have the same variance. With time constants a
-        factor r apart, and B² ln(r) / pi each, the spectrum between them is B² / (2 pi f) on both
-        sides of zero.
+        factor r apart and variances of B² ln(r) / pi, the two-sided spectrum between them is
+        B² / (2 pi f).
 
         """
         constants = _FLICKER if self.bias_instability else _FLICKER[:0]
@@ -89,7 +89,7 @@ class Noise:
         """
         Return the variance, rad², of a heading after `duration` s without white noise.
 
-        The bias is known as its mean over the `CALIBRATED` s before.
+        The bias is estimated as its mean over the `CALIBRATED` s before.
 
         """
         variance = self.rate_random_walk ** 2 * (duration ** 3 + CALIBRATED * duration ** 2) / 3.0
@@ -109,10 +109,10 @@ class Noise:
 
 def known_mean(constant: Number) -> tuple[Number, Number]:
     """
-    Return the variance of the mean of a process over `CALIBRATED` s, and the covariance after.
+    Return the variance of the mean of a process over `CALIBRATED` s, and a covariance.
 
-    The process is a Gauss-Markov process of unit variance; the covariance is that of the mean with
-    the value after.
+    The process is a Gauss-Markov process of unit variance; the covariance is that of the mean and
+    the value at the end of the interval.
 
     """
     ratio = CALIBRATED / constant
@@ -124,9 +124,8 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
     """
     Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
 
-    Flicker and random walk have no variance, but their increments do (`Part.covariance`). Sums
-    whose weights add up to zero, as the error of a bias against a later bias, have the right
-    variance.
+    Flicker and random walk have no finite variance, but their increments do (`Part.covariance`).
+    The result holds for sums whose weights add up to zero, such as the difference of two biases.
 
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
@@ -138,7 +137,7 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
 
 @dataclass(frozen=True)
 class GaussMarkov:
-    """A first-order process: density of the noise that drives it, rad/s/√s, and its time, s."""
+    """A first-order process: density of the driving noise, rad/s/√s, and correlation time, s."""
 
     density: float
     correlation_time: float
@@ -146,7 +145,7 @@ class GaussMarkov:
     def allan_variance(self, duration: Array) -> Array:
         """Return the Allan variance at averaging times, s, of shape (n,) (IEEE 952, C.21)."""
         ratio = duration / self.correlation_time
-        # the difference of the exponentials loses all digits where the ratio is small
+        # a series where the difference of the exponentials would lose all digits
         series = ratio ** 3 * (2.0 / 3.0 - ratio / 2.0)
         bracket = 2.0 * ratio + 4.0 * np.expm1(-ratio) - np.expm1(-2.0 * ratio)
         bracket = np.where(ratio < 1e-3, series, bracket)
@@ -158,9 +157,9 @@ class GaussMarkov:
         return self.density * math.sqrt(0.5 * self.correlation_time)
 
     def angle_covariance(self, time: Number) -> Array:
-        """Return that of the angle, rad², as `Part.covariance` does."""
+        """Return the covariance of the angle, rad², as `Part.covariance` does."""
         ratio = np.abs(np.asarray(time, dtype=float)) / self.correlation_time
-        # ratio - 1 + exp(-ratio) loses all digits where the ratio is small
+        # a series where ratio - 1 + exp(-ratio) would lose all digits
         growth = np.where(ratio < 1e-4, ratio ** 2 * (0.5 - ratio / 6.0),
                           ratio + np.expm1(-ratio))
         return -(self.deviation * self.correlation_time) ** 2 * growth
@@ -169,7 +168,7 @@ class GaussMarkov:
 @dataclass(frozen=True)
 class Part:
     """
-    A part of the noise, by the slope of its Allan deviation (IEEE Std 952, C.1).
+    A noise term by the slope of its Allan deviation (IEEE Std 952, C.1).
 
     Its Allan variance is ``factor * coefficient² * tau ** (2 slope)``.
 
@@ -178,9 +177,9 @@ class Part:
     name: str
     symbol: str
     unit: str  # in SI
-    slope: float  # of the Allan deviation in the logarithmic chart
+    slope: float  # of log Allan deviation over log averaging time
     factor: float
-    #: Of the angle, for a coefficient of 1, as a function of the time between, up to terms that
+    #: Covariance of the angle at a time difference, for a coefficient of 1, except terms that
     #: second differences remove.
     covariance: Callable[[Number], Array]
 

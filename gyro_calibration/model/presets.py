@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Gyros by the figures of their sources, for simulations, plans and benchmarks."""
+"""Gyros by published figures, for simulations, plans and benchmarks."""
 
 from __future__ import annotations
 

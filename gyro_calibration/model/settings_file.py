@@ -9,10 +9,10 @@
 # under the License.
 
 """
-Files of settings: models, bias tables, limits.
+YAML files of settings: models, bias tables, limits.
 
-They are YAML as people write it, and data alone: nothing in them is run or names a file. A schema
-says what each name may hold.
+They are data only: nothing in them is run, and they cannot name other files. A schema states what
+each name may hold.
 
 """
 
@@ -29,11 +29,11 @@ from gyro_calibration.files import LARGEST, plain, read_bytes
 import numpy as np
 import yaml
 
-#: Bytes of such a file: a model with the covariance of 150 values has half of it.
+#: Largest file, bytes: twice the size of a model with the covariance of 150 values.
 BYTES = 1_000_000
-#: How deep lists and names may be nested, and how many there may be; YAML takes 30 us for each.
+#: Largest depth of nested lists and names, and largest number of nodes; parsing takes 30 us each.
 _DEEPEST, _MOST = 10, 50_000
-#: Shows what was given, and not all of a large value.
+#: Shortens large values in messages.
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 3
 
@@ -42,13 +42,13 @@ def read_settings(path: str | Path, most: int = BYTES) -> Any:
     """
     Read a YAML file of names, texts, numbers, true, false, null and lists.
 
-    Dates are texts, and 1e-4, which YAML 1.1 takes for a text, is a number. What a program wrote,
-    which names its format, must end with a whole line: 9.3e-06 that is cut off may be 9.3.
+    Dates are texts, and 1e-4, a text in YAML 1.1, is a number. A file that names its format, as
+    programs write it, must end with a line end: a truncated 9.3e-06 could read as 9.3.
 
     Raises
     ------
     OSError : it cannot be opened
-    ValueError : it is none; the message is a part of a sentence, with the line where it is known
+    ValueError : it is no such file; the message is part of a sentence, with the line if known
 
     """
     try:
@@ -66,7 +66,7 @@ def read_settings(path: str | Path, most: int = BYTES) -> Any:
 
 
 class WrongValue(ValueError):
-    """A value is not what its schema wants; the message is a part of a sentence."""
+    """A value does not fit its schema; the message is part of a sentence."""
 
     def __init__(self, place: str, given: Any, wanted: str):
         super().__init__(f'{plain(place[:100])} is {_SHORT.repr(given)}; wanted {wanted}')
@@ -74,18 +74,18 @@ class WrongValue(ValueError):
 
 def checked(place: str, value: Any, schema: Any) -> Any:
     """
-    Return a value as its schema reads it.
+    Return a value as parsed by its schema.
 
     Parameters
     ----------
     place : of the value in the file, such as `noise.angle_random_walk`
     value : what the file holds there
-    schema : a function of place and value; or a mapping of names to schemas, of which the file may
-        leave some out; or None, for a mapping of any names
+    schema : a function of place and value; or a mapping of names to schemas, all of them optional
+        in the file; or None, for a mapping of any names
 
     Raises
     ------
-    WrongValue : it is something else
+    WrongValue : the value does not fit the schema
 
     """
     if callable(schema):
@@ -100,14 +100,14 @@ def checked(place: str, value: Any, schema: Any) -> Any:
 
 def refuse_others(place: str, given: Mapping[str, Any],
                   known: Sequence[str] | Mapping[str, Any]) -> None:
-    """Raise `WrongValue` for a name that is not known."""
+    """Raise `WrongValue` for an unknown name."""
     for name in given:
         if name not in known:
             raise WrongValue(f'{place}.{name}', given[name], f'one of {", ".join(known)}')
 
 
 def number(place: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> float:
-    """Return a number that a gyro may have."""
+    """Return a finite number within bounds, or raise `WrongValue`."""
     if (isinstance(value, bool) or not isinstance(value, (int, float))
             or not low <= value <= high):
         least = '' if low == -LARGEST else f' of at least {low:g}'
@@ -118,22 +118,24 @@ def number(place: str, value: Any, low: float = -LARGEST, high: float = LARGEST)
 
 
 def text(place: str, value: Any) -> str:
-    """Return a text, also of what YAML takes for a number."""
+    """Return a scalar as text, also one that YAML reads as a number."""
     if isinstance(value, (list, dict)):
         raise WrongValue(place, value, 'a text')
     return str(value)
 
 
 def _line(text: object) -> str:
-    """Return a message as one line, and not all of it where it repeats the file."""
+    """Return a message as one line of at most 200 characters."""
     return ' '.join(str(text).split())[:200]
 
 
 def settings_text(content: Any) -> str:
     """
-    Return names, texts, numbers and lists as YAML, which `read_settings` reads as they were.
+    Return names, texts, numbers and lists as YAML that `read_settings` reads back unchanged.
 
-    ArithmeticError says that a number is not finite.
+    Raises
+    ------
+    ArithmeticError : a number is not finite
 
     """
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
@@ -143,8 +145,7 @@ class _Loader(yaml.SafeLoader):
     """
     Reads names, texts, numbers and lists, and refuses aliases, tags and names given twice.
 
-    A few lines with aliases unfold to gigabytes; a deep nest is more than the stack of Python
-    holds.
+    A few lines with aliases expand to gigabytes; deep nesting overflows the stack of Python.
 
     """
 
@@ -179,7 +180,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Puts a text in quotes that would be read as a number."""
+    """Quotes texts that would be read as numbers."""
 
     yaml_implicit_resolvers: dict[Any, Any] = {
         first: list(each) for first, each in yaml.SafeDumper.yaml_implicit_resolvers.items()}
@@ -188,7 +189,7 @@ class _Dumper(yaml.SafeDumper):
         return True
 
     def represent_str(self, data: str) -> Any:
-        # Outside of double quotes these would be read as ends of lines.
+        # Outside of double quotes these would be read as line ends.
         return self.represent_scalar('tag:yaml.org,2002:str', data,
                                      '"' if re.search('[\x85\u2028\u2029]', data) else None)
 
@@ -203,8 +204,8 @@ def _refuse(problem: str, at: Any) -> None:
     raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
 
 
-#: Name -> (pattern, first characters, constructor). A number of more than 400 digits is none, and
-#: would take long to read.
+#: Name -> (pattern, first characters, constructor). More than 400 digits are not read as a number,
+#: since that would take long.
 _KINDS: dict[str, tuple[str, list[str], Any]] = {
     'null': ('~|null|Null|NULL|', ['~', 'n', 'N', ''], lambda loader, node: None),
     'bool': ('true|True|TRUE|false|False|FALSE', list('tTfF'),

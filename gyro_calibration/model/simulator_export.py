@@ -9,11 +9,10 @@
 # under the License.
 
 """
-The part of a gyro model that robot simulators can hold, in their own formats.
+Export of a gyro model to the formats of robot simulators.
 
 Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from a Python configuration, MuJoCo from
-a `<gyro>` sensor. Each holds a few figures; what it cannot hold is listed, so that no one takes
-the simulated gyro for the modelled one.
+a `<gyro>` sensor. Each supports some of the parameters; the export lists those that are left out.
 
 """
 
@@ -34,10 +33,10 @@ from scipy.optimize import minimize
 
 def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:
     """
-    Return the process that comes nearest to bias instability and rate random walk.
+    Return the process that fits bias instability and rate random walk best.
 
     The logarithms of the Allan variances, angle random walk included, are compared at one
-    averaging time an octave.
+    averaging time per octave.
 
     Parameters
     ----------
@@ -47,8 +46,8 @@ def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarko
 
     Returns
     -------
-    the process, of density 0 where there is neither; and the largest error of the Allan deviation
-    from one sample to the span, as a ratio, 1
+    the process, with density 0 if both figures are 0; and the largest relative error of the Allan
+    deviation from one sample to the span, 1
 
     """
     floor, walk = noise.bias_instability, noise.rate_random_walk
@@ -64,7 +63,7 @@ def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarko
     def errors(logarithms: Array) -> Array:
         return np.log((white + process(logarithms).allan_variance(octaves)) / wanted)
 
-    longest = math.log(100.0 * span)  # from there on it is a random walk over the span
+    longest = math.log(100.0 * span)  # beyond it the process is a random walk over the span
     begins = [np.array([math.log(walk + floor / math.sqrt(time)), math.log(time)])
               for time in np.geomspace(span / 100.0, span, 5)]
     found = min((minimize(lambda x: float(np.mean(errors(x) ** 2)), begin, method='Nelder-Mead',
@@ -76,9 +75,9 @@ def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarko
 @dataclass(frozen=True)
 class Figures:
     """
-    What simulators hold of a gyro, in rad/s and s; 0 where there is none.
+    The parameters of a gyro that simulators support, in rad/s and s; 0 where there is none.
 
-    The bias is the output at rest, the white noise the standard deviation of a sample.
+    The bias is the output at rest, the white noise is the standard deviation of a sample.
 
     """
 
@@ -95,18 +94,18 @@ class Figures:
 def figures(model: GyroModel, sample_rate: float, temperature: float,
             span: float) -> tuple[Figures, float]:
     """
-    Return what simulators hold of a model.
+    Return the parameters of a model that simulators support.
 
     Parameters
     ----------
     model : with its last self-calibration
     sample_rate : of the simulated gyro, Hz
-    temperature : at which it works, degC
-    span : how long its heading is looked at, s; the wander is made right up to it
+    temperature : operating temperature, degC
+    span : longest averaging time at which the wander is fitted, s
 
     Returns
     -------
-    the figures, and the largest error of the Allan deviation by the wander, 1
+    the parameters, and the largest relative error of the Allan deviation by the wander, 1
 
     """
     interval = 1.0 / sample_rate
@@ -129,8 +128,9 @@ def _sdf(held: Figures) -> tuple[str, set[str]]:
     """
     Return the noise of the z axis for an `<imu>` in SDF.
 
-    Gazebo draws the sign of `bias_mean`, and lets it decay with the correlation time; so the bias
-    is the mean of the noise. `dynamic_bias_stddev` is the density of a Gauss-Markov process.
+    Gazebo draws the sign of `bias_mean` at random and decays it with the correlation time, so the
+    bias is exported as the mean of the noise. `dynamic_bias_stddev` is the density of a
+    Gauss-Markov process.
 
     """
     quantized = held.quantization >= 1e-6  # rad/s; Gazebo makes no smaller steps
@@ -189,8 +189,8 @@ def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list
 
     Returns
     -------
-    text for the simulator, with what it cannot hold of the model as a comment; and the same as a
-    list of sentences
+    text for the simulator, with a comment on the parameters that are left out; and these
+    parameters, one text each
 
     """
     text, names = _FORMATS[simulator](held)
@@ -212,6 +212,6 @@ def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list
     lines = ['Not held by this simulator:', *(f'  {each}' for each in left_out)]
     if simulator == 'isaac':
         return '\n'.join([*(f'# {line}' for line in lines), text, '']), left_out
-    # two hyphens would end a comment of XML
+    # two hyphens are not allowed in an XML comment
     inside = escape('\n'.join(lines)).replace('--', '- -')
     return f'<!-- {inside} -->\n{text}\n', left_out

@@ -9,9 +9,9 @@
 # under the License.
 
 r"""
-Wire formats of serial gyros: bytes to samples and back, and recognizing a format (`listening`).
+Wire formats of serial gyros: bytes to samples and back, and recognition of formats (`listening`).
 
-No port, no ROS, no clock.
+This package uses no port, no ROS and no clock.
 
 >>> decoder = find('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')

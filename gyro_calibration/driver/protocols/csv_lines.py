@@ -11,11 +11,10 @@
 """
 Numbers separated by commas, one sample a line: any gyro behind a microcontroller.
 
-The columns are named by `Settings.columns` in the words of the log format. An empty or ``nan``
-temperature, time, acceleration or supply is not known. An output that is ``nan`` or ``inf``, or
-beyond 2000 deg/s where no full scale is set, is refused: a gyro that turns faster does not come
-this way, but a line that lost its decimal point does. A line without an output is discarded, as is
-a header.
+The columns are named by `Settings.columns` in names of the log format. An empty or ``nan``
+temperature, time, acceleration or supply is unknown. An output that is ``nan`` or ``inf``, or
+beyond 2000 deg/s where no full scale is set, is refused: such values are mostly lines that lost
+their decimal point. A line without an output is discarded, as is a header.
 
 """
 
@@ -60,7 +59,7 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
         return None
     fields = dict(zip(settings.columns, texts))
     name = next(name for name in GYRO_COLUMNS if name in fields)
-    output = fields[name]  # which may be one that the decoder refuses
+    output = fields[name]  # the decoder may refuse it
     if not (_NUMBER.fullmatch(output) or _NOT_FINITE.fullmatch(output)):
         return None
     known: list[float | None] = []

@@ -52,7 +52,7 @@ def _checksum(frame: bytes) -> bytes:
 
 
 class _Parser:
-    """Joins the halves of the values that are spread over two frames."""
+    """Joins the halves of values that span two frames."""
 
     def __init__(self, settings: Settings):
         self._number, self._high = -1, 0

@@ -9,10 +9,10 @@
 # under the License.
 
 """
-Recognize the wire format that explains the bytes that came.
+Recognition of the wire format of received bytes.
 
 A line is read at each of `BAUDS` in turn, until `recognize` names a protocol. At a wrong baud the
-bytes are in no format.
+bytes fit no format.
 
 """
 
@@ -26,32 +26,32 @@ from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.protocol import LineSplitter, NUMBER
 
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
-"""Bits per second to try in this order: first those of new gyros, then others that some can do."""
+"""Bits per second, in order of the attempts: first the defaults of gyros, then others."""
 
-_LONGEST = 8192  # last bytes that are looked at, so that a growing buffer costs no more
-_FRAMES = 3  # fewer may be chance
-_ENOUGH = 0.5  # of the bytes; a line may lose or damage the rest
-_ALL = 0.95  # of the bytes, where all frames are the same: zeros may pass a weak check
-_NEARLY = 0.8  # of the share of the best format: another above it makes the result ambiguous
+_LONGEST = 8192  # number of last bytes that are used, which limits the cost
+_FRAMES = 3  # least number of frames; fewer may be chance
+_ENOUGH = 0.5  # least share of the bytes in frames; a line may lose or damage the rest
+_ALL = 0.95  # least share where all frames are equal: zeros may pass a weak check
+_NEARLY = 0.8  # the result is ambiguous if another format has this times the best share
 _NUMBERS = re.compile(NUMBER + rb'(?: *, *' + NUMBER + rb')* *')
 
 
 @dataclass(frozen=True)
 class Recognition:
     """
-    The format of some bytes.
+    The recognized format of some bytes.
 
-    The share that is explained, 0 to 1, is that of the bytes in frames of the best format, without
-    the rest of a frame at the beginning. Where the columns do not fit, it is that of the lines
-    that have as many numbers as most.
+    The explained share, 0 to 1, is that of the bytes in frames of the best format, without an
+    incomplete frame at the beginning. Where the columns do not fit, it is the share of the lines
+    with the most frequent number of columns.
 
     """
 
-    protocol: Protocol | None  # where it is one, and not too few bytes
+    protocol: Protocol | None  # None if ambiguous, or too few bytes
     explained: float
     frames: int
     runner_up: Protocol | None  # the next best format, if it explains any byte
-    words: str  # this in a sentence
+    words: str  # the result as a sentence
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class _Score:
 
 def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
     """
-    Return which format explains the bytes, of which the last 8192 are looked at.
+    Return the format that explains the last 8192 bytes.
 
-    The settings need not suffice for the format that is found; see its `Protocol.check`.
+    The settings may be incomplete for the recognized format; see its `Protocol.check`.
 
     Parameters
     ----------
-    data : all that came from the port, from anywhere on
-    settings : the format ``csv`` is recognized by the number of its columns
+    data : received bytes, from any position in a frame on
+    settings : the format ``csv`` is recognized by the number of `columns`
 
     """
     settings, data = settings or Settings(), data[-_LONGEST:]
@@ -120,7 +120,7 @@ def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
 
 
 def _numbers_of_a_line(data: bytes) -> tuple[int, float]:
-    """Return how many numbers most lines have, 0 where most have none, and their share."""
+    """Return the most frequent number of numbers in a line, 0 for none, and its share."""
     lines = [frame.data for frame in LineSplitter(1024).feed(data)]
     counts = Counter(line.count(b',') + 1 if _NUMBERS.fullmatch(line.strip()) else 0
                      for line in lines)

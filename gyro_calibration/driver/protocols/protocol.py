@@ -9,12 +9,11 @@
 # under the License.
 
 """
-What wire formats share: records, decoder from bytes to samples, and splitters of a stream.
+Common parts of wire formats: records, decoder from bytes to samples, and splitters of a stream.
 
-A format is a `Protocol`: a splitter that finds frames in a stream of bytes, a parser that makes a
-`Reading` of a frame, and a function back. A reading is in the unit of the device; sign,
-sensitivity and full scale are applied here, for all formats alike, and so are the counts of what
-was discarded, refused and lost.
+A format is a `Protocol`: a splitter that finds frames in a stream of bytes, a parser from a frame
+to a `Reading`, and a writer. A reading is in the unit of the device; sign, sensitivity and full
+scale are applied here for all formats, as are the counts of discarded, refused and lost data.
 
 """
 
@@ -45,9 +44,9 @@ ASSUMED_NOISE = math.radians(0.5)
 ASSUMED_FORCE_NOISE = 0.1
 """m/s², standard deviation of a specific force: 0.01 g, beyond the noise of any such unit."""
 
-_TEMPERATURES = -100.0, 300.0  # degC; beyond them no sensor of a gyro reports
-_MOST_DEVIATION = 0.05  # of the sample rate; the clocks of gyros are 2 to 3 % off
-_LEARNING = 0.05  # of the average length of a frame, a frame
+_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
+_MOST_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
+_LEARNING = 0.05  # weight of a frame in the average length
 
 
 @dataclass(frozen=True)
@@ -61,11 +60,11 @@ class Sample:
     temperature : degC; None where the device sends none with this sample
     time : seconds, by the clock of the device
     sequence : count of the device, modulo `Protocol.modulus`
-    missing : samples that seem to be lost directly before this one: damaged, called invalid by the
-        device, or refused. A sequence, or the time that passed, knows better.
+    missing : estimated samples lost directly before this one: damaged, marked as invalid by the
+        device, or refused. A sequence or the elapsed time has priority.
     specific_force : m/s², along the input axis
-    health : what else the device reports of itself with this sample, by names with their units:
-        ``supply_v``, ``source_current_a``
+    health : further values of the device with this sample, by names with units: ``supply_v``,
+        ``source_current_a``
 
     """
 
@@ -81,20 +80,19 @@ class Sample:
 @dataclass(frozen=True)
 class Settings:
     """
-    How a gyro is wired and scaled; None stands for the value of its protocol.
+    Mounting and scaling of a gyro; None is the default of its protocol.
 
     Attributes
     ----------
     sensitivity : rad/s per count, or per unit of the device
     invert : whether the device counts clockwise turns positive
     axis : ``'x'``, ``'y'`` or ``'z'``: the one to read of a gyro with three
-    columns : of the protocol ``csv``, in the words of the log format; columns with other names are
+    columns : of the protocol ``csv``, in names of the log format; columns with other names are
         skipped
-    full_scale : rad/s; samples beyond it are refused, since the device cannot mean them
+    full_scale : rad/s; samples beyond it are refused
     increments : whether the device is set to send the angle since its last sample in place of the
         rate
-    sample_rate : Hz, that the device is set to; an increment divided by the interval of this rate
-        is the rate of turn
+    sample_rate : setting of the device, Hz; an increment times this rate is the rate of turn
 
     Raises
     ------
@@ -131,11 +129,11 @@ class Settings:
 @dataclass(frozen=True)
 class Reading:
     """
-    What one frame holds.
+    The content of one frame.
 
-    The value is in the unit of the device and in its own sense of rotation, with whether the
-    device calls it valid. A frame without a value, None, is in order, but is none of a rate. The
-    rest is as in `Sample`.
+    The value is in the unit and the sense of rotation of the device; `valid` is the status that
+    the device reports. A correct frame without a rate has the value None. The rest is as in
+    `Sample`.
 
     """
 
@@ -150,22 +148,22 @@ class Reading:
 
 @dataclass(frozen=True)
 class Written(Reading):
-    """A reading that a device writes: it has a value, and a sequence from 0 on without wraps."""
+    """A reading that an emulated device writes: with a value, and a sequence without wraps."""
 
     value: float
     sequence: int = 0
 
 
 def count(value: float, bits: int = 16) -> int:
-    """Return the nearest signed number of so many bits, at whose ends a device saturates."""
+    """Return the nearest signed integer of a number of bits, with saturation."""
     return min(max(round(value), -1 << bits - 1), (1 << bits - 1) - 1)
 
 
 Parse = Callable[[bytes], 'Reading | None']
-"""Makes a reading of a frame, or None of one that is none; may remember the frames before."""
+"""Parses a frame to a reading, or None if it is not valid; may use earlier frames."""
 
 Write = Callable[[Written], bytes]
-"""Makes the bytes of a reading; may remember the readings before."""
+"""Makes the bytes of a reading; may use earlier readings."""
 
 Given = TypeVar('Given')
 Made = TypeVar('Made')
@@ -173,19 +171,19 @@ Made = TypeVar('Made')
 
 def stateless(make: Callable[[Given, Settings], Made]
               ) -> Callable[[Settings], Callable[[Given], Made]]:
-    """Return the `Protocol.parser` or `writer` of a format whose frames stand for themselves."""
+    """Return the `Protocol.parser` or `writer` of a format with independent frames."""
     return lambda settings: lambda given: make(given, settings)
 
 
 class Frame(NamedTuple):
-    """A frame, and how many bytes before it belong to none."""
+    """A frame, and the number of bytes before it outside of frames."""
 
     data: bytes
     garbage: int
 
 
 class Splitter:
-    """Finds frames in bytes that come in any pieces; holds back no more than one frame."""
+    """Finds frames in bytes that come in any pieces; buffers at most one frame."""
 
     def __init__(self) -> None:
         self._tail, self._garbage, self.discarded_bytes = b'', 0, 0
@@ -195,7 +193,7 @@ class Splitter:
         raise NotImplementedError
 
     def reset(self) -> None:
-        """Drop the frame that has begun: the next bytes do not continue it."""
+        """Discard an incomplete frame: the next bytes do not continue it."""
         self._discard(len(self._tail))
         self._tail, self._garbage = b'', 0
 
@@ -209,14 +207,14 @@ class Splitter:
 
 
 def check_rates(settings: Settings) -> None:
-    """Raise ValueError where increments are asked of a device that can only send rates."""
+    """Raise ValueError if increments are set for a device that sends rates only."""
     if settings.increments:
         raise ValueError('increments is set, but this gyro sends rates, not angles: leave '
                          'increments out')
 
 
 def check_counts(settings: Settings) -> None:
-    """Raise ValueError where counts, whose size differs by unit, have no sensitivity."""
+    """Raise ValueError if a device that sends counts has no sensitivity."""
     check_rates(settings)
     if settings.sensitivity is None:
         raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the rad/s '
@@ -231,25 +229,24 @@ class Protocol:
     Attributes
     ----------
     name, description : str
-    baud : bits per second of the line, which has 8 data bits, no parity and 1 stop bit
+    baud : bits per second, with 8 data bits, no parity and 1 stop bit
     rate : nominal samples per second; see `nominal_rate`
     sensitivity : rad/s per unit of the device, or rad where it sends increments
     splitter : returns a new `Splitter`
-    parser : ``parser(settings)`` returns what parses the frames of one connection, see `Parse` and
-        `stateless`
-    writer : ``writer(settings)`` returns what writes the frames of one device, see `Write` and
-        `stateless`
+    parser : ``parser(settings)`` returns the parser of one connection, see `Parse` and `stateless`
+    writer : ``writer(settings)`` returns the writer of one device, see `Write` and `stateless`
     invert : whether the device counts clockwise turns positive
     full_scale : rad/s
-    largest_count : of a device that counts; its full scale is then this many times the sensitivity
-    noise_density : white noise of the rate, rad/s/√Hz, where the data sheet of the gyro is known
-    increments : whether the device sends angles since its last sample, if nothing else is set
-    startup : what makes the device send
-    preamble : what the emulated device sends first, so that its first sample is not taken for the
+    largest_count : of a device that sends counts; the full scale is this times the sensitivity
+    noise_density : white noise of the rate, rad/s/√Hz, by the data sheet of the gyro; None if not
+        known
+    increments : whether the device sends angles since its last sample by default
+    startup : request to the device to send
+    preamble : first bytes of the emulated device, so that its first sample is not taken for the
         rest of a line
-    modulus : at which the sequence of the device begins anew; 0 where it has none
-    good : between which the values of `Sample.health` should be
-    check : ``check(settings)`` raises ValueError when the format needs more
+    modulus : of the sequence of the device; 0 where it has none
+    good : normal ranges of the values of `Sample.health`
+    check : ``check(settings)`` raises ValueError if settings are missing or wrong
 
     """
 
@@ -299,7 +296,7 @@ class Protocol:
 
     def encode(self, sample: Sample, settings: Settings | None = None,
                valid: bool = True) -> bytes:
-        """Return what a device, just turned on, sends for a sample; see `encoder`."""
+        """Return the bytes of a device that was just turned on for a sample; see `encoder`."""
         return self.encoder(settings)(sample, valid)
 
     def nominal_rate(self, settings: Settings) -> float:
@@ -311,7 +308,7 @@ class Protocol:
         return self.increments if settings.increments is None else settings.increments
 
     def wrong_rate(self, settings: Settings, period: float) -> str:
-        """Return a warning where angles come at another period, s, than rates are made of."""
+        """Return a warning if angles come at another period, s, than that of the sample rate."""
         rate = self.nominal_rate(settings)
         if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MOST_DEVIATION:
             return ''
@@ -343,14 +340,14 @@ class Protocol:
 
 class Decoder:
     """
-    Turns the bytes of one gyro into samples; raises on no input, and holds no more than one frame.
+    Decodes the bytes of one gyro to samples; never raises, and buffers at most one frame.
 
-    What a format sends in several frames is joined only if nothing was lost between them. A
-    refused sample is missing before the next one; a refused temperature is left out of its sample.
+    Values that span several frames are joined only if nothing was lost between them. A refused
+    sample counts as missing before the next one; a refused temperature is left out of its sample.
 
     Attributes
     ----------
-    faults : frames whose value the device itself calls invalid
+    faults : frames whose value the device marks as invalid
     refused_samples : frames whose value is not finite, or beyond full scale
     refused_temperatures : not finite, or beyond -100 to 300 degC
 
@@ -368,7 +365,7 @@ class Decoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Return how many bytes belonged to no frame."""
+        """Return the number of bytes outside of frames."""
         return self._splitter.discarded_bytes + self._refused_bytes
 
     def feed(self, data: bytes) -> list[Sample]:
@@ -377,14 +374,14 @@ class Decoder:
         return [sample for sample in samples if sample is not None]
 
     def reset(self) -> None:
-        """Drop the frame that has begun, as after the port was lost; the counts go on."""
+        """Discard an incomplete frame, as after a loss of the port; the counts are kept."""
         self._splitter.reset()
         self._parse = self._parser()
         self._garbage, self._skipped, self._begun = 0, 0, False
 
     def _sample(self, frame: Frame) -> Sample | None:
         if frame.garbage:
-            self._parse = self._parser()  # the last frame is not the one directly before
+            self._parse = self._parser()  # the previous frame is not adjacent
             self._garbage += frame.garbage
         reading = self._parse(frame.data)
         if reading is None:
@@ -399,7 +396,7 @@ class Decoder:
             self.refused_samples += reading.valid
             self._skipped += 1
             return None
-        # frames that were discarded or skipped before this one; 0 for the first
+        # number of frames that were discarded or skipped before this one; 0 for the first
         length = len(frame.data)
         self._length += (_LEARNING if self._length else 1.0) * (length - self._length)
         missing = self._skipped + round(self._garbage / self._length) if self._begun else 0
@@ -420,15 +417,15 @@ _LINE_END = re.compile(rb'[\r\n]')
 
 class LineSplitter(Splitter):
     """
-    Gives whole lines without their ends, and no empty ones.
+    Splits bytes into complete, nonempty lines without their ends.
 
-    A port is opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``: so the first
-    line is discarded, unless it begins as only whole lines do.
+    A port may be opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``. So the
+    first line is discarded, unless it begins as only complete lines do.
 
     Parameters
     ----------
     longest : bytes; a longer line is discarded, so that an endless one does not fill the memory
-    beginnings : with what only a whole line begins
+    beginnings : first bytes that occur only at the beginning of a line
 
     """
 
@@ -457,14 +454,14 @@ class LineSplitter(Splitter):
         return whole
 
     def reset(self) -> None:
-        """Drop the line that has begun."""
+        """Discard an incomplete line."""
         super().reset()
         self._begun = self._too_long = False
 
 
 class FrameSplitter(Splitter):
     """
-    Gives frames that match a pattern and pass their check; after garbage it tries the next byte.
+    Splits bytes into frames that match a pattern and pass their check, from any byte on.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ from gyro_calibration.driver.protocols.protocol import (
 )
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
-# what the firmware sends when it is not asked for more
+# default output of the firmware
 _ANGLES = re.compile(rb'#YPR=' + NUMBER + rb'(?:,' + NUMBER + rb'){2} *')
 _FORCE = STANDARD_GRAVITY / 256.0
 _TURNED = {'x': 1.0, 'y': -1.0, 'z': -1.0}  # from forward, right, down to forward, left, up

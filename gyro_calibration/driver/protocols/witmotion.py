@@ -47,7 +47,7 @@ _NUMBERS = struct.Struct('<2x4h')
 
 
 class _Parser:
-    """Gives each rate with the acceleration of the frames before it."""
+    """Joins each rate with the acceleration of the preceding frame."""
 
     def __init__(self, settings: Settings):
         self._axis = 'xyz'.index(settings.axis)

@@ -8,11 +8,11 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 """
-What stands between the true rate and the output of a gyro: the one place of each formula.
+Errors of a gyro: the formula of each effect between the true rate and the output.
 
-Simulation, calibration, diagnosis and compensation meet here. Most effects add
-``sum(columns(channels, *shapes) * values)`` to the output. Others change the signal itself, such
-as a delay, or rounding.
+Simulation, calibration, diagnosis and compensation use the same formulas. Most effects add
+``sum(columns(channels, *shapes) * values)`` to the output. Others, such as a delay or rounding,
+change the signal itself.
 
 Reading order, each imports only from those before it: `effect` (the records: channels, parameters,
 effects; the lag), `polynomial` (of Ojeda, Chung and Borenstein), `catalogue` (all others).

@@ -8,11 +8,11 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 """
-All effects but the polynomial, each a record with its formula.
+All effects except the polynomial, each a record with its formula.
 
-First those of rate and temperature alone, which dwells of a rate table show; then those of the
-temperatures of the past, of the time since power-on, of what is around the gyro, and those that
-change the signal itself. A new effect is one more record here.
+In this order: effects of rate and temperature alone, which dwells of a rate table show; of past
+temperatures; of the time since power-on; of the surroundings; and effects that change the signal
+itself. A new effect is one more record here.
 
 """
 
@@ -55,7 +55,7 @@ SINE_RESPONSE = Effect(
     lambda channels, k: (np.sin(k * channels.rate) / k - channels.rate,),
     (Parameter('k', 's', bounds=(1e-3, 30.0)),), 'turn at many speeds up to full scale')
 
-#: From where the effects of temperature count, degC.
+#: Temperature at which the effects of temperature are zero, degC.
 _REFERENCE_TEMPERATURE = Parameter('reference_temperature', 'degC', 25.0)
 BIAS_TEMPERATURE = Effect(
     'bias_temperature', 'The bias changes in proportion to the temperature.',
@@ -75,7 +75,7 @@ SCALE_FACTOR_TEMPERATURE = Effect(
 
 
 def _temperature_ahead(channels: Channels, time_constant: float) -> Number:
-    """Return what the lagged temperature is above the temperature, K."""
+    """Return the lagged temperature minus the temperature, K."""
     if channels.lagged is None:
         return 0.0
     return channels.lagged('temperature', time_constant) - channels.temperature
@@ -170,13 +170,13 @@ _OF_SURROUNDINGS = (
 
 
 def _at(when: Array, time: Array, signal: Array) -> Array:
-    """Return a signal at other times; beyond its ends it stays."""
-    # Straight lines between samples would look like a delay in quick motion.
+    """Return a signal at other times; beyond its ends it is constant."""
+    # Linear interpolation would look like a delay in fast motion.
     return np.asarray(CubicSpline(time, signal)(np.clip(when, time[0], time[-1])))
 
 
 def _lagged(signal: Array, time: Array, time_constant: float) -> Array:
-    """Return the signal through a lag, which takes it for straight between 4 points a sample."""
+    """Return the signal through a lag, interpolated at 4 points a sample."""
     count = len(time)
     finer = np.interp(np.arange(4 * (count - 1) + 1) / 4, np.arange(count), time)
     return lagged_signal(_at(finer, time, signal), finer, time_constant)[::4]
@@ -222,26 +222,26 @@ QUANTIZATION = Effect(
     distortion=lambda signal, _time, step: np.round(signal / step) * step, stage='output',
     undone='What was rounded away is lost; noise above half a step keeps its mean.')
 
-#: Those of rate and temperature alone, which dwells of a rate table can show.
+#: Effects of rate and temperature alone, which dwells of a rate table can show.
 STEADY = {effect.name: effect for effect in (
     BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY, QUADRATIC_NONLINEARITY, CUBIC_NONLINEARITY,
     SINE_RESPONSE, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
-#: All that a model may hold, except the polynomial.
+#: All effects except the polynomial.
 CATALOGUE = STEADY | {effect.name: effect for effect in (
     *_OF_PAST_TEMPERATURES, *_OF_TIME, *_OF_SURROUNDINGS, *_OF_THE_SIGNAL, SATURATION,
     QUANTIZATION)}
-#: Effects of the user's own, which `add_effects` put into the catalogue.
+#: Effects of the user, which `add_effects` added to the catalogue.
 ADDED: dict[str, Effect] = {}
 
 
 def add_effects(effects: Iterable[Effect]) -> None:
     """
-    Put effects of one's own into the catalogue, for models and for the diagnosis of logs.
+    Add effects of the user to the catalogue, for models and for the diagnosis of logs.
 
     Raises
     ------
-    ValueError : if one is no `Effect`, has a name that is taken, or a shape to be fitted without
-        values to begin with, or if its columns do not fit to its coefficients
+    ValueError : an item is no `Effect`, its name is taken, a nonlinear parameter that is to be
+        fitted has no initial values, or the columns do not match the coefficients
 
     """
     rate = np.linspace(-1.0, 1.0, 5)

@@ -9,17 +9,16 @@
 # under the License.
 
 """
-An effect, its parameters, and what it may look at: the records; and a lag of first order.
+The records of an effect, its parameters and its input channels; and a first-order lag.
 
-An effect is a record and a model is a tuple of them, without subclasses or a registry: effects are
-combined in any way since each only adds columns. Effects on the signal (a delay, a lag, rounding)
-are no function of one instant and add no column; they are simulated where they happen, and
-`undone` says what compensation leaves of them.
+An effect is a record and a model is a tuple of effects. Effects are combined in any way, since
+each only adds columns. Effects on the signal (a delay, a lag, rounding) are no function of one
+instant and add no column; they are simulated at their stage, and `undone` states what compensation
+leaves of them.
 
-A parameter with a default is a convention (a temperature to count from, a centre, a scale) and is
-not fitted. One without a default is a property of the gyro, is fitted, and has a place in the
-covariance. `nested` gives the sum of the columns in less time than the columns take; a test
-compares both.
+A parameter with a default is a convention (a reference temperature, a centre, a scale) and is not
+fitted. One without a default is a property of the gyro, is fitted, and is part of the covariance.
+`nested` computes the sum of the columns faster than the columns; a test compares both.
 
 """
 
@@ -36,11 +35,10 @@ import numpy as np
 @dataclass(frozen=True)
 class Channels:
     """
-    What an effect may look at, of one instant (numbers) or of many (arrays of shape (n,)).
+    Inputs of effects, at one instant (numbers) or at many (arrays of shape (n,)).
 
-    What needs more than one instant is made by `history`: the channels ``lagged`` and ``heating``.
-    Without them nothing is known of the past, and everything is taken to have been as it is for
-    ever.
+    The channels ``lagged`` and ``heating`` depend on earlier samples; `model.channels` makes them.
+    Without them the past is taken to be constant.
 
     Attributes
     ----------
@@ -54,8 +52,8 @@ class Channels:
     lagged : (channel, time constant) -> the channel through a first-order lag; channels are
         'temperature', 'specific_force', and 'vibration', the squared deviation of the specific
         force from its own mean over 1 s
-    heating : (filter time, s, threshold, K/s) -> 1 since the temperature rose, -1 since it fell,
-        and 0 before either was known
+    heating : (filter time, s, threshold, K/s) -> 1 after the temperature rose, -1 after it fell,
+        0 before either
 
     """
 
@@ -71,14 +69,14 @@ class Channels:
 
     def moving(self, rate: Number, output: Number) -> Channels:
         """Return the same surroundings with another rate and output."""
-        # The constructor takes three times as long.
+        # The constructor would take three times as long.
         other = object.__new__(Channels)
         other.__dict__.update(self.__dict__, rate=rate, output=output)
         return other
 
     @staticmethod
     def of(rate: Number, output: Number, temperature: Number) -> Channels:
-        """Return channels with these alone, in a third of the time of the constructor."""
+        """Return channels without history, in a third of the time of the constructor."""
         other = object.__new__(Channels)
         other.__dict__.update(rate=rate, output=output, temperature=temperature)
         return other
@@ -91,11 +89,11 @@ class Channels:
 @dataclass(frozen=True)
 class Parameter:
     """
-    A coefficient or a shape: its name, unit, the value taken where none is given, and its bounds.
+    A coefficient or a nonlinear parameter: name, unit, default value and bounds.
 
-    A shape with a default is a convention, such as a temperature to count from; one without is a
-    property of the gyro, and is fitted. `begin_with` holds the values of a shape with which the
-    search of a diagnosis begins.
+    A parameter with a default is a convention, such as a reference temperature; one without is a
+    property of the gyro, and is fitted. `begin_with` holds the initial values of a nonlinear
+    parameter in the search of a diagnosis.
 
     """
 
@@ -113,22 +111,22 @@ class Effect:
 
     Attributes
     ----------
-    name : as in the catalogue; files hold it
-    cause : one sentence for people
+    name : as in the catalogue and in files
+    cause : one sentence for users
     looks_at : the channels that it uses
-    coefficients : what multiplies the columns
-    columns : (channels, *shapes) -> one column a coefficient
-    shapes : what the columns depend on, other than the channels
-    shown_by : what to do so that data show it, apart from what looks like it
+    coefficients : factors of the columns
+    columns : (channels, *shapes) -> one column per coefficient
+    shapes : nonlinear parameters, on which the columns depend
+    shown_by : experiment that separates it from similar effects
     nested : (channels, shapes, coefficients) -> the sum of the columns times the coefficients,
-        where there is a shorter way to it
+        where a faster formula exists
     distortion : (signal, time, *values) -> signal, of a whole log, for an effect that adds nothing
         but changes the signal itself
     stage : of the distortion: 'rate' before anything is added to the rate, or 'output' after the
         noise
-    moved : (time, *values) -> time, of an effect that is undone by moving the stamps
-    undone : what of the effect compensation cannot undo, as a sentence; '' where it undoes all
-    along : the channel along which a diagnosis draws it
+    moved : (time, *values) -> time, of an effect that is compensated by shifting the stamps
+    undone : the part of the effect that compensation leaves, as a sentence; '' for none
+    along : channel of the abscissa of its plot in a diagnosis
 
     """
 
@@ -167,31 +165,31 @@ class Effect:
 def lag_ahead(interval: Number, change: Number, time_constant: float,
               ahead: float = 0.0) -> Number:
     """
-    Return what a lagged signal is ahead of the signal, of one instant or of many (shape (n,)).
+    Return the lagged signal minus the signal, at one instant or at many (shape (n,)).
 
-    A lag obeys ``time_constant * d(lagged)/dt = signal - lagged``, here exactly for a signal that
-    is linear between its samples. What it is ahead decays by exp(-x) over an interval of x time
-    constants, and a change of the signal by d takes ``d (1 - exp(-x)) / x`` away from it.
+    A lag obeys ``time_constant * d(lagged)/dt = signal - lagged``, solved exactly for a signal
+    that is linear between its samples. The difference decays by exp(-x) over an interval of x time
+    constants, and a change d of the signal reduces it by ``d (1 - exp(-x)) / x``.
 
     Parameters
     ----------
-    interval : since the sample before, s, not negative
-    change : of the signal since the sample before
+    interval : since the previous sample, s, not negative
+    change : of the signal since the previous sample
     time_constant : s, above 0
-    ahead : what the lagged signal was ahead at the sample before the first one
+    ahead : the difference at the sample before the first one
 
     """
     if not isinstance(interval, np.ndarray):
         x = interval / time_constant
         return math.exp(-x) * ahead + change * (math.expm1(-x) / x if x else -1.0)
-    # intervals of no length leave the formulas a number
+    # an interval of 0 must not give 0 / 0
     x = np.maximum(interval / time_constant, 1e-300)
     fallen = np.expm1(-x)
     return _recurrence(fallen + 1.0, change * (fallen / x), ahead)
 
 
 def lagged_signal(signal: Array, time: Array, time_constant: float) -> Array:
-    """Return a signal, shape (n,), through a lag that starts in its first value."""
+    """Return a signal, shape (n,), through a lag that starts at its first value."""
     interval, change = np.diff(time, prepend=time[:1]), np.diff(signal, prepend=signal[:1])
     return signal + lag_ahead(interval, change, time_constant)
 
@@ -200,8 +198,8 @@ def _recurrence(factors: Array, added: Array, before: float) -> Array:
     """
     Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,).
 
-    Rows of sqrt(n) samples go on side by side, each from zero; then each gets what the row before
-    it has come to.
+    Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
+    row before is propagated through each row.
 
     """
     count = len(factors)

@@ -9,7 +9,7 @@
 # under the License.
 
 """
-The error polynomial over output and temperature, and its matrix as the paper has it.
+The error polynomial over output and temperature, and its matrix in the form of the paper.
 
 The polynomial is one of the output, not of the true rate: Ojeda, Chung and Borenstein regress the
 error on the output, so that compensation is one subtraction (their eq. 13). Its powers are centred
@@ -48,7 +48,7 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
                temperature_centre: float, temperature_scale: float) -> tuple[Number, Number]:
         output = channels.output - output_centre
         output /= output_scale
-        if not temperature_order:  # then the temperature need not be known
+        if not temperature_order:  # the temperature may be unknown
             return output, 0.0 * output
         temperature = channels.temperature - temperature_centre
         temperature /= temperature_scale
