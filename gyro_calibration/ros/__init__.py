@@ -9,10 +9,10 @@
 # under the License.
 
 """
-The nodes: samples, wheels and services on topics, joined to the computing modules.
+ROS 2 nodes: the computing modules with topics, services and parameters.
 
-`pipeline` and `calibration_session` are what a node does with samples, commands and time, without
-rclpy; the nodes join them to topics.
+`pipeline` and `calibration_session` process samples, commands and time without rclpy; the nodes
+connect them to topics.
 
 Reading order: `parameters`, `clock`, `runner`, `diagnostics`, `health_monitor`, `state_store`,
 `wheels`, `driver_report`, `driver_node`, `recorder_node`, `calibration_session`, `pipeline`,

@@ -9,15 +9,14 @@
 # under the License.
 
 """
-Calibrations on a robot, without rclpy: what a run collects, who drives, and what it gives.
+Calibration runs on a robot, without rclpy: data collection, drive, guards and fit.
 
-Samples, odometry and commands go in with the time of the steady clock; commands come out through
-`send`. Every guard of a drive looks at the steady clock, whatever ROS time does. A run ends with
+Inputs are samples, odometry and commands with the time of the steady clock; commands are sent
+through `send`. All guards of a drive use the steady clock, not ROS time. A run ends with
 `Run.reason` set ('' where its samples are complete); `CalibrationSession.conclude` then fits it.
 
-A foreign command is one that was not sent here: the own commands come back on `cmd_vel` in the
-order in which they were sent, and any other command is that of another node, also a zero among
-zeros.
+A foreign command is one of another node: own commands come back on `cmd_vel` in the order of
+sending, and every other command is foreign, also an additional zero.
 
 """
 
@@ -62,30 +61,30 @@ from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-#: Length of a calibration of the bias alone, s.
+#: Duration of a calibration of the bias alone, s.
 _REST_DURATION = 15.0
-#: After whole turns are finished the robot rests for this time, s.
+#: Duration of the rest after whole turns, s.
 MARKED = 2.5
-#: A run that waits for `finish` ends after this time, s.
+#: Longest duration of a run that waits for `finish`, s.
 LONGEST = 600.0
-#: A run that does not drive the robot ends after this time without a sample, s.
+#: Time without a sample after which a run without a drive ends, s.
 SILENCE = 5.0
-#: A robot is driven on for this time, s, or this number of intervals, after the last sample.
+#: Time without a sample, s or intervals, after which a drive ends; the longer one applies.
 BLIND, _BLIND_INTERVALS = 0.25, 4.0
-#: Another node must receive the commands within this time, s; discovery may take 3 s.
+#: Longest wait for a node that receives the commands, s; discovery may take 3 s.
 DISCOVERY = 5.0
-#: After the last command the robot may turn on for this time, s: latency and deceleration.
+#: Longest turn of the robot after the last command, s: latency and deceleration.
 STOPPING = 1.5
-#: Odometry headings that change by less than this over a run show no turn, rad.
+#: Least change of the odometry heading over a run that shows a turn, rad.
 _TURNED = 1.0 * DEGREE
-#: Own commands that have not come back yet; at 50 Hz that is 5 s.
+#: Largest number of own commands that have not come back; 5 s at 50 Hz.
 _ECHOES = 256
-#: A node that was held up for this time, s, does not go on with a drive: the base itself has
-#: stopped, or turned on.
+#: Longest pause of the node in a drive, s: after it the base has stopped by itself, or turned
+#: on.
 _HELD_UP = 1.0
-#: In a drive stamps and clock are compared over this time, s: a jump of the stamps shows in it.
+#: Time over which stamps and clock are compared in a drive, s; it shows a jump of the stamps.
 _DRIVEN = 2.0
-#: The zero that ends a drive is repeated for this time, s: the link to the base may lose one.
+#: Duration of repeated zero commands after a drive, s: the link to the base may lose some.
 _REPEATED = 1.0
 
 
@@ -94,20 +93,20 @@ class Run:
     """A calibration in progress."""
 
     kind: str  # PROFILE, ODOMETRY, TURNS or REST
-    duration: float  # of the motion that is compared, s; inf until `CalibrationSession.finish`
-    after: float  # further samples that are wanted, s
-    received: float  # when the last sample, or else the request, came, s of the steady clock
+    duration: float  # of the compared motion, s; inf until `CalibrationSession.finish`
+    after: float  # duration of samples after the motion, s
+    received: float  # time of the last sample, or of the request, s of the steady clock
     motion: Motion | None = None  # the profile
-    reason: str | None = None  # why it ended; '' where its samples are complete
+    reason: str | None = None  # reason of the end; '' where the samples are complete
     times: list[float] = field(default_factory=list)  # stamps, s
     outputs: list[float] = field(default_factory=list)  # rad/s
     rates: list[float] = field(default_factory=list)  # after the model, rad/s
     temperatures: list[float] = field(default_factory=list)  # degC
-    #: Stamp, s, heading, rad, and rate, rad/s, of each message.
+    #: Stamp, s, heading, rad, and rate, rad/s, of each odometry message.
     odometry: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, time: float, output: float, rate: float, temperature: float | None) -> None:
-        """Take a sample; the temperature in degC, where it is known."""
+        """Add a sample; temperature in degC, or None if unknown."""
         self.times.append(time)
         self.outputs.append(output)
         self.rates.append(rate)
@@ -115,14 +114,14 @@ class Run:
             self.temperatures.append(temperature)
 
     def finish(self) -> str:
-        """Let the motion be over now; return what the robot must do still."""
+        """End the motion now; return the remaining instruction for the user."""
         self.duration = min(self.duration, self.elapsed)
         left = self.duration + self.after - self.elapsed
         return f'leave the robot at rest for {left:.1f} s more'
 
     @property
     def over(self) -> str | None:
-        """Return '' where the samples are complete, why they never will be, or None."""
+        """Return '' if the samples are complete, the reason of a time-out, or None."""
         if self.elapsed >= self.duration + self.after:
             return ''
         if math.isinf(self.duration) and self.elapsed > LONGEST:
@@ -137,12 +136,12 @@ class Run:
 
     @property
     def total(self) -> float:
-        """Return how long it takes at most, s."""
+        """Return the longest duration of the run, s."""
         return LONGEST if math.isinf(self.duration) else self.duration + self.after
 
     @property
     def progress(self) -> float:
-        """Return which part is done."""
+        """Return the completed fraction, 0 to 1."""
         return min(self.elapsed / self.total, 1.0)
 
     @property
@@ -159,21 +158,21 @@ class Run:
 
 @dataclass(frozen=True)
 class Rules:
-    """What a run is accepted by; 0 `turns` takes the number that the gyro shows."""
+    """Criteria for accepting a run; with 0 `turns` the gyro determines their number."""
 
     limits: Limits = Limits()
     odometry: Reference = Reference()
     turns: int = 0
 
     def after(self, kind: str) -> float:
-        """Return how long samples are wanted after the motion, s."""
+        """Return the duration of samples after the motion, s."""
         if kind in (TURNS, REST):
             return MARKED if kind == TURNS else 0.0
         return self.limits.time_offset + SETTLED + self.limits.rest
 
 
 def rules(values: SimpleNamespace) -> Rules:
-    """Return the rules that the parameters of the node state."""
+    """Return the rules by the parameters of the node."""
     return Rules(Limits(bias=values.calibration_maximum_bias),
                  Reference(scale_deviation=values.calibration_odometry_scale_deviation),
                  values.calibration_turns)
@@ -183,7 +182,7 @@ class Drive:
     """
     The commands of a run that drives the robot, and the guards that end it.
 
-    It measures the largest lateness of commands and of samples, s.
+    `command_lateness` and `sample_lateness` are the largest ones, s.
 
     """
 
@@ -191,7 +190,7 @@ class Drive:
     """Time between commands, s."""
 
     def __init__(self, run: Run, clock: Clock, blind: Callable[[], float]):
-        """Begin to wait for a receiver of the commands; `blind` in s, see `BLIND`."""
+        """Start to wait for a receiver of the commands; `blind` returns s, see `BLIND`."""
         assert run.motion is not None
         self._run, self._motion, self._clock, self._blind = run, run.motion, clock, blind
         self._begun = self._polled = clock.steady()
@@ -201,16 +200,16 @@ class Drive:
         self.command_lateness = self.sample_lateness = 0.0
 
     def see_sample(self, time: float) -> None:
-        """Measure how much later than the most prompt one of the last time a sample came."""
+        """Update the lateness of samples relative to the recent least delay."""
         self.sample_lateness = max(self.sample_lateness, self._delay.add(time))
 
     def waits(self, receivers: int) -> bool:
-        """Tell whether the run has not begun because no node receives its commands."""
+        """Tell whether the run still waits for a node that receives its commands."""
         self._received = self._received or receivers > 0
         return not self._received
 
     def fault(self, receivers: int, ros_time_stands: bool) -> str:
-        """Return why the run must end; '' where it goes on."""
+        """Return why the run must end; '' if it continues."""
         now = self._clock.steady()
         pause, self._polled = now - self._polled, now
         if self.waits(receivers):
@@ -224,33 +223,33 @@ class Drive:
                     'drove the robot; reduce its load and run again')
         if fault := self._delay.fault():
             return fault
-        # Decided at the second poll: after a pause of this process the samples that wait in its
-        # queue come after its timers.
+        # Decided at the second poll: after a pause of this process, queued samples are delivered
+        # after its timers.
         silence = now - self._run.received
         before, self._suspected = self._suspected, silence > self._blind()
         return (f'no sample came for {silence:.2f} s while the robot was driven: check the gyro '
                 'and its driver') if before and self._suspected else ''
 
     def is_abandoned(self, callers: int) -> bool:
-        """Tell whether the callers of the service have left, at two polls."""
+        """Tell whether the callers of the service are gone at two polls in a row."""
         self._called = self._called or callers > 0
         before, self._alone = self._alone, self._called and not callers
         return before and self._alone
 
     def command(self) -> float | None:
-        """Return the rate to command now, rad/s; None where the last command is young enough."""
+        """Return the rate to command now, rad/s; None if no command is due."""
         now = node_time(self._clock)
-        left = self._due - now  # more than an interval where ROS time has jumped back
+        left = self._due - now  # more than an interval if ROS time has jumped back
         if 0.5 * self.INTERVAL < left <= 1.5 * self.INTERVAL:
             return None
         if self._due > -math.inf:
             self.command_lateness = max(self.command_lateness, now - self._due)
         self._due = now + self.INTERVAL
-        # After a pause of this process the samples that waited may come before the next poll.
+        # After a pause of this process, queued samples may be delivered before the next poll.
         held_up = self._clock.steady() - self._polled > _HELD_UP
         if self._suspected or held_up or not self._run.times:
             return 0.0
-        # By the stamps, but samples that are held up do not hold up the motion.
+        # By the stamps, but delayed samples do not delay the motion.
         elapsed = max(now - self._delay.least - self._run.times[0], self._run.elapsed)
         return float(self._motion.rate_at(np.array(elapsed)))
 
@@ -258,7 +257,7 @@ class Drive:
                      'to its topic, or change cmd_vel_stamped')
 
     def lateness(self, limits: Limits) -> str:
-        """Return how late commands and samples were, where that exceeds the residual limit."""
+        """Return a sentence on the lateness of commands and samples beyond the residual limit."""
         late = max(self.command_lateness, self.sample_lateness)
         if late * _fastest(self._motion) <= limits.residual:
             return ''
@@ -278,20 +277,20 @@ STANDING_TIME = ('ROS time stands still: start or resume the simulation that pub
 
 class CalibrationSession:
     """
-    Calibrate on request.
+    Calibrations on request.
 
     Attributes
     ----------
-    run : the one in progress, or None
-    warning : after a run that drove the robot: that it kept turning; ''
-    lateness : of commands and of samples in the last run that drove the robot, at most, s
+    run : the run in progress, or None
+    warning : that the robot kept turning after a drive, in a sentence; ''
+    lateness : largest lateness of commands and of samples in the last drive, s
 
     """
 
     def __init__(self, estimator: HeadingEstimator, store: StateStore, monitor: HealthMonitor,
                  send: Callable[[float], None], clock: Clock):
         """
-        Begin with no run.
+        Start without a run.
 
         Parameters
         ----------
@@ -315,7 +314,7 @@ class CalibrationSession:
         """Tell whether a run drives the robot."""
         return self._drive is not None
 
-    # The begin
+    # Start
 
     def begin(self, kind: str, values: SimpleNamespace, obstacle: str = '') -> str:
         """
@@ -329,7 +328,7 @@ class CalibrationSession:
 
         Returns
         -------
-        '', or why not
+        '', or the reason of the refusal
 
         """
         if self.run:
@@ -367,10 +366,10 @@ class CalibrationSession:
         usual = _BLIND_INTERVALS * self._estimator.tracker.intervals.usual
         return min(max(BLIND, usual), self._rules.limits.gap)
 
-    # What comes in
+    # Inputs
 
     def add(self, time: float, output: float, receivers: int) -> None:
-        """Take a sample; `receivers` is the number of other nodes that receive the commands."""
+        """Add a sample; `receivers` is the number of other nodes that receive the commands."""
         run = self.run
         if run is None or run.reason is not None:
             return
@@ -388,7 +387,7 @@ class CalibrationSession:
             self._command_if_due(self._drive)
 
     def add_odometry(self, time: float, heading: float, rate: float) -> None:
-        """Take a heading, rad, and a rate, rad/s, of the odometry."""
+        """Add a heading, rad, and a rate, rad/s, of the odometry."""
         if self.run:
             self.run.odometry.append((time, heading, rate))
         late = self._clock.steady() - self._stopped
@@ -399,7 +398,7 @@ class CalibrationSession:
                             'time-out of its base, and check for other nodes that command it')
 
     def add_command(self, velocity: Velocity) -> None:
-        """Take a command from cmd_vel; one that was not sent here ends a run that drives."""
+        """Add a command from cmd_vel; a foreign one ends a drive."""
         for place, rate in enumerate(self._sent):
             if velocity == Velocity(angular=(0.0, 0.0, rate)):
                 for _ in range(place + 1):
@@ -419,16 +418,16 @@ class CalibrationSession:
     def watch(self, values: SimpleNamespace, receivers: int, ros_time_stands: bool = False,
               conflict: str = '') -> None:
         """
-        Send the next command of a run that drives the robot, or end a run that must not go on.
+        Send the next command of a drive, or end a run by its guards.
 
-        To be called every `Drive.INTERVAL` while `drives`, else a few times a second.
+        To be called every `Drive.INTERVAL` while `drives`, else a few times per second.
 
         Parameters
         ----------
         values : the parameters of the node
         receivers : number of other nodes that receive the commands
         ros_time_stands : ROS time has stood still for longer than `BLIND`
-        conflict : why the samples cannot be used at all; ''
+        conflict : why the samples cannot be used; ''
 
         """
         run = self.run
@@ -454,18 +453,18 @@ class CalibrationSession:
             self.end(f'no sample came for {SILENCE:g} s: check the gyro and its driver')
 
     def see_callers(self, count: int) -> None:
-        """Take the number of clients of the service, a few times a second; a drive wants one."""
+        """End a drive without clients of the service; called a few times per second."""
         if self._drive and self._drive.is_abandoned(count):
             self.end('the program that called calibrate has ended before the answer: keep it '
                      'running until the answer')
 
     def interrupt(self, reason: str) -> None:
-        """End a run over which integration began anew."""
+        """End a run in which the integration was restarted."""
         if self.run and self.run.times:
             self.end(f'{reason}: check the cable of the gyro and run again')
 
     def _command_if_due(self, drive: Drive) -> None:
-        """Send the next command, at a sample or at a look: a simulation may be a fast one."""
+        """Send the next command if it is due, at samples and polls: simulations may be fast."""
         if (rate := drive.command()) is not None:
             self._command(rate)
 
@@ -474,24 +473,24 @@ class CalibrationSession:
         self._send(rate)
 
     def stop_robot(self) -> bool:
-        """Command zero if the robot is being driven; return whether it was."""
+        """Command zero if the robot is driven; return whether it was."""
         if not self._drive:
             return False
         self._command(0.0)
         self._stopped = self._clock.steady()
         return True
 
-    # The end
+    # End
 
     def end(self, reason: str) -> None:
-        """End the run, and stop the robot at once; '' where its samples are complete."""
+        """End the run and stop the robot; the reason is '' if its samples are complete."""
         if self.run and self.run.reason is None:
             self.run.reason = reason
             if self.stop_robot() and reason:
                 self._repeats_until = self._stopped + _REPEATED
 
     def finish(self) -> tuple[bool, str]:
-        """Let the motion of a run by turns or by odometry be over now."""
+        """End the motion of a run by turns or by odometry."""
         run = self.run
         if run is None or run.kind not in (ODOMETRY, TURNS):
             return False, 'no calibration by turns or by odometry is in progress'
@@ -501,7 +500,7 @@ class CalibrationSession:
         return True, run.finish()
 
     def cancel(self) -> tuple[bool, str]:
-        """Give the run up, and change nothing."""
+        """Cancel the run without a change of the calibration."""
         if self.run is None:
             return False, 'no calibration is in progress'
         if self.run.reason is not None:
@@ -511,7 +510,7 @@ class CalibrationSession:
         return True, 'cancelled; the previous calibration is in use'
 
     def conclude(self) -> tuple[bool, str]:
-        """Fit a run that has ended and use what it gives, or say why nothing was changed."""
+        """Fit a finished run and use its calibration, or return why nothing was changed."""
         run, drive = self.run, self._drive
         assert run is not None and run.reason is not None
         try:
@@ -521,7 +520,7 @@ class CalibrationSession:
         except DataRefused as error:
             late = drive.lateness(self._rules.limits) if drive and not run.reason else ''
             return False, f'{late} (the run shows: {error})' if late else str(error)
-        except Exception as error:  # the robot stands, the caller is informed, the node continues
+        except Exception as error:  # the robot stands; answer the caller and continue
             return False, f'the fit failed and nothing was changed: {error!r}'
         finally:
             if drive:
@@ -544,7 +543,7 @@ class CalibrationSession:
                                        difference, trouble]))
 
     def _with_scale(self, bias: SelfCalibration) -> SelfCalibration:
-        """Return a calibration of the bias with the scale factor error that is in use."""
+        """Return a calibration of the bias with the scale factor error in use."""
         used = self._estimator.used.self_calibration
         unknown = SelfCalibration(covariance=((0.0, 0.0), (0.0, 0.0)))
         last = self._estimator.model.self_calibration or used or unknown
@@ -557,9 +556,9 @@ class CalibrationSession:
 def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
                prior: Array | None = None) -> tuple[SelfCalibration, str]:
     """
-    Return the calibration that a complete run gives, and a remark.
+    Return the calibration by a complete run, and a remark.
 
-    The prior is that of the model, of a fleet; a run against a motion is drawn to it.
+    The prior is that of a fleet model; it is used in runs against a motion.
 
     Raises
     ------
@@ -569,7 +568,7 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
     if run.kind == REST:
         bias, deviation = calibrate_bias(time - time[0], rate, rules.limits, noise, output)
-        turned = 0.0  # by the headings of odometry or by its rates
+        turned = 0.0  # rad; by the headings or the rates of odometry
         if len(run.odometry) > 1:
             at, headings, rates = np.array(run.odometry).T
             turned = max(float(np.mean(rates) * np.ptp(at)),
@@ -590,7 +589,7 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
 
 
 def _odometry_motion(run: Run) -> tuple[float, Motion]:
-    """Return when the odometry begins, s, and the motion that it shows."""
+    """Return the time of the first odometry, s, and the motion of the odometry."""
     end = run.times[0] + run.duration
     rows = np.array([each for each in run.odometry if each[0] <= end])
     increases = len(rows) > 1 and bool((np.diff(rows[:, 0]) > 0.0).all())
@@ -607,7 +606,7 @@ def _odometry_motion(run: Run) -> tuple[float, Motion]:
 
 def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion, rules: Rules,
               noise: Noise, when: str, prior: Array | None) -> tuple[SelfCalibration, str]:
-    """Fit a run to its motion, and check it by the rest after it."""
+    """Fit a run to its motion, and check the fit by the rest after it."""
     limits, odometry = rules.limits, run.kind == ODOMETRY
     inside = (time >= -limits.time_offset) & (time <= motion.duration + limits.time_offset)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,

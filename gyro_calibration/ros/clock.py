@@ -16,18 +16,18 @@ from collections import deque
 import math
 from typing import Protocol
 
-#: The sample with the least delay within this time shows how far stamps are behind the clock, s:
-#: few are held up for so long, and the clock of a gyro that is 3 % off moves by 15 ms in it.
+#: Window of the least delay of stamps behind the clock, s: few samples are delayed for longer, and
+#: a gyro clock that is 3 % off drifts by 15 ms in it.
 _PROMPT = 0.5
-#: The clocks of gyros are up to 3 % off: stamps that are so much faster or slower are wrong.
+#: Largest difference in rate of stamps and clock, 1; the clocks of gyros are up to 3 % off.
 _PACE = 0.05
 
 
 class Clock(Protocol):
-    """The clocks that a node reads; tests have their own."""
+    """The clocks that a node reads; tests inject their own."""
 
     def steady(self) -> float:
-        """Return seconds of the steady clock, which all guards and time-outs use."""
+        """Return seconds of the steady clock, for all guards and time-outs."""
 
     def date(self) -> float:
         """Return seconds since 1970 by the clock of the host."""
@@ -44,14 +44,14 @@ def node_time(clock: Clock) -> float:
 
 class StampDelay:
     """
-    How far stamps are behind the clock of a node, and whether they go on as it does.
+    Delay of stamps behind the clock of a node, and a test whether both advance equally.
 
-    The `least` delay of the samples of the last time, s, is nan before the first.
+    `least` is the least delay of recent samples, s; nan before the first.
 
     """
 
     def __init__(self, clock: Clock, tolerance: float, window: float):
-        """Begin with nothing seen; samples may be held up by a tolerance; window; both in s."""
+        """Start without samples; tolerance of their delay and window of the test, both in s."""
         self._clock, self._tolerance, self._window = clock, tolerance, window
         self.least = math.nan
         # Time of arrival and delay, s, of samples with less delay than any after them.
@@ -59,7 +59,7 @@ class StampDelay:
         self._before: tuple[float, float] | None = None
 
     def add(self, time: float) -> float:
-        """Take the stamp of a sample, s; return its delay beyond the least one, s."""
+        """Add the stamp of a sample, s; return its delay beyond the least one, s."""
         now = node_time(self._clock)
         while self._prompt and self._prompt[-1][1] >= now - time:
             self._prompt.pop()
@@ -70,11 +70,11 @@ class StampDelay:
         return now - time - self.least
 
     def fault(self) -> str:
-        """Return that the stamps leave the clock, in a sentence; ''."""
+        """Return a sentence if stamps and clock advance differently; else ''."""
         now = node_time(self._clock)
         then, before = self._before or (now, self.least)
         elapsed, grown = now - then, self.least - before
-        # Samples that are held up are behind a fast simulation by more.
+        # In a fast simulation the same delay is more simulated time.
         limit = self._tolerance * (1.0 if self._clock.simulated() is None else 4.0)
         if abs(grown) > limit + _PACE * abs(elapsed):
             return (f'this computer was busy, or the clock of the driver is wrong: the stamps on '
@@ -91,23 +91,23 @@ class RosTime:
 
     Attributes
     ----------
-    standing : for how long it has stood still, s of the steady clock; 0 where it is not
-        simulated, and inf before a simulation starts
+    standing : time since its last advance, s of the steady clock; 0 where it is not simulated,
+        inf before a simulation starts
 
     """
 
     def __init__(self) -> None:
-        """Begin with nothing seen."""
+        """Start without readings."""
         self.standing = 0.0
         self._last: float | None = -1.0
         self._changed = self._polled = 0.0
 
     def poll(self, clock: Clock) -> None:
         """
-        Compare with the last poll; by one timer.
+        Compare with the last poll; to be called by one timer.
 
-        Only the time up to that poll counts: after a pause of this process, the messages of
-        /clock that wait in its queue come after its timers.
+        Only the time up to that poll counts: after a pause of this process, queued messages of
+        /clock are delivered after its timers.
         """
         now, time = clock.steady(), clock.simulated()
         if time != self._last:

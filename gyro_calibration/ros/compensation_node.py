@@ -9,10 +9,10 @@
 # under the License.
 
 """
-Corrected rates and the heading on a robot: joins `pipeline` to topics, services and timers.
+The compensation node: connects `pipeline` to topics, services and timers.
 
-``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel`` go in; ``imu/data``, ``heading``,
-``yaw_rate``, ``~/calibration_status`` and diagnostics come out.
+It subscribes to ``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel``, and publishes
+``imu/data``, ``heading``, ``yaw_rate``, ``~/calibration_status`` and diagnostics.
 
 """
 
@@ -69,7 +69,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 
-#: Between two polls of publishers, receivers and clocks, s.
+#: Interval of polls of publishers, receivers and clocks, s.
 _WATCH_INTERVAL = 0.2
 
 
@@ -94,7 +94,7 @@ class CompensationNode(Node):
     """Publish corrected rates and the heading, and calibrate on request."""
 
     def __init__(self) -> None:
-        """Read the model and the last calibration; raw rates go on where they are wrong."""
+        """Read the model and the last calibration; without them raw rates are published."""
         super().__init__('compensation_node')
         values = declare(self, PARAMETERS, self._set)
         self._values, clock = values, NodeClock(self)
@@ -118,7 +118,7 @@ class CompensationNode(Node):
         self._offer('cancel_calibration', self._cancel)
         self._offer('reset_heading',
                     lambda answer: self._fill(answer, True, self._pipeline.reset()))
-        # Each timer, also a cancelled one, costs time at every sample: one for all.
+        # One timer for all: each one, also a cancelled one, costs time at every sample.
         self._watched = 0
         call_every(self, _WATCH_INTERVAL, self._watch)
         self._show_status()
@@ -149,7 +149,7 @@ class CompensationNode(Node):
         subscribe_to(self, Odometry, 'odom', self._on_odometry)
         subscribe_to(self, TwistStamped if self._stamped else Twist, 'cmd_vel', self._on_command)
         if self._values.calibration_drive:
-            self._learn_to_drive()  # where it cannot, calibrate reports it
+            self._learn_to_drive()  # calibrate reports a failure
 
     def _offer(self, name: str,
                fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
@@ -176,7 +176,7 @@ class CompensationNode(Node):
         known = force if reported and math.isfinite(force) else None
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:
-            output = math.nan  # REP-145: the message holds no rate
+            output = math.nan  # REP-145: the message has no rate
         found = self._pipeline.sample(_stamp(message.header), output, known, self._receivers,
                                       message.header.frame_id)
         if found is not None:
@@ -187,7 +187,7 @@ class CompensationNode(Node):
     # Publishers
 
     def _publish(self, imu: Imu, found: Output) -> None:
-        """Publish the message that came with its z corrected, and the heading."""
+        """Publish the received message with its z corrected, and the heading."""
         sec, nanosec = divmod(found.stamp, NSEC_PER_SEC)
         imu.header.stamp.sec, imu.header.stamp.nanosec = sec, nanosec
         imu.angular_velocity.z = found.rate
@@ -255,7 +255,7 @@ class CompensationNode(Node):
     # Services
 
     def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
-        """Begin a run, which `_answer_ended` answers; or change nothing and say why."""
+        """Begin a run, which `_answer_ended` answers, or refuse with the reason."""
         session = self._pipeline.session
         obstacle = ''
         if self._values.calibration_drive:
@@ -304,7 +304,7 @@ class CompensationNode(Node):
     # Driving
 
     def _learn_to_drive(self) -> str:
-        """Become a publisher of cmd_vel, or return why not; only before a first drive."""
+        """Create the publisher of cmd_vel before the first drive; return why it failed, or ''."""
         if self._velocity is None:
             kind = TwistStamped if self._stamped else Twist
             try:
@@ -316,12 +316,12 @@ class CompensationNode(Node):
         return ''
 
     def _look_for_receivers(self) -> None:
-        """Count the other nodes that receive cmd_vel; this one is a subscriber too."""
+        """Count the other nodes that receive cmd_vel; this node is a subscriber too."""
         count = self._velocity.get_subscription_count() if self._velocity else 0
         self._receivers = max(count - 1, 0)
 
     def _drive(self) -> None:
-        """Send the next command, and let guards look, while a run drives the robot."""
+        """Send the next command and check the guards of a drive."""
         self._look_for_receivers()
         self._pipeline.watch(self._receivers)
         self._answer_ended()
@@ -337,7 +337,7 @@ class CompensationNode(Node):
         self._velocity.publish(message)
 
     def destroy_node(self) -> None:
-        """Stop the robot if it is being driven, keep what was learned, and close."""
+        """Stop the robot if it is driven, store the bias table, and destroy the node."""
         if hasattr(self, '_pipeline'):  # not where a parameter was refused
             if self._pipeline.session.stop_robot():
                 assert self._velocity is not None
@@ -352,8 +352,8 @@ def _stamp(header: Any) -> int:
 
 
 def heading_of(turned: Quaternion) -> float:
-    """Return the yaw of an orientation, rad; nan where it has none."""
-    # A power of a large number would raise OverflowError, where a product is inf.
+    """Return the yaw of an orientation, rad; nan if it is not valid."""
+    # A power of a large number would raise OverflowError; a product is inf.
     return math.atan2(2.0 * (turned.w * turned.z + turned.x * turned.y),
                       1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z))
 

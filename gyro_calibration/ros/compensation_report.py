@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What the compensation node reports: diagnostics once a second, and the state of calibration."""
+"""Reports of the compensation node: diagnostics each second, and the calibration status."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.ros.pipeline import COUNTED, Pipeline
 from gyro_calibration.ros.state_store import StateStore
 
-#: So many in a second are no warning.
+#: Count -> largest increase per second without a warning.
 _TOLERATED = {'lost_samples': 3}
 
 
 class CompensationReport:
-    """Compare the counts of a pipeline with those of the last report."""
+    """Makes reports of a pipeline; counts are compared with those of the last report."""
 
     def __init__(self, pipeline: Pipeline, clock: Clock):
-        """Begin with nothing reported."""
+        """Start without a report."""
         self._pipeline, self._clock = pipeline, clock
         self._before, self._asked = dict.fromkeys(COUNTED, 0), math.nan
 
     def level(self) -> bytes:
-        """Return the level that a report would have now."""
+        """Return the level of a report made now."""
         return self._evaluate(self._growing())[0]
 
     def make(self) -> Report:
-        """Return level, message and values; a count is a warning only while it grows."""
+        """Return level, message and values; only counts that increase give warnings."""
         counts, now = self._pipeline.journal.counts, self._clock.steady()
         growing = self._growing()
         seconds = now - self._asked
@@ -105,7 +105,7 @@ class CompensationReport:
         return OK, 'heading goes on' + ('' if tracked else '; the bias is not estimated at rest')
 
     def _values(self, rate: float) -> dict[str, object]:
-        """Return all that is known, by name; `rate` of the samples in Hz."""
+        """Return the values of the report by name; `rate` is the sample rate, Hz."""
         pipeline, date = self._pipeline, self._clock.date()
         estimator, journal, store = pipeline.estimator, pipeline.journal, pipeline.store
         tracker = estimator.tracker
@@ -160,7 +160,7 @@ class CompensationReport:
 
 
 def _monitored(monitor: HealthMonitor) -> dict[str, object]:
-    """Return what the last rest showed."""
+    """Return the results of the last rest by name."""
     rest = monitor.last
     if rest is None:
         return {'rests_checked': 0}

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What a node reports on ``/diagnostics``, under its fully qualified name."""
+"""Diagnostics of a node on ``/diagnostics``, under its fully qualified name."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def status_array(node: Node, name: str, report: Report, hardware_id: str = '') -
 
 
 class Diagnostics:
-    """Report when asked; `level` is that of the last report, None before the first."""
+    """Publisher of reports; `level` is that of the last report, None before the first."""
 
     def __init__(self, node: Node, name: str, report: Callable[[], Report],
                  hardware_id: str = 'none'):
         """
-        Become a publisher of diagnostics on a thing by its name, such as ``'gyro'``.
+        Create the publisher of diagnostics with a status name, such as ``'gyro'``.
 
-        The report, level, sentence and values by name, is never made twice at the same time, and
+        `report` returns level, sentence and values by name. It is never called concurrently, and
         must not call `now`.
 
         """
@@ -52,7 +52,7 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def now(self) -> None:
-        """Report, from any thread."""
+        """Make and publish a report; may be called from any thread."""
         with self._lock:
             report = self._report()
             self._publisher.publish(

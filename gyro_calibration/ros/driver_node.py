@@ -9,11 +9,10 @@
 # under the License.
 
 """
-The driver: reads a gyro on a serial port and publishes its samples, whatever happens to the port.
+The driver node: reads a gyro on a serial port and publishes its samples.
 
-A thread of its own reads, decodes, stamps and publishes, which costs least; the executor only
-reports once a second. Were the thread to end by a fault of the program, the node would end with
-it, so that whoever started it can start it again.
+One thread reads, decodes, stamps and publishes; the executor only reports once per second. If the
+thread ends by a fault of the program, the node ends too, so that a launch file can restart it.
 
 """
 
@@ -36,7 +35,7 @@ from gyro_calibration.ros.runner import call_every, declare, publish_on, run
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, Temperature
 
-# not yes and no, which YAML makes truth values of
+# not yes and no, which YAML reads as booleans
 _THREE_WAYS = {'default': None, 'always': True, 'never': False}
 
 PARAMETERS = (
@@ -72,21 +71,21 @@ PARAMETERS = (
 )
 
 _REPORT_INTERVAL = 1.0  # s
-_WATCH_INTERVAL = 0.5  # s; between two checks that the thread runs
-_CLOCK_INTERVAL = 0.01  # s; between two readings of the node's clock, which cost as a message does
+_WATCH_INTERVAL = 0.5  # s; interval of checks that the thread runs
+_CLOCK_INTERVAL = 0.01  # s; interval of readings of the node's clock, each as costly as a message
 
 
 class DriverNode(Node):
     """
     Publishes ``imu/data_raw``, ``imu/temperature`` and ``/diagnostics``; see `PARAMETERS`.
 
-    Stamps are those of the node's clock. With ``use_sim_time`` that is the time of the simulation
-    as soon as there is one, and the time of the system before. A gyro on a port turns in real
-    time: where the simulation runs faster or slower, its rates are meaningless there.
+    Stamps are those of the node's clock. With ``use_sim_time`` that is the simulated time, and the
+    system time before a simulation starts. A gyro on a port measures in real time: its rates are
+    wrong in a simulation that runs faster or slower.
 
     Raises
     ------
-    ValueError : a parameter has no possible value
+    ValueError : a parameter is not valid
 
     """
 
@@ -159,11 +158,11 @@ class DriverNode(Node):
             self._report.add_clock_step(step)
 
     def _now(self) -> float:
-        """Return the time of the node, s: of the system before a simulation begins."""
+        """Return the time of the node, s; the system time before a simulation starts."""
         return self.get_clock().now().nanoseconds / NSEC_PER_SEC or time.time()
 
     def _on_change(self, state: State) -> None:
-        """Log once where a connection fails or is restored, not at each attempt."""
+        """Log each failure and recovery of the connection once, not each attempt."""
         if state.problem:
             self._flush()
             self._report.clear()
@@ -185,10 +184,10 @@ class DriverNode(Node):
 
 class Messages:
     """
-    The messages of samples, made once; only their values change.
+    Reusable messages of samples, whose values are set for each sample.
 
-    The variance of the temperature stays 0, which stands for unknown; `variance` is that of one
-    sample of the rate, (rad/s)².
+    The variance of the temperature is 0, which stands for unknown; `variance` is that of the rate
+    of one sample, (rad/s)².
 
     """
 
@@ -202,7 +201,7 @@ class Messages:
     def fill(self, mean: Mean) -> None:
         """Set both messages to a sample, or a mean of several."""
         imu, sample = self.imu, mean.sample
-        second, part = divmod(mean.stamp, 1.0)  # the product of all would lose 0.1 us
+        second, part = divmod(mean.stamp, 1.0)  # one product would lose 0.1 us
         sec, nanosec = divmod(int(second) * NSEC_PER_SEC + round(part * NSEC_PER_SEC),
                               NSEC_PER_SEC)
         for header in (imu.header, self.temperature.header):
@@ -220,7 +219,7 @@ class Messages:
 
 
 def settings(values: SimpleNamespace) -> Settings:
-    """Return the settings of a gyro that parameters stand for; raise as `Settings` does."""
+    """Return the settings of a gyro by the parameters; raise as `Settings` does."""
     return Settings(values.sensitivity or None, _THREE_WAYS[values.invert], values.axis,
                     tuple(values.columns), values.full_scale or None,
                     _THREE_WAYS[values.increments], values.sample_rate or None)

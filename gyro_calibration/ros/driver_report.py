@@ -18,23 +18,23 @@ from gyro_calibration.driver.connection import Connection, Counts
 from gyro_calibration.driver.protocols import Sample, Settings
 from gyro_calibration.ros.diagnostics import ERROR, OK, Report, WARN
 
-_LEAST_TIME = 0.5  # s; a rate over less is not meaningful
+_LEAST_TIME = 0.5  # s; shortest time over which a sample rate is computed
 _OPENING = {'opening': 'opening the port', 'listening': 'listening for a protocol'}
 
 
 class DriverReport:
     """
-    Reports the state of a connection, once a second.
+    Makes reports of a connection, once per second.
 
     Parameters
     ----------
     connection, settings : of the driver
-    port : as it was given
+    port : parameter of the node
     clock : returns seconds of the steady clock
 
     Attributes
     ----------
-    event : what happened last, in a sentence
+    event : the last event, in a sentence
 
     """
 
@@ -49,7 +49,7 @@ class DriverReport:
         self._health: dict[str, float] = {}
 
     def add(self, samples: Iterable[Sample]) -> None:
-        """Keep what the gyro reports of itself; may be called from another thread."""
+        """Store temperature and health of the gyro; may be called from another thread."""
         for sample in samples:
             if sample.health:
                 self._health = {**self._health, **sample.health}
@@ -63,7 +63,7 @@ class DriverReport:
         self.event = f'the clock of this computer was set by {step:+.1f} s; the stamps follow it'
 
     def clear(self) -> None:
-        """Drop what the gyro reported of itself, as it is silent; from any thread."""
+        """Clear temperature and health while the gyro is silent; from any thread."""
         self._temperature, self._health = None, {}
 
     def make(self) -> Report:
@@ -75,7 +75,7 @@ class DriverReport:
                            for name, count in vars(counts).items()}
             self._rate = self._grown.pop('samples') / elapsed
             self._last, self._last_time = counts, now
-        # The other thread may drop these meanwhile.
+        # The other thread may clear these meanwhile.
         last, clock, protocol = self._temperature, connection.clock, connection.protocol
         return *self._evaluate(), {
             'port': self._port,

@@ -9,12 +9,11 @@
 # under the License.
 
 """
-Check whether a gyro at rest has the noise and the bias of its model.
+Tests of the noise and the bias of a gyro at rest against its model.
 
-Samples are gathered to stretches of `STRETCH` s in which the rate is steady, as it is at rest. In
-each, the noise is compared with the model's by the mean square of differences of neighbouring
-blocks, and the mean rate with zero. The levels of both tests follow from a stated rate of false
-alarms.
+Samples are collected in stretches of `STRETCH` s with a steady rate, as at rest. In each stretch
+the mean square of differences of neighbouring blocks is tested against the noise of the model, and
+the mean rate against zero. The levels of both tests follow from a stated rate of false alarms.
 
 """
 
@@ -31,35 +30,35 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-#: Length of a stretch, of a part that must be steady, and of a block whose mean is compared with
-#: its neighbour's, s.
+#: Duration of a stretch, of its parts in the test of steadiness, and of the blocks in the test of
+#: noise, s.
 STRETCH, _PART, _BLOCK = 10.0, 1.0, 0.05
-#: Longest interval between samples, s.
+#: Longest interval between samples in a stretch, s.
 _GAP = 0.5
-#: Noise up to this many times the model's is accepted: figures are inexact and change with age.
+#: Largest accepted ratio of the noise to that of the model; figures are inexact and change.
 _TOLERANCE = 1.25
-#: Noise down to the model's divided by this is accepted: a gyro that filters its output has less
+#: Largest accepted ratio of the noise of the model to the measured one: a filtered output has less
 #: noise in neighbouring blocks.
 _QUIET = 3.0
-#: Limit of the variance of parts over the one that noise explains; with 9 degrees of freedom
-#: chance exceeds it once in a million stretches.
+#: Largest ratio of the variance of parts to that by noise; with 9 degrees of freedom chance
+#: exceeds it once in a million stretches.
 _STEADY = 6.0
-#: Chance that a calibration is falsely reported to differ from the one before.
+#: Probability of a false report that a calibration differs from the previous one.
 CHANCE = 1e-3
-#: A value that comes so often, and for so long, s, is repeated: a gyro whose noise is _QUIET times
-#: less than that of the model, and 2 steps of its output, repeats a value with a chance of 0.2.
+#: Least number and duration, s, of equal values that count as repeated: a gyro with noise of 2
+#: steps of its output, _QUIET times less than in the model, repeats a value with probability 0.2.
 _REPEATS, _REPEATED = 20, 0.25
-#: Also a gyro of larger steps is dead where this is exceeded by the logarithm of the chance of so
-#: many repeated values: e^-25 for a gyro that sends each sample four times.
+#: Limit of -ln of the probability of as many repeats, beyond which a gyro with larger steps is
+#: dead too: e^-25 for a gyro that sends each sample four times.
 _IMPROBABLE = 100.0
-#: So many changes show the step of an output.
+#: Number of changes after which the step of the output is known.
 _CHANGES = 100
-#: Odometry shows a turn from this rate on, rad/s.
+#: Least rate of a turn by odometry, rad/s.
 _TURNS = 0.05
-#: No robot stops a turn faster, rad/s².
+#: Largest angular deceleration of a robot, rad/s².
 _BRAKING = 20.0
-#: Number of stretches in a row that decide where the rest is not announced, since a robot that
-#: goes straight may shake for a while.
+#: Number of successive stretches that decide in an unannounced rest: a robot on a straight path
+#: may vibrate for some time.
 _IN_A_ROW = 3
 
 
@@ -71,7 +70,7 @@ class Rest:
     noise_ratio: float  # standard deviation of the noise over that of the model
     noise_fits: bool  # within chance and tolerance
     bias: float  # mean rate, rad/s
-    sigmas: float  # of the mean, by what the model explains; nan where it does not say
+    sigmas: float  # of the mean, by the variance of the model; nan where unknown
     bias_fits: bool  # within chance
     bias_deviation: float  # standard deviation of the mean by the noise of this stretch, rad/s
     announced: bool
@@ -79,21 +78,21 @@ class Rest:
 
 class RepeatedOutput:
     """
-    Find out whether a gyro repeats one value: it is dead, saturated, or its driver has stopped.
+    Detector of a gyro that repeats one value: it is dead, saturated, or its driver has stopped.
 
-    That is so where odometry shows another turn, and where its noise is larger than the steps of
-    its output, or chance is excluded. Some gyros report zero at rest: a repeated zero counts only
-    after a stop that is too sudden for a robot.
+    A value counts as repeated if odometry shows a different rate, if the noise is larger than the
+    steps of the output, or if chance is excluded. Some gyros report zero at rest: a repeated zero
+    counts only after a deceleration that no robot has.
 
     """
 
     def __init__(self, noise: Noise):
-        """Begin with nothing seen; `noise` of the model."""
+        """Start without samples; `noise` is that of the model."""
         self._noise, self._step, self._changes = noise, math.inf, 0
         self._value, self._since, self._count, self._fell = math.nan, 0.0, 0, False
 
     def add(self, time: float, output: float, turning: float) -> bool:
-        """Take a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
+        """Add a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
         if output != self._value:
             step = abs(output - self._value)
             self._step = min(step, self._step)
@@ -110,7 +109,7 @@ class RepeatedOutput:
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
         if output == 0.0 and not self._fell or self._changes <= _CHANGES or not sample:
             return False
-        # the chance of one more sample with the value, where the noise is low and lies around it
+        # probability of one more equal sample, for low noise around the value
         repeats = math.erf(_QUIET * self._step / (2.0 * math.sqrt(2.0) * sample))
         return (2.0 * _QUIET * self._step < sample
                 or -self._count * math.log(max(repeats, 1e-9)) > _IMPROBABLE)
@@ -118,12 +117,12 @@ class RepeatedOutput:
 
 class HealthMonitor:
     """
-    Compare noise and bias at rest with the model, on a robot.
+    Monitor of noise and bias at rest on a robot.
 
     Attributes
     ----------
-    standing : a mean below this, rad/s, is rest; one above may be a steady turn, and counts if it
-        is the same in several stretches
+    standing : means below this, rad/s, are rest; one above may be a steady turn, and counts only
+        if it is the same in several stretches
     noise_alarm, bias_alarm : one sentence each, '' without an alarm
     last : the last stretch at rest, or None
     examined : number of stretches at rest
@@ -132,17 +131,17 @@ class HealthMonitor:
 
     def __init__(self, noise: Noise, false_alarms: float, standing: float = 0.0):
         """
-        Begin with nothing gathered.
+        Start without samples.
 
         Parameters
         ----------
-        noise : of the model; without an angle random walk nothing is checked
-        false_alarms : largest rate of false alarms at rest, 1/h; 0 checks nothing
+        noise : of the model; without an angle random walk the monitor is off
+        false_alarms : largest rate of false alarms at rest, 1/h; 0 switches the monitor off
         standing : see above, rad/s
 
         """
         self._noise, self.standing = noise, standing
-        # Four ways to alarm: noise or bias, upwards or downwards.
+        # Four tests: noise and bias, upwards and downwards.
         self._level = 0.25 * false_alarms * STRETCH / 3600.0
         self._gathered: list[tuple[float, float, float]] = []
         self._rests: list[Rest] = []
@@ -153,24 +152,24 @@ class HealthMonitor:
 
     @property
     def works(self) -> bool:
-        """Return whether there is anything to check."""
+        """Return whether the monitor is on."""
         return self._noise.angle_random_walk > 0.0 and self._level > 0.0
 
     def restart(self) -> None:
-        """Drop the samples gathered so far, as after a gap."""
+        """Discard the samples so far, as after a gap."""
         self._gathered = []
 
     def recalibrated(self) -> None:
-        """Drop the past biases, as another calibration is in use."""
+        """Discard past biases after a new calibration."""
         self.restart()
         self._rests.clear()
         self.bias_alarm = ''
 
     def add(self, time: float, output: float, rate: float) -> bool:
         """
-        Take a sample: its stamp, s, output and corrected rate, rad/s.
+        Add a sample: its stamp, s, output and corrected rate, rad/s.
 
-        Tell whether a stretch is complete, and `examine` is to be called.
+        Return whether a stretch is complete and `examine` is to be called.
 
         """
         if self._gathered and not 0.0 < time - self._gathered[-1][0] <= _GAP:
@@ -180,7 +179,7 @@ class HealthMonitor:
 
     def examine(self, bias_variance: float, age: float, announced: bool = False) -> Rest | None:
         """
-        Examine the stretch that is complete, and begin the next.
+        Test the complete stretch, and start the next one.
 
         Parameters
         ----------
@@ -190,7 +189,7 @@ class HealthMonitor:
 
         Returns
         -------
-        the result; None where the rate is not steady, which is no rest
+        the result; None where the rate is not steady, so that it is no rest
 
         """
         time, output, rate = np.array(self._gathered).T
@@ -208,7 +207,7 @@ class HealthMonitor:
     def _set_alarms(self, rest: Rest) -> None:
         last, several = self._rests, len(self._rests) == _IN_A_ROW
         biases = [each.bias for each in last]
-        # the mean was the same in the last stretches, unlike that of turns
+        # the mean was the same in the last stretches, unlike in turns
         stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)
         if rest.noise_fits:
             self.noise_alarm = ''
@@ -234,24 +233,23 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     """
     Test a stretch of samples against noise and bias of a model.
 
-    The codes of a gyro that rounds coarsely do not show its noise: the tests allow for what
-    rounding may add or hide.
+    A coarsely quantized output does not show the noise: the tests allow for the error by rounding.
 
     Parameters
     ----------
     time, output, rate : s and rad/s, shape (n,); the rate is after model and self-calibration
     noise : of the model
-    level : chance of each of the four false alarms
-    step : between the codes of the output, rad/s; inf where the output never changed
+    level : probability of each of the four false alarms
+    step : quantization step of the output, rad/s; inf where the output never changed
     bias_variance, age, announced : as in `HealthMonitor.examine`
 
     Returns
     -------
-    the result; None where the rate is not steady, samples are too few, or values are absurd
+    the result; None where the rate is not steady, samples are too few, or values are too large
 
     """
     if max(np.abs(output).max(), np.abs(rate).max()) > LARGEST:
-        return None  # no gyro has such rates, and their squares may overflow
+        return None  # the squares may overflow
     interval = (time[-1] - time[0]) / (len(time) - 1)
     size = max(1, round(_BLOCK / interval))
     if len(time) < 20 * size or step == math.inf:
@@ -286,7 +284,7 @@ def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
 
 
 def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
-    """Return whether parts of the stretch differ by no more than noise; one part shows nothing."""
+    """Return whether parts of the stretch differ within noise; False for a single part."""
     part = ((time - time[0]) / _PART).astype(int)
     count = np.bincount(part)
     means = (np.bincount(part, rate) / np.maximum(count, 1))[count > 0.5 * count.max()]
@@ -297,14 +295,15 @@ def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
 def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: float,
             level: float = CHANCE) -> str:
     """
-    Return how a calibration differs from the one before, if noise does not explain it, else ''.
+    Return a sentence on the change of a calibration beyond noise; '' within noise.
 
     Parameters
     ----------
-    before : an infinite variance is of a value that was not known
-    noise : of the model, by which the bias drifts
+    before : previous calibration; an infinite variance is that of an unknown value
+    after : new calibration
+    noise : of the model, for the drift of the bias
     age : time between the two, s
-    level : chance of a false report
+    level : probability of a false report
 
     """
     if before.covariance is None or after.covariance is None:

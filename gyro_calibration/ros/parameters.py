@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The parameters of a node as one table; values are checked here, without rclpy."""
+"""Parameters of a node as a table, and checks of their values, without rclpy."""
 
 from __future__ import annotations
 
@@ -33,23 +33,25 @@ class Parameter:
     unit: str = ''
     range: tuple[float, float] | None = None  # noqa: A003  lowest and highest value allowed
     dynamic: bool = False  # may be set while the node runs
-    choices: tuple[str, ...] = ()  # the values that a text may have; empty for any
+    choices: tuple[str, ...] = ()  # allowed values of a text; empty for any
 
     @property
     def attribute(self) -> str:
-        """Return the name in the record of values: ``calibration_maximum_bias``."""
+        """Return the attribute in the record of values: ``calibration_maximum_bias``."""
         return self.name.replace('.', '_')
 
     @property
     def allowed(self) -> str:
-        """Return the choices in words; '' where any value is possible."""
+        """Return the choices as text; '' if any value is allowed."""
         return f'{", ".join(self.choices[:-1])} or {self.choices[-1]}' if self.choices else ''
 
     def check(self, value: object) -> object:
         """
-        Return the value as the type of the default; a whole number may stand for a float.
+        Return the value in the type of the default; an integer is accepted for a float.
 
-        ValueError says which value is wanted.
+        Raises
+        ------
+        ValueError : the value is not valid; the message states the valid ones
 
         """
         if isinstance(self.default, float) and type(value) is int and abs(value) < 1 << 63:
@@ -79,7 +81,7 @@ class Parameter:
 
 def record(table: Sequence[Parameter], given: Mapping[str, object] | None = None
            ) -> SimpleNamespace:
-    """Return the values of a table by attribute: the given ones, checked, else the defaults."""
+    """Return the values of a table by attribute: checked given values, else defaults."""
     given = given or {}
     return SimpleNamespace(**{
         each.attribute: each.check(given[each.name]) if each.name in given else each.default

@@ -9,15 +9,15 @@
 # under the License.
 
 """
-What the compensation node does with samples, wheels and time, without rclpy.
+Processing of the compensation node, without rclpy: samples, wheels, time and conflicts.
 
-Samples, temperatures, odometry and commands go in with their stamps; corrected rates and headings
-come out. Stamps are nanoseconds since 1970 or of a simulation; guards and time-outs look at the
-steady clock.
+Inputs are samples, temperatures, odometry and commands with their stamps; outputs are corrected
+rates and headings. Stamps are nanoseconds since 1970 or of a simulation; guards and time-outs use
+the steady clock.
 
-Two publishers are recognized by their stamps: a sample of a second one divides an interval so that
-one part is at most half of it, and two such intervals while the graph shows several publishers are
-the proof. The graph alone lists a driver that was killed for up to 20 s.
+Two publishers are detected by their stamps: a sample of a second one divides an interval so that
+one part is at most half of it. Two such intervals while the graph lists several publishers are the
+proof. The graph alone is not, since it lists a killed driver for up to 20 s.
 
 """
 
@@ -88,28 +88,30 @@ PARAMETERS = (
               'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
-#: Rests taken for motion, in an hour at rest, 1/h.
+#: Rate of rests that are taken for motion, 1/h of rest.
 _REST_FALSE_ALARMS = 0.1
-#: False alarms of the monitor of noise and bias, in an hour at rest, 1/h.
+#: Rate of false alarms of the monitor of noise and bias, 1/h of rest.
 _HEALTH_FALSE_ALARMS = 0.001
-#: A gyro that was silent for this time, s, may have been without power, with another bias since.
+#: Silence after which the gyro may have been without power, s; its bias may have changed.
 _POWER_OFF = 10.0
-#: The mean rate over this time shows whether a robot turns that is to be driven, s.
+#: Averaging time of the rate that must be zero before a drive, s.
 _LOOKED_BACK = 0.5
-#: A mean rate is a turn from this number of standard deviations of the bias on.
+#: Least number of standard deviations of a mean rate that shows a turn.
 _SIGMAS = 4.0
-#: Between two samples a robot may begin and end a turn with this acceleration, rad/s²: the default
-#: of Nav2's controllers.
+#: Largest angular acceleration of a turn between two samples, rad/s²: the default of Nav2's
+#: controllers.
 _ACCELERATION = 3.2
-#: A temperature that differs by more from the one before it, K, waits for another like it.
+#: Largest step of the temperature that is used at once, K; a larger one must be confirmed by the
+#: next.
 _LEAP = 5.0
-#: Odometry that turns by this, rad, while its rate is zero shows for some time, s, no standstill.
+#: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill,
+#: and for how long, s.
 _CONTRADICTION, _DISTRUST = 1.0 * DEGREE, 600.0
-#: Stamps of ROS time are below it, ns: `builtin_interfaces/Time` has 31 bits for seconds.
+#: Upper limit of ROS time, ns: `builtin_interfaces/Time` has 31 bits for seconds.
 _END_OF_TIME = NSEC_PER_SEC << 31
-#: Stamps and clock are compared over this time, s, in which 9 % are beyond what is held up.
+#: Time over which stamps and clock are compared, s; a deviation of 9 % exceeds the tolerance.
 _COMPARED = 30.0
-#: Stamps that jump back twice within this time, s, are those of several publishers.
+#: Two jumps back of the stamps within this time, s, show several publishers.
 _INTERLEAVED = 1.0
 
 
@@ -117,8 +119,8 @@ class Output(NamedTuple):
     """
     A corrected sample: stamp, ns, heading, rad, rate, rad/s, and their variances.
 
-    Where the noise of the gyro is not known, the variance of the heading is that of a quantity
-    that is not measured, and that of the rate holds the assumed bias.
+    Where the noise of the gyro is unknown, the variance of the heading is that of an unmeasured
+    quantity, and the variance of the rate includes the assumed bias.
 
     """
 
@@ -135,24 +137,24 @@ COUNTED = ('samples', 'refused_samples', 'refused_temperatures', 'lost_samples',
 
 @dataclass
 class Journal:
-    """What happened so far."""
+    """Events and counts so far."""
 
-    #: When the last sample came, s of the steady clock.
+    #: Time of the last sample, s of the steady clock.
     received: float
-    #: Of samples, and of what was wrong with some.
+    #: Counts of samples and of their faults.
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
-    #: The last event, and steps of the clock of the host, in words.
+    #: The last event, and the steps of the host clock, as text.
     event: str = ''
     clock_steps: str = ''
     #: Number of refused calibrations, and the last reasons.
     refused: int = 0
     reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
-    #: Further quantities in the samples.
+    #: Further channels in the samples.
     channels: set[str] = field(default_factory=set)
 
 
 def _tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
-    """Return how the heading is tracked; without known noise the threshold filter finds rests."""
+    """Return the settings of the tracker; with unknown noise the threshold filter is used."""
     rate = 0.0 if values.stationary_method == 'none' else values.stationary_threshold
     threshold = Threshold(rate, angle_random_walk=noise.angle_random_walk)
     alarms = _REST_FALSE_ALARMS if values.stationary_method == 'rest' else 0.0
@@ -161,24 +163,24 @@ def _tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
 
 class Pipeline:
     """
-    From raw samples to corrected rates and the heading.
+    Computes corrected rates and the heading from raw samples.
 
     Attributes
     ----------
     values : the parameters of the node
     store, estimator, monitor, wheels, session, journal, ros_time : its parts
-    conflict : why the samples cannot be used, in a sentence; ''
-    several : the same for publishers that are there, of which perhaps one alone sends; ''
+    conflict : why samples cannot be used, in a sentence; ''
+    several : that the graph lists several publishers, in a sentence; ''
     repeats : that the gyro repeats one value, in a sentence; ''
-    pace : that the stamps of samples leave the clock, in a sentence; ''
-    odometry_fault : why odometry is not taken for a standstill, in a sentence; ''
+    pace : that stamps and clock advance differently, in a sentence; ''
+    odometry_fault : why odometry does not show standstill, in a sentence; ''
 
     """
 
     def __init__(self, values: SimpleNamespace, calibration_file: Path, clock: Clock,
                  send: Callable[[float], None]):
         """
-        Read model and last calibration; what is wrong with them is reported.
+        Read model and last calibration; faults of the files are reported.
 
         Parameters
         ----------
@@ -210,25 +212,25 @@ class Pipeline:
         self._newest, self._jumps = 0, deque[float](maxlen=2)
         self._frame: str | None = None
         self.several, self._switches = '', 0
-        # Of a driver that was started again, which may send faster than before: when the last
-        # sample arrived, s, and the longest interval since a silence, ns.
+        # For a driver that was restarted and may send faster: arrival of the last sample, s, and
+        # the longest interval since a silence, ns.
         self._same_name, self._arrived, self._longest = False, clock.steady(), 0
-        self._behind = 0.0  # by which the last samples came late, ns
+        self._behind = 0.0  # delay of the last samples, ns
         self._good = 0.0, 0.0
-        # When samples with a repeated stamp began, s, and the fastest rate among them, rad/s.
+        # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._standing: tuple[float, float] | None = None
         self.repeats, self._repeated = '', RepeatedOutput(noise)
         self.pace, self._pace_fault, self._stamps = '', '', StampDelay(
             clock, _INTERLEAVED, _COMPARED)
         self._suspect = math.nan  # a temperature, degC
-        # What odometry's heading was when its rate became zero, rad, and when both differed, s.
+        # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
         self._stood, self._contradicted = math.nan, -math.inf
         self._recent, self._beginnings = deque[tuple[float, float]](), 0
 
     # Time
 
     def _since_epoch(self, stamp: int) -> float:
-        """Return s since the first stamp's second, where a double still resolves nanoseconds."""
+        """Return s since the second of the first stamp, so that a double resolves nanoseconds."""
         if self._epoch is None:
             self._epoch = stamp - stamp % NSEC_PER_SEC
         return 1e-9 * (stamp - self._epoch)
@@ -239,7 +241,7 @@ class Pipeline:
         return since if self._last == -math.inf else self._host.of_other(since, self._last)
 
     def _time_of_sample(self, stamp: int, silence: float) -> float:
-        """Return the time of a sample that came after a silence; both in s."""
+        """Return the time of a sample, s, after a silence, s."""
         since = self._since_epoch(stamp)
         if self._clock.simulated() is not None:
             return since
@@ -247,7 +249,7 @@ class Pipeline:
         return self._host.of_sample(since, self._last, self._interval, silence)
 
     def _look_at_host_clock(self) -> None:
-        """Take dates that the clock of the host gave before it was set for those after it."""
+        """Detect steps of the host clock, and correct stored dates by them."""
         clock, journal = self._clock, self.journal
         read = read_together(clock.steady, clock.date)
         if not read or not (step := self._host.watch(*read)):
@@ -261,10 +263,10 @@ class Pipeline:
         if self.estimator.calibrated_now and self.estimator.model.self_calibration:
             self.store.keep(self.estimator.model.self_calibration)
 
-    # What comes in
+    # Inputs
 
     def temperature(self, stamp: int, value: float) -> None:
-        """Take a temperature, degC; with a stamp far ahead of the samples it is one of now."""
+        """Add a temperature, degC; a stamp far ahead of the samples is replaced by the last."""
         time = self._time(stamp)
         if time - self._last > TEMPERATURE_TIMEOUT and self._last > -math.inf:
             time = self._last
@@ -281,7 +283,7 @@ class Pipeline:
                                   f'{f" after {known:g} degC" if odd else ""} and not used')
 
     def odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
-        """Take a heading, rad, and a velocity by the wheels."""
+        """Add a heading, rad, and a velocity by the odometry."""
         now, rate, time = self._clock.steady(), velocity.angular[2], self._time(stamp)
         if velocity.moves:
             self._stood = math.nan
@@ -290,7 +292,7 @@ class Pipeline:
             self._add_unknown_turn(_CONTRADICTION)
         elif math.isnan(self._stood):
             self._stood = heading
-        # A late message shows nothing of now, and one that contradicts itself no standstill.
+        # A late message is not used, and a contradictory one does not show standstill.
         if not self._last - time > FRESH and (velocity.moves or not self.odometry_fault):
             self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
@@ -298,14 +300,14 @@ class Pipeline:
 
     @property
     def odometry_fault(self) -> str:
-        """Return why odometry is not taken for a standstill, in a sentence; ''."""
+        """Return why odometry does not show standstill, in a sentence; ''."""
         if self._clock.steady() - self._contradicted > _DISTRUST:
             return ''
         return ('odom turns by its headings while its rate is zero: check its twist, without '
                 'which it does not show that the robot stands')
 
     def command(self, velocity: Velocity) -> None:
-        """Take a command from cmd_vel, those of this node included."""
+        """Add a command from cmd_vel, also one of this node."""
         self.wheels.add(COMMAND, velocity, self._clock.steady())
         self.session.add_command(velocity)
 
@@ -318,13 +320,13 @@ class Pipeline:
         ----------
         stamp : ns
         output : rad/s
-        specific_force : along the input axis, m/s², where it came
+        specific_force : along the input axis, m/s²; None if unknown
         receivers : number of other nodes that receive cmd_vel
         frame : of the gyro
 
         Returns
         -------
-        what is published, or None where the sample cannot be used
+        the corrected sample, or None where the sample cannot be used
 
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
@@ -358,14 +360,14 @@ class Pipeline:
             return None
         if self._standing is not None:
             (first, fastest), self._standing = self._standing, None
-            if now - first > BLIND:  # what the gyro may have turned meanwhile
+            if now - first > BLIND:  # add the possible turn meanwhile
                 self._add_unknown_turn(min(fastest * (now - first), math.tau))
                 journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                  'came; turns in this time are not in the heading')
         interval = time - self._last
         if 0.0 < interval <= self.values.maximum_gap:
             self._interval = min(interval, self.estimator.tracker.intervals.usual)
-        # Without power, perhaps; where samples only waited, their stamps go on.
+        # Perhaps a loss of power; after a mere delay the stamps continue.
         if (now - journal.received > _POWER_OFF and interval < math.inf
                 and not 0.0 < interval < _POWER_OFF):
             self.estimator.begin_run(self._clock.date())
@@ -374,7 +376,7 @@ class Pipeline:
         return self._use(stamp, time, (interval, silence), output, specific_force, now, receivers)
 
     def _see_jump(self, now: float, what: str) -> None:
-        """Take the second jump of stamps or frames within 1 s for that of several gyros."""
+        """Count a jump of stamps or frames; two within 1 s show several gyros."""
         self._jumps.append(now)
         if len(self._jumps) > 1 and now - self._jumps[0] < _INTERLEAVED:
             self._refuse_all(f'{what}, as with several gyros on one topic: give each gyro a topic '
@@ -382,7 +384,7 @@ class Pipeline:
 
     def _use(self, stamp: int, time: float, since: tuple[float, float], output: float,
              force: float | None, now: float, receivers: int) -> Output | None:
-        """Compensate and integrate a sample; `since` the last one by stamps and arrivals, s."""
+        """Compensate and integrate a sample; `since` is the interval by stamps and arrivals, s."""
         estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
         sources = _SOURCES[self.values.wheels]
         moving = self.wheels.moving(now, sources) if sources else None
@@ -404,7 +406,7 @@ class Pipeline:
             self._note_restart(restarted)
         elif unseen and moving is not False and tracker.intervals.lost > lost:
             turned = 0.25 * _ACCELERATION * interval ** 2
-            if silence < 0.5 * interval:  # or no samples are lost, and the stamps leapt
+            if silence < 0.5 * interval:  # the stamps may have jumped without a loss
                 turned += abs(estimator.rate) * interval
             self._add_unknown_turn(turned)
         self._stamps.add(time)
@@ -418,7 +420,7 @@ class Pipeline:
             self.session.add(time, output, receivers)
         known = self._noise_is_known
         spread = 0.0 if known and self._interval < math.inf else self.values.assumed_bias ** 2
-        # Right after a reset nothing but the last sample is unknown; zero would say exactly known.
+        # After a reset the variance is that of one sample; zero would state an exact heading.
         least = tracker.rate_variance * min(self._interval, 1.0) ** 2
         found = Output(
             stamp + self._delay, tracker.heading,
@@ -441,7 +443,7 @@ class Pipeline:
         self.estimator.rewind(tracker.heading, tracker.variance + angle ** 2)
 
     def _look_for_repeats(self, time: float, output: float, now: float) -> None:
-        """Take a turn for unknown while the gyro repeats one value."""
+        """Detect a repeated value, and add an unknown turn to the heading."""
         if not self._repeated.add(time, output, self.wheels.turning(now)):
             self.repeats = ''
         elif not self.repeats:
@@ -463,9 +465,9 @@ class Pipeline:
     # Conflicts and obstacles
 
     def _refuse_all(self, conflict: str) -> None:
-        """Use no more samples, and go back to the heading from before the conflict."""
+        """Refuse all samples, and restore the heading from before the conflict."""
         if not self.conflict:
-            # Turns are unknown until one gyro sends alone: the variance is that of any direction.
+            # Turns are unknown until only one gyro sends: add the variance of a full turn.
             heading, variance = self._good
             self.estimator.rewind(heading, variance + math.tau ** 2)
             self.journal.event = conflict
@@ -473,7 +475,7 @@ class Pipeline:
         self.session.watch(self.values, 0, conflict=conflict)
 
     def publishers(self, names: Sequence[str]) -> None:
-        """Take the nodes that publish the samples, a few times a second."""
+        """Take the names of the nodes that publish samples; called a few times per second."""
         self.several = '' if len(names) < 2 else (
             f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), and '
             'their samples cannot be distinguished: give each gyro a topic of its own')
@@ -490,12 +492,12 @@ class Pipeline:
 
     def _look_for_switch(self, stamp: int) -> None:
         """
-        Count a sample that comes too soon after the one before it to be of the same publisher.
+        Count samples that follow too soon to be of the same publisher.
 
-        A sample of another one divides an interval, so that one part is at most half of it. A
-        driver that was started again sends alone, although the middleware lists its dead
-        predecessor for up to 20 s; it may send at another rate. Samples that were held up come
-        too soon after each other as well, until they have caught up.
+        A sample of a second publisher divides an interval, so that one part is at most half of it.
+        A restarted driver sends alone, although the middleware lists the killed one for up to 20
+        s, and may send at another rate. Delayed samples also follow too soon, until they have
+        caught up.
 
         """
         usual, interval = (NSEC_PER_SEC * self.estimator.tracker.intervals.usual,
@@ -511,7 +513,7 @@ class Pipeline:
             self._refuse_all(self.several)
 
     def obstacle(self) -> str:
-        """Return why the robot must not be driven now; '' where nothing stands against it."""
+        """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
         if self.ros_time.standing > BLIND:
             return STANDING_TIME
@@ -529,7 +531,7 @@ class Pipeline:
                     'it stands, call calibrate_bias first')
         return ''
 
-    # Now and then
+    # Periodic calls
 
     def set(self, values: SimpleNamespace) -> None:  # noqa: A003
         """Continue with other values of the parameters."""
@@ -541,17 +543,17 @@ class Pipeline:
             self.monitor.standing = tracking.threshold.rate
 
     def watch(self, receivers: int) -> None:
-        """Check that time and samples advance; to be called several times a second."""
+        """Check that time and samples advance; to be called several times per second."""
         self.ros_time.poll(self._clock)
-        # A robot is not driven by samples that may be those of another gyro in a moment.
+        # A drive ends where several publishers exist, before their samples mix.
         conflict = self.conflict or (self.several if self.session.drives else '')
         self.session.watch(self.values, receivers, self.ros_time.standing > BLIND, conflict)
 
     def learn(self, ending: bool = False) -> None:
-        """Let the bias table learn from rests; to be called once a second, and at the end."""
+        """Update bias table and files; to be called once per second, and at the end."""
         if self._clock.simulated() is None:
             self._look_at_host_clock()
-        # Twice in a row: samples that were held up come at once, and are late until they have.
+        # Two faults in a row: delayed samples come in a burst, and are late until then.
         before, self._pace_fault = self._pace_fault, self._stamps.fault()
         self.pace = before and self._pace_fault
         if self.pace:
@@ -566,7 +568,7 @@ class Pipeline:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
         self._good = 0.0, 0.0
-        if self.conflict or self.repeats:  # turns are not measured
+        if self.conflict or self.repeats:  # turns are not measured now
             self.estimator.rewind(0.0, math.tau ** 2)
         return 'the heading is zero here and now'
 

@@ -9,11 +9,11 @@
 # under the License.
 
 """
-Receive messages from topics in serialized form, for a recorder.
+A node that receives serialized messages from topics, for a recorder.
 
 Types come from the graph, so that any message whose package is installed can be recorded. A
-subscription requests the QoS that is offered: best effort publishers are received, and reliable
-ones lose nothing. Publishers may come late, go and come again with another QoS.
+subscription requests the offered QoS: best effort publishers are received, and reliable ones lose
+nothing. Publishers may start late, stop, and start again with another QoS.
 
 """
 
@@ -39,9 +39,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-_LAST = 10.0  # s; longest time for taking what had come before a busy recorder is stopped
-_POLL_INTERVAL = 0.3  # s; between two queries of the graph
-_LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process
+_LAST = 10.0  # s; longest time for the messages in the queues when a recorder is stopped
+_POLL_INTERVAL = 0.3  # s; interval of queries of the graph
+_LARGEST_DOMAIN = 232  # beyond it UDP ports exceed 65535, and Fast DDS ends the process
 _WORDS = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
 
 
@@ -52,14 +52,14 @@ class RecorderNode(Node):
     Parameters
     ----------
     topics : sequence of str
-    everything : whether all other topics are wanted as well
-    take : gets each message, and the definition
+    everything : whether all other topics are recorded too
+    take : is called with each message and its definition
 
     Attributes
     ----------
-    topics : those that were asked for, with their full names
-    unknown : topics whose type is not installed here, and why they cannot be recorded
-    taken : number of messages that were handed over
+    topics : full names of the requested topics
+    unknown : topics whose type is not installed, and the reason
+    taken : number of received messages
 
     Raises
     ------
@@ -82,7 +82,7 @@ class RecorderNode(Node):
 
     @property
     def missing(self) -> list[str]:
-        """Return the topics that were asked for and have no publisher so far."""
+        """Return the requested topics without a publisher so far."""
         return [topic for topic in self.topics if topic not in self._subscriptions_of]
 
     def known(self) -> list[str]:
@@ -90,7 +90,7 @@ class RecorderNode(Node):
         return sorted(name for name, _ in self.get_topic_names_and_types())
 
     def poll(self) -> None:
-        """Subscribe to what is new in the graph."""
+        """Subscribe to new topics in the graph."""
         for topic, kinds in self.get_topic_names_and_types():
             wanted = topic in self.topics or self._everything
             publishers = self.get_publishers_info_by_topic(topic) if wanted else []
@@ -110,7 +110,7 @@ class RecorderNode(Node):
             self.unknown[topic] = f'{kind} is not installed here ({error})'
             return
 
-        # By the steady clock: the time of receipt must not jump when the clock is set.
+        # By the steady clock, so that times of receipt do not jump when the clock is set.
         def take(data: bytes) -> None:
             self.taken += 1
             self._take(Message(topic, kind, self._begin + round(steady() * NSEC_PER_SEC),
@@ -132,7 +132,7 @@ def _reason(error: Exception) -> str:
 
 
 def _quality(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
-    """Return a QoS that all publishers can serve; transient local if that of all is."""
+    """Return a QoS compatible with all publishers; transient local only if all offer it."""
     best_effort = any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
                       for each in publishers)
     latched = all(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
@@ -147,7 +147,7 @@ def load(kind: str) -> Any:
     """
     Return the class of a message type such as ``sensor_msgs/msg/Imu``.
 
-    Any node in the graph can name a type, and must not make this one import other modules.
+    Other nodes name the types, so only modules of the form ``package.msg`` are imported.
 
     """
     if not re.fullmatch(r'\w+/msg/\w+', kind):
@@ -157,7 +157,7 @@ def load(kind: str) -> Any:
 
 
 def _definition_of(kind: str) -> str:
-    """Return the fields of a type, and then those of all types in it, as ROS 2 writes them."""
+    """Return the definition of a type with its nested types, in the format of ROS 2."""
     kinds, parts = [kind], []
     for each in kinds:
         fields = load(each).get_fields_and_field_types()
@@ -170,7 +170,7 @@ def _definition_of(kind: str) -> str:
 
 
 def _field(text: str) -> str:
-    """Return the type of a field in a definition, ``float64[<=3]`` of ``sequence<double, 3>``."""
+    """Return the type of a field in a definition: ``float64[<=3]`` for ``sequence<double, 3>``."""
     if text.startswith('sequence<'):
         inner, _, most = text.removeprefix('sequence<').removesuffix('>').partition(', ')
         return f'{_field(inner)}[{f"<={most}" if most else ""}]'
@@ -182,17 +182,17 @@ def _field(text: str) -> str:
 def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Message, str], None],
                   tick: Callable[[RecorderNode], None], stop: threading.Event) -> None:
     """
-    Hand over the messages of topics until stopped.
+    Receive the messages of topics until stopped.
 
     Parameters
     ----------
     topics, everything, take : as for `RecorderNode`
-    tick : is called often, with the node
-    stop : ends it when set
+    tick : is called at least every 50 ms, with the node
+    stop : event that ends the recording
 
     Raises
     ------
-    LogError : a topic name is not valid, or ROS 2 cannot be started, as with an impossible
+    LogError : a topic name is not valid, or ROS 2 cannot be started, as with an invalid
         ROS_DOMAIN_ID
 
     """
@@ -223,7 +223,7 @@ def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Messa
 
 
 def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> None:
-    """Hand over the messages in the queues, which came before the recorder was stopped."""
+    """Receive the messages that were in the queues when the recorder was stopped."""
     deadline, idle = time.monotonic() + _LAST, 0
     while idle < 3 and time.monotonic() < deadline:  # a call may also serve a timer
         before = node.taken

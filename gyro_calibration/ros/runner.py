@@ -9,7 +9,7 @@
 # under the License.
 
 """
-How a node declares its parameters, which qualities its topics have, and how it starts and ends.
+Common functions of nodes: parameters, QoS of topics, start and shutdown.
 
 A node is a subclass of `rclpy.node.Node` that declares its table of parameters in its constructor
 and joins its threads in `destroy_node`. Its ``main`` is ``return run(TheNode)``.
@@ -54,30 +54,30 @@ from rclpy.timer import Timer
 SENSOR_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT,
                         durability=DurabilityPolicy.VOLATILE)
 """
-Of subscriptions to samples: best effort, so that every publisher fits (REP-2003).
+QoS of subscriptions to samples: best effort, compatible with every publisher (REP-2003).
 
-5000 deep, so that callbacks that are busy for 5 s lose nothing at 1 kHz.
+The depth of 5000 covers callbacks that are busy for 5 s at 1 kHz.
 
 """
 
 PUBLISHED_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE,
                            durability=DurabilityPolicy.VOLATILE)
-"""Of published samples: reliable, so that every subscriber fits (REP-2003)."""
+"""QoS of published samples: reliable, compatible with every subscriber (REP-2003)."""
 
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""The last state, also for those who come later."""
+"""QoS of a state: the last message is kept for late subscribers."""
 
-# By default rclpy watches each topic for partners whose quality of service does not fit, and asks
-# at every wake-up, which at 1 kHz costs 2 % of a core a topic. Here every quality fits.
+# By default rclpy checks each topic for incompatible QoS at every wake-up, which costs 2 % of a
+# core per topic at 1 kHz. Here every QoS is compatible.
 _UNWATCHED_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
 _UNWATCHED_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
 
 ENDING = 10.0
-"""A node that has not ended after this time is killed, s."""
+"""Longest time of the shutdown of a node, s; then it is killed."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SIGNAL_SEEN = 0.2  # s; a signal is seen after this time at the latest
+_SIGNAL_SEEN = 0.2  # s; longest time until a signal is handled
 
 
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:
@@ -104,7 +104,7 @@ def declare(node: Node, table: Sequence[Parameter],
     ----------
     node : Node
     table : sequence of Parameter
-    changed : takes the record of all values after some were set
+    changed : is called with the record of all values after a change
 
     Raises
     ------
@@ -132,7 +132,7 @@ def declare(node: Node, table: Sequence[Parameter],
             changed(current())
 
     for each in table:
-        # with any type first: rclpy refuses 100 for 100.0, and in several sentences
+        # first with any type: rclpy refuses 100 for 100.0, with a message of several sentences
         several = not isinstance(each.default, (bool, int, float, str))
         default = list(each.default) if several else each.default  # type: ignore[arg-type]
         given = node.declare_parameter(each.name, default,
@@ -148,7 +148,7 @@ def declare(node: Node, table: Sequence[Parameter],
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return what ``ros2 param describe`` shows."""
+    """Return the descriptor that ``ros2 param describe`` shows."""
     unit = f' Unit: {parameter.unit}.' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.description + unit, read_only=not parameter.dynamic,
@@ -166,10 +166,10 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 def call_every(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """
-    Call again and again while the node spins, each time after a period, s, of the steady clock.
+    Create a timer with a period, s, of the steady clock.
 
-    By the clock of the node, the default of rclpy's timers, all would stop for an hour when the
-    clock is set back by one, and for ever when a simulation is paused.
+    Timers of the node's clock, the default of rclpy, stop for an hour when that clock is set back
+    by an hour, and while a simulation is paused.
 
     """
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -202,16 +202,17 @@ def run(node_class: Callable[[], Node]) -> int:
         return 0
     finally:
         rclpy.try_shutdown()
-        # Ctrl-C under a launch file comes twice; the second would kill the interpreter at its end.
+        # A launch file sends SIGINT twice; the second would kill the interpreter at its exit.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
 
 def answer_later(service: Service) -> None:
     """
-    Let the callback of a service return a `Future` of its response, which is sent when it is done.
+    Allow the callback of a service to return a `Future`; its response is sent when it is done.
 
-    It does what an ``async`` callback does, in every executor, and holds up no other callback.
+    This corresponds to an ``async`` callback, works in every executor, and blocks no other
+    callback.
 
     """
     send = service.send_response
@@ -229,16 +230,16 @@ def spin(node: Node, stop: threading.Event) -> None:
     """Serve the callbacks of a node until an event is set, then close it."""
     serving: Executor
     try:
-        # It takes half of the processor time. It awaits no ``async`` callback and passes no
-        # message information before rclpy 7.1.11 (Jazzy); the nodes use neither.
+        # This executor takes half of the processor time. Before rclpy 7.1.11 (Jazzy) it has no
+        # ``async`` callbacks and no message information; the nodes use neither.
         from rclpy.experimental import EventsExecutor
         serving = EventsExecutor()
     except ImportError:  # Humble
         serving = SingleThreadedExecutor()
     serving.add_node(node)
     try:
-        # A node has a timer, after which a signal is seen. For this executor a time-out is one
-        # more timer with each message; the other one never returns without.
+        # The timers of a node end the wait of SingleThreadedExecutor, for which a time-out would
+        # be one more timer at each message; EventsExecutor returns only with a time-out.
         timeout = None if isinstance(serving, SingleThreadedExecutor) else _SIGNAL_SEEN
         while not stop.is_set():
             serving.spin_once(timeout_sec=timeout)
@@ -246,8 +247,8 @@ def spin(node: Node, stop: threading.Event) -> None:
         pass  # rclpy was shut down elsewhere
     finally:
         serving.shutdown()
-        # Fast DDS 2.14 waits for ever, with the GIL held, when it receives the end of another node
-        # at the moment of its own, as after Ctrl-C.
+        # Fast DDS 2.14 can deadlock, with the GIL held, when two nodes end at the same time, as
+        # after Ctrl-C.
         faulthandler.dump_traceback_later(ENDING, exit=True)
         node.destroy_node()
         faulthandler.cancel_dump_traceback_later()

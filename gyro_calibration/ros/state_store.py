@@ -11,9 +11,8 @@
 """
 The state of a robot in files: the gyro model, the last self-calibration, biases at rest.
 
-The calibration file is a whole model file: it is read and checked in the same way and holds the
-effects behind which it was found. Where those differ from the model in use, the self-calibration
-is not used.
+The calibration file is a complete model file with the effects that were in use at the calibration.
+If they differ from the model in use, the self-calibration is not used.
 
 """
 
@@ -39,18 +38,18 @@ class StateStore:
 
     Attributes
     ----------
-    model : with its self-calibration; an empty one where it cannot be read
-    table : of biases at rest
-    problem : why the rates are uncalibrated, in a sentence; '' where they are calibrated
-    hint : another fault of a file; '' without
+    model : the model with its self-calibration; an empty one if it cannot be read
+    table : biases at rest
+    problem : why the rates are uncalibrated, in a sentence; '' if they are calibrated
+    hint : fault of the calibration file; '' without
     table_hint : fault of the bias table; '' without
-    shared_hint : that another process has written to a file since; '' without
-    written : time of the last writing of the bias table, s since 1970; None before
+    shared_hint : that another process has written to a file; '' without
+    written : time when the bias table was last written, s since 1970; None before
 
     """
 
     def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior):
-        """Read the files, use those without a fault, and remove what a killed run left behind."""
+        """Read the files, use those without a fault, and remove temporary files of killed runs."""
         for file in (calibration_file, bias_file):
             remove_leftovers(file)
         self._calibration_file, self._bias_file = calibration_file, bias_file
@@ -64,7 +63,7 @@ class StateStore:
                                             for file in (calibration_file, bias_file)}
 
     def poll(self) -> None:
-        """Check whether another process has written to the files; to be called regularly."""
+        """Check whether another process has written to the files; to be called periodically."""
         for file, seen in self._seen.items():
             found = _version(file)
             if found is not None and found != seen:
@@ -98,7 +97,7 @@ class StateStore:
         return with_self_calibration(model, stored.self_calibration)
 
     def keep(self, calibration: SelfCalibration) -> str:
-        """Store a calibration, and return what went wrong, '' if nothing."""
+        """Use and store a calibration; return the fault of the storage, '' without one."""
         self.model, self.hint = with_self_calibration(self.model, calibration), ''
         try:
             self._written(self._calibration_file, write_model(self._calibration_file, self.model))
@@ -110,7 +109,7 @@ class StateStore:
         return self.hint
 
     def keep_table(self, now: float, ending: bool = False) -> None:
-        """Write the table if it is due, and at the end; `now` in s since 1970."""
+        """Write the bias table if it is due, and at the end; `now` in s since 1970."""
         if self.problem or not self.table.due(now, ending):
             return
         try:
@@ -124,7 +123,7 @@ class StateStore:
 
 
 def _fault(stored: GyroModel, model: GyroModel) -> str:
-    """Return why a stored self-calibration does not fit a model, for a sentence; '' if it does."""
+    """Return why a stored self-calibration does not fit a model; '' if it does."""
     if stored.self_calibration is None:
         return 'the file has none; it may be truncated'
     if not same_effects(stored, model):

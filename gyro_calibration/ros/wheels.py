@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Whether the wheels of a robot turn, as far as odometry and commands of the last second show."""
+"""Motion of the wheels of a robot, by odometry and commands of the last second."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 import math
 
-#: What came longer ago shows nothing, s.
+#: Largest age of a velocity that is used, s.
 FRESH = 1.0
-#: A robot coasts for this time after its last command to move, s.
+#: Longest motion after the last command to move, s.
 COASTING = 0.5
-#: Wheels stand up to these speeds, m/s and rad/s.
+#: Largest speeds of wheels at standstill, m/s and rad/s.
 LINEAR, _ANGULAR = 0.001, 0.0002
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
 
@@ -39,7 +39,7 @@ class Velocity:
 
     @property
     def moves(self) -> bool:
-        """Tell whether it is more than wheels that stand show."""
+        """Tell whether it exceeds the speeds at standstill."""
         return (any(abs(part) > LINEAR for part in self.linear)
                 or any(abs(part) > _ANGULAR for part in self.angular))
 
@@ -48,14 +48,14 @@ class Wheels:
     """The last velocity from each source, by the steady clock."""
 
     def __init__(self) -> None:
-        """Begin with nothing received."""
+        """Start without velocities."""
         self._last: dict[str, tuple[float, Velocity]] = {}
-        # since when a source has shown without a break that the robot stands, s
+        # begin of uninterrupted standstill by each source, s
         self._standing: dict[str, float] = {}
         self._commanded = -math.inf
 
     def add(self, source: str, velocity: Velocity, now: float) -> None:
-        """Take a velocity that came at a time, s; one that is not finite shows nothing."""
+        """Add a velocity at its time of arrival, s; one that is not finite is ignored."""
         if not velocity.is_finite:
             return
         then, _ = self._last.get(source, (-math.inf, None))
@@ -66,7 +66,7 @@ class Wheels:
             self._commanded = now
 
     def moving(self, now: float, sources: Collection[str] = (ODOMETRY, COMMAND)) -> bool | None:
-        """Return whether the wheels turn by these sources; None where none shows it."""
+        """Return whether the robot moves by these sources; None without recent data."""
         fresh = [velocity.moves for source, (then, velocity) in self._last.items()
                  if source in sources and now - then <= FRESH]
         if not fresh:
@@ -74,15 +74,15 @@ class Wheels:
         return any(fresh) or COMMAND in sources and now - self._commanded < COASTING
 
     def stood(self, since: float, now: float, sources: Collection[str]) -> bool:
-        """Tell whether one of these sources saw from a time on, s, that the robot stood."""
+        """Tell whether one of these sources has shown standstill since a time, s."""
         return self.moving(now, sources) is False and any(
             self._standing[source] <= since for source in sources if source in self._standing)
 
     def turning(self, now: float) -> float:
-        """Return the rate about z that odometry shows, rad/s; 0 where none came in time."""
+        """Return the rate about z by odometry, rad/s; 0 without recent data."""
         then, velocity = self._last.get(ODOMETRY, (-math.inf, Velocity()))
         return velocity.angular[2] if now - then <= FRESH else 0.0
 
     def age(self, now: float) -> float:
-        """Return how long ago the last velocity came, s."""
+        """Return the age of the last velocity, s."""
         return now - max((then for then, _ in self._last.values()), default=-math.inf)
