@@ -446,8 +446,8 @@ class CalibrationSession:
         elif self._drive:
             self._command_if_due(self._drive)
         if node_time(self._clock) - self._begun > 2.0 * run.total + SILENCE:
-            self.end('the stamps on imu/data_raw go on too slowly: check the clock of the driver, '
-                     'and use_sim_time')
+            self.end('the stamps on imu/data_raw advance too slowly: check the clock of the '
+                     'driver, and use_sim_time')
         suspected, self._suspected = self._suspected, self._clock.steady() - run.received > SILENCE
         if suspected and self._suspected:
             self.end(f'no sample came for {SILENCE:g} s: check the gyro and its driver')

@@ -78,7 +78,7 @@ class StampDelay:
         limit = self._tolerance * (1.0 if self._clock.simulated() is None else 4.0)
         if abs(grown) > limit + _PACE * abs(elapsed):
             return (f'this computer was busy, or the clock of the driver is wrong: the stamps on '
-                    f'imu/data_raw went on by {elapsed - grown:.2f} s in {elapsed:.2f} s; reduce '
+                    f'imu/data_raw advanced by {elapsed - grown:.2f} s in {elapsed:.2f} s; reduce '
                     'the load, or check that clock and use_sim_time')
         if self._prompt and (self._before is None or elapsed > self._window):
             self._before = now, self.least

@@ -94,15 +94,16 @@ class CompensationReport:
             temperature = ('no temperature comes; the model is used at its reference temperature '
                            f'of {estimator.model.reference_temperature:g} degC')
         elif estimator.temperature is not None and estimator.temperature_is_lost:
-            temperature = (f'no temperature comes any more; the last one, '
-                           f'{estimator.temperature:.1f} degC, is held, and the standard '
-                           'deviation of the bias increases')
+            temperature = (f'the temperature is missing; {estimator.temperature:.1f} degC, the '
+                           'last one, is held, and the standard deviation of the bias '
+                           'increases')
         warnings = [*(text for name, text in counted.items() if name in growing),
                     *filter(None, (temperature, *missing, *others))]
         if warnings:
             return WARN, warnings[0]
         tracked = pipeline.estimator.tracker.slowest_noticed > 0.0
-        return OK, 'heading goes on' + ('' if tracked else '; the bias is not estimated at rest')
+        return OK, 'the heading is published' + (
+            '' if tracked else '; the bias is not estimated at rest')
 
     def _values(self, rate: float) -> dict[str, object]:
         """Return the values of the report by name; `rate` is the sample rate, Hz."""

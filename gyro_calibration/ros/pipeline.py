@@ -447,8 +447,8 @@ class Pipeline:
         if not self._repeated.add(time, output, self.wheels.turning(now)):
             self.repeats = ''
         elif not self.repeats:
-            self.repeats = (f'the gyro reports {output:g} rad/s again and again: it is dead, '
-                            'saturated, or its driver stands')
+            self.repeats = (f'the gyro repeats the rate {output:g} rad/s: it is dead or '
+                            'saturated, or its driver has stopped')
             self.journal.event = self.repeats
             self._add_unknown_turn(math.tau)
             if self.session.drives:

@@ -251,14 +251,14 @@ def test_stamps_that_leave_the_clock_end_a_drive(tmp_path, pace, ros, within):
     paced(rig, pace)
     assert rig.go(5.0, lambda: rig.ended)
     assert rig.stopped_after(begin) < within
-    assert 'the stamps on imu/data_raw went on by' in rig.session.conclude()[1]
+    assert 'the stamps on imu/data_raw advanced by' in rig.session.conclude()[1]
 
 
 def test_stamps_that_all_but_stand_end_a_run_that_does_not_drive(tmp_path):
     rig = rested(tmp_path)
     paced(rig, 1e-6)
     success, message = rig.calibrate(REST)
-    assert not success and 'go on too slowly' in message
+    assert not success and 'advance too slowly' in message
 
 
 @pytest.mark.parametrize('timer_first', [True, False])

@@ -207,7 +207,7 @@ def test_a_gyro_that_repeats_one_value_is_an_error_and_the_heading_claims_nothin
     rig.robot.command(0.0 if value == 'in a turn' else 0.7)
     rig.go(6.0)
     level, message, _ = reported(rig)
-    assert level == ERROR and 'again and again: it is dead' in message, message
+    assert level == ERROR and 'the gyro repeats' in message and 'it is dead' in message, message
     rig.robot.step = turns
     rig.go(3.0)
     error, deviation = rig.error(begin)
@@ -252,7 +252,7 @@ def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_no
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(noisy(10.0), SLOW)
     rig.feed(np.full(50, BIAS), SLOW)
-    assert 'again and again' in rig.pipeline.obstacle()
+    assert 'the gyro repeats' in rig.pipeline.obstacle()
     rig.pipeline.reset()
     assert rig.feed(noisy(1.0), SLOW)[-1].heading_variance > math.pi ** 2
 
@@ -260,7 +260,7 @@ def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_no
 def test_a_gyro_of_zeros_beside_odometry_that_turns_is_an_error(tmp_path):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(np.zeros(50), SLOW, moving=0.3)
-    assert 'the gyro reports 0 rad/s again and again' in rig.pipeline.repeats
+    assert 'the gyro repeats the rate 0 rad/s' in rig.pipeline.repeats
 
 
 # Rest
@@ -758,7 +758,7 @@ OK, WARN, ERROR = range(3)
 
 
 @pytest.mark.parametrize('fault, level, words', [
-    (lambda rig: None, OK, 'heading goes on'),
+    (lambda rig: None, OK, 'the heading is published'),
     (lambda rig: setattr(rig.robot, 'unplugged', True), ERROR, 'no samples on imu/data_raw for'),
     (lambda rig: setattr(rig.robot, 'stamps_stand', True), ERROR, 'the stamp stands still'),
     (lambda rig: rig.publishers.append('/other'), ERROR, '2 publishers send'),
@@ -788,7 +788,7 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
     reported(rig)
     rig.go(1.0)
     level, message, _ = reported(rig)
-    assert (level == WARN and 'the stamps on imu/data_raw went on by' in message) == warns, message
+    assert (level == WARN and 'stamps on imu/data_raw advanced by' in message) == warns, message
     assert (rig.error(first)[1] > math.tau) == warns
 
 

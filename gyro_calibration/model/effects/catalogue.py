@@ -27,11 +27,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 BIAS = Effect(
-    'bias', 'The output is not zero at rest; it holds the Earth rate about the input axis.',
+    'bias', 'The output at rest is not zero; it includes the Earth rate about the input axis.',
     frozenset(), (Parameter('bias', 'rad/s'),),
-    lambda channels: (channels.ones(),), shown_by='let the gyro rest')
+    lambda channels: (channels.ones(),), shown_by='record at rest')
 SCALE_FACTOR_ERROR = Effect(
-    'scale_factor_error', 'The output grows with the rate by another factor than the nominal one.',
+    'scale_factor_error', 'The scale factor differs from the nominal one.',
     frozenset({'rate'}), (Parameter('scale_factor_error', '1'),),
     lambda channels: (channels.rate,), shown_by='turn at several speeds, both ways')
 SCALE_FACTOR_ASYMMETRY = Effect(
@@ -40,17 +40,17 @@ SCALE_FACTOR_ASYMMETRY = Effect(
     lambda channels: (abs(channels.rate),),
     shown_by='turn both ways at many speeds, slow ones and rest too')
 QUADRATIC_NONLINEARITY = Effect(
-    'quadratic_nonlinearity', 'The output has a part that grows with the square of the rate.',
+    'quadratic_nonlinearity', 'The output has a part in proportion to the square of the rate.',
     frozenset({'rate'}), (Parameter('quadratic_nonlinearity', 's/rad'),),
     lambda channels: (channels.rate * channels.rate,),
     shown_by='turn both ways at many speeds up to full scale')
 CUBIC_NONLINEARITY = Effect(
-    'cubic_nonlinearity', 'The scale factor falls or grows with the square of the rate.',
+    'cubic_nonlinearity', 'The scale factor changes with the square of the rate.',
     frozenset({'rate'}), (Parameter('cubic_nonlinearity', 's²/rad²'),),
     lambda channels: (channels.rate * channels.rate * channels.rate,),
     shown_by='turn at many speeds up to full scale')
 SINE_RESPONSE = Effect(
-    'sine_response', 'An open-loop fibre-optic gyro answers with the sine of its Sagnac phase.',
+    'sine_response', 'An open-loop fibre-optic gyro responds with the sine of its Sagnac phase.',
     frozenset({'rate'}), (Parameter('amplitude', '1', default=1.0),),
     lambda channels, k: (np.sin(k * channels.rate) / k - channels.rate,),
     (Parameter('k', 's', bounds=(1e-3, 30.0)),), 'turn at many speeds up to full scale')
@@ -63,7 +63,7 @@ BIAS_TEMPERATURE = Effect(
     lambda channels, reference: (channels.temperature - reference + 0.0 * channels.rate,),
     (_REFERENCE_TEMPERATURE,), 'rest at two temperatures, and better go up and down again')
 BIAS_TEMPERATURE_QUADRATIC = Effect(
-    'bias_temperature_quadratic', 'The bias is curved over temperature.',
+    'bias_temperature_quadratic', 'The bias changes with the square of the temperature.',
     frozenset({'temperature'}), (Parameter('bias_temperature_quadratic', 'rad/s/K²'),),
     lambda channels, reference: ((channels.temperature - reference) ** 2 + 0.0 * channels.rate,),
     (_REFERENCE_TEMPERATURE,), 'rest at three temperatures or more')
@@ -84,8 +84,8 @@ def _temperature_ahead(channels: Channels, time_constant: float) -> Number:
 _OF_PAST_TEMPERATURES = (
     Effect(
         'bias_temperature_rate',
-        'The bias changes in proportion to how fast the temperature changes, as gradients within '
-        'the instrument do (in fibre gyros the effect of Shupe).',
+        'The bias changes in proportion to the rate of change of the temperature, by gradients '
+        'within the instrument (in fibre gyros the Shupe effect).',
         frozenset({'temperature', 'lagged'}), (Parameter('bias_temperature_rate', 'rad/s/(K/s)'),),
         lambda channels, filter_time: (
             -_temperature_ahead(channels, filter_time) / filter_time + 0.0 * channels.rate,),
@@ -101,7 +101,7 @@ _OF_PAST_TEMPERATURES = (
         (Parameter('time_constant', 's', bounds=(1.0, 3000.0)),),
         'heat and cool at two speeds, with corners in the temperature'),
     Effect(
-        'thermal_hysteresis', 'The bias is another one while the gyro cools than while it heats.',
+        'thermal_hysteresis', 'The bias while heating differs from that while cooling.',
         frozenset({'temperature', 'heating'}), (Parameter('thermal_hysteresis', 'rad/s'),),
         lambda channels, filter_time, threshold: (
             (0.0 if channels.heating is None else channels.heating(filter_time, threshold))
@@ -116,17 +116,18 @@ _OF_TIME = (
         frozenset({'time'}), (Parameter('warm_up', 'rad/s'),),
         lambda channels, time_constant: (
             np.exp(-channels.time / time_constant) + 0.0 * channels.rate,),
-        (Parameter('time_constant', 's', bounds=(1.0, 1e5)),), 'start cold, and start warm'),
+        (Parameter('time_constant', 's', bounds=(1.0, 1e5)),),
+        'compare a cold start with a warm start'),
     Effect(
         'rate_ramp', 'The bias grows steadily with time.',
         frozenset({'time'}), (Parameter('rate_ramp', 'rad/s²'),),
         lambda channels: (channels.time + 0.0 * channels.rate,),
         shown_by='let it run several times, heating in one and cooling in another'),
     Effect(
-        'bias_step', 'At one moment the bias becomes another one.',
+        'bias_step', 'The bias changes in a single step.',
         frozenset({'time'}), (Parameter('bias_step', 'rad/s'),),
         lambda channels, step_time: ((channels.time >= step_time) * channels.ones(),),
-        (Parameter('step_time', 's', bounds=(0.0, 1e9)),), 'run again: it happens once'))
+        (Parameter('step_time', 's', bounds=(0.0, 1e9)),), 'repeat the run: the step occurs once'))
 
 _OF_SURROUNDINGS = (
     Effect(
@@ -160,13 +161,13 @@ _OF_SURROUNDINGS = (
         (Parameter('reference_supply', 'V', 5.0),), 'step the supply at one temperature'),
     Effect(
         'interference_tone',
-        'Something periodic gets into the output, or folds down from above half the sample rate.',
+        'The output contains a periodic signal, or an alias from above half the sample rate.',
         frozenset({'time'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')),
         lambda channels, frequency: [
             wave(2.0 * math.pi * frequency * channels.time) + 0.0 * channels.rate
             for wave in (np.sin, np.cos)],
         (Parameter('frequency', 'Hz', bounds=(1e-4, 1e5)),),
-        'sample at another rate: an alias moves, a tone stays'))
+        'sample at another rate: an alias changes its frequency, a tone does not'))
 
 
 def _at(when: Array, time: Array, signal: Array) -> Array:
@@ -182,45 +183,45 @@ def _lagged(signal: Array, time: Array, time_constant: float) -> Array:
     return lagged_signal(_at(finer, time, signal), finer, time_constant)[::4]
 
 
-_FAST_REVERSALS = 'reverse quickly: a delay leaves the size of the swing as it is, a lag does not'
+_FAST_REVERSALS = 'reverse quickly: a lag reduces the amplitude, a delay does not'
 _OF_THE_SIGNAL = (
     Effect(
         'bandwidth', 'The output follows the rate through a first-order lag.',
         shapes=(Parameter('bandwidth', 's', bounds=(1e-7, 10.0)),), shown_by=_FAST_REVERSALS,
         distortion=_lagged, stage='rate',
-        undone='Quick motion stays damped: sharpening it would raise the noise.'),
+        undone='The attenuation of fast motion remains: to undo it would amplify the noise.'),
     Effect(
         'time_offset', 'The stamps of the samples are late by a constant time.',
         shapes=(Parameter('time_offset', 's', bounds=(-1.0, 1.0)),), shown_by=_FAST_REVERSALS,
         distortion=lambda signal, time, offset: _at(time - offset, time, signal), stage='rate',
         moved=lambda time, offset: time - offset,
-        undone='It is undone by moving the stamps; what is late for a controller stays late.'),
+        undone='It is compensated by shifting the stamps; the delay for a controller remains.'),
     Effect(
-        'clock_rate', 'The clock of the gyro runs at another pace than that of the reference.',
+        'clock_rate', 'The clock of the gyro runs at a different rate than that of the reference.',
         shapes=(Parameter('clock_rate', '1', bounds=(-0.1, 0.1)),),
         shown_by='record a long log with quick motion at both ends',
         distortion=lambda signal, time, rate: _at((1.0 + rate) * time, time, signal), stage='rate',
         moved=lambda time, rate: (1.0 + rate) * time,
-        undone='It is undone by stretching the stamps of a log; a robot stamps by its own clock, '
-               'where nothing is to be undone.'),
+        undone='It is compensated by scaling the stamps of a log; a robot stamps by its own '
+               'clock, without this effect.'),
     Effect(
         'dead_zone', 'The output stays zero while the rate is small.',
         frozenset({'rate'}), (Parameter('amplitude', '1', default=1.0),),
         lambda channels, dead_zone: ((abs(channels.rate) < dead_zone) * -channels.rate,),
         (Parameter('dead_zone', 'rad/s', bounds=(1e-7, 1.0)),), 'sweep slowly through zero',
-        undone='Where the output is zero, nothing is known of the rate within the zone.'))
+        undone='An output of zero does not determine the rate within the zone.'))
 SATURATION = Effect(
     'saturation', 'The output cannot go beyond a limit.',
     shapes=(Parameter('saturation', 'rad/s', bounds=(1e-3, 1e3)),),
     shown_by='turn faster than the limit',
     distortion=lambda signal, _time, limit: np.clip(signal, -limit, limit), stage='output',
-    undone='At the limit, nothing is known of the rate but that it is beyond.')
+    undone='An output at the limit does not determine the rate beyond it.')
 QUANTIZATION = Effect(
     'quantization', 'The output comes in steps.',
     shapes=(Parameter('quantization', 'rad/s', bounds=(1e-12, 1.0)),),
-    shown_by='look at the set of codes',
+    shown_by='list the distinct values of the output',
     distortion=lambda signal, _time, step: np.round(signal / step) * step, stage='output',
-    undone='What was rounded away is lost; noise above half a step keeps its mean.')
+    undone='The rounding error remains; with noise above half a step its mean is zero.')
 
 #: Effects of rate and temperature alone, which dwells of a rate table can show.
 STEADY = {effect.name: effect for effect in (
