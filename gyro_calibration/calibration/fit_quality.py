@@ -9,11 +9,11 @@
 # under the License.
 
 """
-What a fit to a known motion may be wrong by beyond its noise, and whether it is then of use.
+Errors of a fit to a known motion that its noise does not contain, and refusal of imprecise fits.
 
-The likelihood looks at blocks of half a second at most. A gyro that shakes on its mount, a
-reversal between two samples, or an encoder out of centre err by as much there, but cancel over
-longer times: such errors repeat with the motion, and do not add up.
+The likelihood uses blocks of 0.5 s at most. The errors of a gyro that shakes on its mount, of a
+reversal between two samples, or of an eccentric encoder repeat with the motion: within a block
+they are as large as random errors, over longer times they cancel and do not accumulate.
 
 """
 
@@ -30,26 +30,26 @@ from gyro_calibration.model.motion import Motion
 import numpy as np
 from scipy.special import chdtr
 
-#: A run is looked at again in so many windows.
+#: Number of windows of a run in the second fit of the bias.
 _WINDOWS = 16
-#: How often a fit to noise that adds up is looked at again in vain.
+#: Probability of that second fit where the noise is a random walk of the heading.
 _CHANCE = 1e-3
 
-#: A calibration is for a drive of this length, s, that ends so far from where it began, rad.
+#: Duration, s, and net turn, rad, of the drive for which the precision of a calibration is judged.
 DRIVE, TURN = 300.0, 2.0 * math.pi
 
 
 @dataclass(frozen=True)
 class _Windows:
     """
-    Means over windows of equal length, shape (n,) each, and what repeats with the motion.
+    Means over windows of equal length, shape (n,) each, and the repeatable error.
 
     Attributes
     ----------
     length : of a window, s
     time, heading : means of times, s, and reference headings, rad
-    turned : mean of what the gyro turned beyond the reference, rad
-    repeating : standard deviation of that from its means within the windows, rad
+    turned : mean heading error of the gyro against the reference, rad
+    repeating : standard deviation of that error about its means within the windows, rad
 
     """
 
@@ -62,20 +62,21 @@ class _Windows:
 
 def look_slower(fit: Fit, time: Array, rate: Array, motion: Motion) -> Fit:
     """
-    Return the fit with the bias by window means, where repeating errors spoil that of the blocks.
+    Return the fit with the bias by window means, where repeatable errors dominate the blocks.
 
-    The scale factor error and the time offset of the fit are taken; what the gyro turned beyond is
-    averaged over 16 windows. Where these differ by less than the noise that the fit has found
-    would make them, that noise does not add up: bias and deviation then are those of the windows,
-    by restricted likelihood with less of it (`noise_grid`). The variance counts twice, for what
-    wanders more slowly than the run lasts does not show in it, and may be as large.
+    Scale factor error and time offset of the fit are kept; the remaining heading error is averaged
+    over 16 windows. If the means differ by less than the noise of the fit implies, that noise does
+    not accumulate: bias and deviation are then those of the windows, by restricted likelihood with
+    a smaller noise (`noise_grid`). The variance is doubled, since a bias that wanders more slowly
+    than the duration of the run is not observable in it and may be as large.
 
     Parameters
     ----------
     fit : by `likelihood.fit_likelihood`
     time : s since the start of the motion, shape (n,)
     rate : output of the gyro, rad/s, shape (n,)
-    motion : headings as measured; with a profile, which the robot follows late, the fit stays
+    motion : headings as measured; with a profile, which the robot follows late, the fit is
+        returned unchanged
 
     """
     windows = None if motion.rate is not None else _windows(fit, time, rate, motion)
@@ -97,7 +98,7 @@ def look_slower(fit: Fit, time: Array, rate: Array, motion: Motion) -> Fit:
 
 
 def _windows(fit: Fit, time: Array, rate: Array, motion: Motion) -> _Windows | None:
-    """Return the windows; None where one is empty, or hardly longer than a block of the fit."""
+    """Return the windows; None where one is empty, or shorter than 1 s."""
     at = motion.time + fit.time_offset
     inside = (at >= time[0]) & (at <= time[-1])
     at, heading = at[inside], motion.heading[inside]
@@ -126,11 +127,12 @@ def _line(windows: _Windows, walk: tuple[float, float], point: tuple[float, floa
 
 def allow_asymmetry(fit: Fit, rate: Array) -> Fit:
     """
-    Return the fit with a small difference between both senses of turning in its covariance.
+    Return the fit with the variance of a scale difference between both senses of turning added.
 
-    For measured headings; against a profile the fit holds it. Such an error grows with the size of
-    the rate. The run takes the part of it that looks like a rate and a bias for them. In a swing
-    without rests, the mean size of the rate in each sense looks like a bias.
+    For measured headings; against a profile the fit includes it. Such an error is proportional to
+    the absolute value of the rate. The part of it that is proportional to the rate, or constant,
+    is indistinguishable from scale factor error and bias. In a swing without rests, the mean
+    absolute rate is indistinguishable from a bias.
 
     """
     columns = np.column_stack([rate, np.ones(len(rate))])
@@ -139,7 +141,7 @@ def allow_asymmetry(fit: Fit, rate: Array) -> Fit:
 
 
 def refuse_repeating(fit: Fit, limit: float) -> None:
-    """Refuse a run whose heading errs by more than a limit, rad, whatever scale and bias are."""
+    """Refuse a run whose heading error exceeds a limit, rad, for any scale and bias."""
     if fit.repeating > limit:
         raise DataRefused(f'the heading error is {fit.repeating / DEGREE:.1f} deg rms and '
                           f'repeats with the motion, at most {limit / DEGREE:g} deg are allowed; '
@@ -149,17 +151,16 @@ def refuse_repeating(fit: Fit, limit: float) -> None:
 
 def refuse_useless(fit: Fit, limit: float) -> None:
     """
-    Refuse a calibration that makes a heading worse, by what it says itself.
+    Refuse a calibration that by its own covariance makes a heading less accurate.
 
     Parameters
     ----------
-    limit : a heading known so well after a drive of five minutes and a whole turn, rad, is of use
-        whatever it was before
+    limit : accepted standard deviation of the heading after a drive of five minutes and a whole
+        turn, rad, whatever it was before
 
     Raises
     ------
-    DataRefused : the heading would be known less well than the limit, and not better than without
-        the calibration
+    DataRefused : the standard deviation exceeds the limit, and the error without the calibration
 
     """
     after = math.sqrt((fit.covariance[1, 1] * DRIVE + 2.0 * fit.covariance[0, 1] * TURN) * DRIVE

@@ -9,11 +9,10 @@
 # under the License.
 
 """
-What went wrong in a run that its profile does not explain: a name, a test and a remedy for each.
+Faults of a run that deviates from its profile: a name, a test and a remedy for each.
 
-What the robot did otherwise shows by which
-motion explains the run best: the profile with one deviating stretch, driven faster or slower,
-begun late, or ended early.
+The fault is the motion that explains the run best: the profile with one deviating stretch, driven
+faster or slower, begun late, or ended early.
 
 """
 
@@ -29,19 +28,17 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
-#: Length of the pieces that motions are compared by, and step of the begins, ends and offsets that
-#: are tried, s. A long run has longer pieces, at most so many: the search takes the cube of their
-#: number.
+#: Minimum length of the pieces in which motions are compared, and step of the tried starts, ends
+#: and offsets, s; largest number of pieces: the time of the search is proportional to its cube.
 _PIECE, _STEP, _MOST_PIECES = 0.1, 0.1, 650
 #: Speeds that are tried, as parts of the profile's.
 _SPEEDS = 2.0 ** (np.arange(-32, 33) / 16.0)
-#: A motion explains a run if it leaves no more than this part of its squares.
+#: A motion explains a run if it leaves at most this fraction of its sum of squares.
 EXPLAINED = 0.1
-#: One that needs a stretch of its own must leave so many times less than one that does not.
+#: Factor by which a motion with a deviating stretch must leave less than one without.
 _SIMPLER = 1.5
 
-#: What a gyro that reports so many times the true rate may be: a confused unit of the gyro, or of
-#: the profile.
+#: Reported over true rate -> the confused unit of the gyro, or of the profile, that causes it.
 _UNITS = {
     180.0 / math.pi: ('the gyro is in deg/s and read as rad/s',
                       'the profile in rad and read as deg'),
@@ -81,7 +78,7 @@ _UNITS = {
                 f'the profile was driven at {factor:g} times its rate')
        for factor in (4.0, 8.0, 10.0, 100.0, 0.25, 0.125, 0.1, 0.01)},
 }
-#: Scale errors up to this, as a logarithm, go with a unit.
+#: Largest scale factor error in addition to a confused unit, as a logarithm.
 _NEAR = math.log(1.1)
 
 
@@ -162,7 +159,7 @@ def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str =
 
 
 def followed(run: Pieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
-    """Return what the profile leaves unexplained at the best delay, and the scale there."""
+    """Return the unexplained fraction of the squares at the best delay, and the scale there."""
     return min(run.left(run.headings(motion, offset)) for offset in _offsets(largest_offset))
 
 
@@ -172,7 +169,7 @@ Tried = Iterable[tuple[float, tuple[float, ...]]]
 
 
 def _best(tried: Tried) -> tuple[float, tuple[float, ...]]:
-    """Return what leaves the least; where there was nothing to try, all is left."""
+    """Return the trial with the least unexplained fraction; infinity without trials."""
     return min(tried, key=lambda each: each[0], default=(math.inf, ()))
 
 
@@ -181,7 +178,7 @@ def _offsets(largest: float) -> Array:
 
 
 def _early(run: Pieces, motion: Motion, largest: float) -> Tried:
-    """Try ends of the motion; the delay is that which fits the part before."""
+    """Try ends of the motion, each at the delay that fits the part before it best."""
     for end in np.arange(0.05, 0.97, 0.0125) * motion.duration:
         yield _best((run.left(run.headings(motion, offset, end=end))[0], (float(end),))
                     for offset in _offsets(largest)[::2])
@@ -200,7 +197,7 @@ def _late(run: Pieces, motion: Motion, largest: float) -> Tried:
 
 
 def _slip(run: Pieces, motion: Motion, largest: float) -> Tried:
-    """Try a stretch that turned otherwise, at the delay that fits best with it."""
+    """Try a stretch with a different turn, at the delay that fits best with it."""
     edges = np.arange(0, len(run.turned) + 1, 5)
     interval = float(np.median(np.diff(run.edges)))
     steps = np.where(np.arange(len(run.turned))[:, None] >= edges, interval, 0.0)

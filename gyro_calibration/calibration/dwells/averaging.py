@@ -23,9 +23,9 @@ from gyro_calibration.logs.quality import quantization_step
 import numpy as np
 from scipy.special import digamma, polygamma
 
-#: Number of batches of a dwell, whose scatter gives the deviation of the mean, and the least
-#: duration of each beyond the first four, s: a vibration of the table and the response of the
-#: gyro's filter average out in it.
+#: Limits of the number of batches of a dwell, whose scatter gives the deviation of the mean, and
+#: the minimum duration of each where there are more than four, s: a vibration of the table and the
+#: response of the gyro's filter average out in it.
 _FEWEST_BATCHES, _MOST_BATCHES, _BATCH = 4, 12, 0.75
 
 
@@ -42,7 +42,8 @@ def averaged(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array,
                       _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
     average = _average_rates if samples.rate is not None else _average_slopes
     rate, output, variance, blur = average(samples, dwells, batches)
-    # White noise in a mean is proportional to 1 / duration, so dwells are alike in the product.
+    # The variance of white noise in a mean is proportional to 1 / duration; so the product of
+    # variance and duration is the same in all dwells.
     deviation = np.sqrt(moderated(variance * durations, batches - 1) / durations + blur ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan)
 
@@ -63,8 +64,8 @@ def _average_slopes(samples: Samples, dwells: Sequence[Numbers],
     Average dwells against a heading; return rate, output, its variance, and the encoder's blur.
 
     The rate is the slope of the heading. The output is averaged by the slope of its integral, with
-    the same weights, so that what the table does besides its steady rate is the same in both. The
-    blur is the standard deviation that the steps of the encoder add.
+    the same weights, so that deviations of the table from its steady rate are the same in both.
+    The blur is the standard deviation that the steps of the encoder add.
 
     """
     assert samples.heading is not None
@@ -73,8 +74,8 @@ def _average_slopes(samples: Samples, dwells: Sequence[Numbers],
                              for values in (samples.time, samples.output, samples.heading))
     turned = list(map(integrate, time, output))
     errors = [angle - samples.scale * reference for angle, reference in zip(turned, heading)]
-    # One scatter holds the motion of the table besides, the other the steps of the encoder. The
-    # smaller one is taken.
+    # The scatter of the output includes the motion of the table, that of the error the steps of
+    # the encoder. The smaller one is used.
     variance = min((_each(_scatter_of_slopes, time, angles, batches)
                     for angles in (turned, errors)), key=np.median)
     blur = abs(samples.scale) * np.array([_blur(*each, step) for each in zip(time, heading)])
@@ -95,7 +96,7 @@ def _scatter_of_slopes(time: Array, angle: Array, batches: int) -> float:
 
 
 def _variance(batches: Sequence[float]) -> float:
-    """Return the variance of the mean of batches; noise may be correlated within a batch."""
+    """Return the variance of the mean of all batches; noise may be correlated within a batch."""
     return float(np.var(batches, ddof=1)) / len(batches)
 
 
@@ -103,9 +104,9 @@ def _blur(time: Array, heading: Array, step: float) -> float:
     """
     Return the standard deviation of a heading's slope, due to the steps of an encoder, rad/s.
 
-    Over M steps it is about 0.35 step / (M duration), and below one 0.6 step / duration (by
-    simulation). Each step is seen late by up to a sample, which adds the square root of M over the
-    number of samples. A heading that stays on one step for the whole dwell is taken as a rest.
+    Over M steps it is about 0.35 step / (M duration), and below one step 0.6 step / duration (by
+    simulation). Each step is observed late by up to a sample, which adds the square root of M over
+    the number of samples. A heading that stays on one step for the whole dwell is taken as a rest.
 
     """
     if np.ptp(heading) <= 0.5 * step or step == 0.0:
@@ -118,12 +119,12 @@ def _blur(time: Array, heading: Array, step: float) -> float:
 
 def moderated(variance: Array, freedom: Array) -> Array:
     """
-    Move variances toward their common value, by more if they are uncertain or agree.
+    Shrink variances toward their common value, by more if they are uncertain or agree.
 
-    A variance out of a dozen batches errs by 40 %; weights made of it would be chance, and the
-    smallest ones would dominate the fit. Empirical Bayes with an inverse gamma prior (Smyth 2004,
-    sections 3 and 6.2): the scatter of their logarithms beyond that of chance gives the degrees of
-    freedom of the prior.
+    A variance of twelve batches has a standard error of 40 %; weights computed from it would be
+    random, and the smallest variances would dominate the fit. Empirical Bayes with an inverse
+    gamma prior (Smyth 2004, sections 3 and 6.2): the scatter of their logarithms in excess of that
+    of sampling gives the degrees of freedom of the prior.
 
     Parameters
     ----------

@@ -22,9 +22,9 @@ from gyro_calibration.logs.stamps import lost_samples
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-#: Least number of samples of a dwell.
+#: Minimum number of samples of a dwell.
 FEWEST = 8
-#: Largest distance of two values of a reference with none lost between them, in usual intervals.
+#: Longest interval between two values of a reference with none lost, in median intervals.
 _LOST = 1.5
 #: Longer intervals than this are not used for the sample rate, s.
 _PAUSE = 1.0
@@ -55,7 +55,8 @@ def usable(log: Log) -> tuple[Samples, list[str]]:
                           'and one of reference_rate_dps and reference_heading_deg')
     known = np.isfinite(reference)
     lost = where_lost(known)
-    # A reference errs before and after it is lost; a tracker loses its markers one by one.
+    # A reference has errors up to 0.05 s before and after a loss: motion capture loses its markers
+    # one by one.
     good = np.flatnonzero(~maximum_filter1d(lost, 2 * count(time, 0.05) + 1)
                           & known & np.isfinite(output))
     if len(good) < FEWEST:
@@ -69,7 +70,7 @@ def usable(log: Log) -> tuple[Samples, list[str]]:
 
 
 def where_lost(known: Mask) -> Mask:
-    """Return where a reference, which may be slow, is lost: values are further apart than most."""
+    """Mark samples without a reference, where its values are above 1.5 median intervals apart."""
     apart = np.diff(np.flatnonzero(known), prepend=-1, append=len(known))
     usual = float(np.median(apart[1:-1])) if len(apart) > 2 else 1.0
     lost = ~known
@@ -114,7 +115,7 @@ def missing(log: Log, samples: Samples, dwells: Sequence[Numbers]) -> Iterator[s
     if len(gaps):
         yield (f'samples missing within the dwells: {lost[gaps].sum()}, '
                f'after {listed([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
-               'steady rate that does no harm')
+               'constant rate the means are not affected')
 
 
 def inside(samples: Samples, dwells: Sequence[Numbers]) -> Mask:
@@ -132,7 +133,7 @@ def duration(time: Array, part: slice | Numbers) -> float:
 
 
 def count(time: Array, span: float) -> int:
-    """Return the number of samples in a span, by the mean interval, since stamps may be bursts."""
+    """Return the number of samples in a span by the mean interval; stamps may come in bursts."""
     steps = np.diff(time)
     return round(span / float(steps[steps < _PAUSE].mean())) if (steps < _PAUSE).any() else 0
 
@@ -144,11 +145,11 @@ def slope(place: Array, values: Array) -> float:
 
 
 def times(number: int) -> str:
-    """Return how often, in words."""
+    """Return 'once', or the number and 'times'."""
     return 'once' if number == 1 else f'{number} times'
 
 
 def listed(words: Sequence[str], most: int = 5) -> str:
-    """Return the first of some words, and how many more there are."""
+    """Return the first words, separated by commas, and the number of further ones."""
     return ', '.join(words[:most]) + (
         f' and {len(words) - most} more' if len(words) > most else '')

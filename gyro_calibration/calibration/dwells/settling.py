@@ -21,13 +21,13 @@ from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-#: Dwells that are further apart than this have no common ramp, s.
+#: Longest ramp between two dwells, s.
 _APART = 5.0
 
 
 def settled(samples: Samples, dwells: Sequence[Numbers],
             limits: Steadiness) -> tuple[list[Numbers], str]:
-    """Cut the margin or the longer response to a ramp off both ends of dwells; return a remark."""
+    """Cut margin or settling time, if longer, off both ends of dwells; return a remark."""
     time, error = samples.time, samples.error
     change = np.diff([np.median(samples.output[rows]) for rows in dwells])
     apart = np.array([time[later[0]] - time[rows[-1]] for rows, later in zip(dwells, dwells[1:])])
@@ -43,7 +43,7 @@ def settled(samples: Samples, dwells: Sequence[Numbers],
 
 def _settling(time: Array, error: Array, dwells: Sequence[Numbers], change: Array,
               longest: float) -> float:
-    """Return for how long after a ramp the output has not settled, s."""
+    """Return the settling time of the output after a ramp, s."""
     durations = np.array([duration(time, rows) for rows in dwells])
     if not len(durations):
         return 0.0
@@ -69,8 +69,8 @@ def _answer(means: Array, change: Array) -> Array:
     """
     Return the response to a unit of change in each bin, from means of shape (dwells, bins).
 
-    A linear response (a filter, a delay) is in proportion to the change of rate, so all dwells
-    together show a response that is below the noise of each.
+    A linear response (a filter, a delay) is proportional to the change of rate, so it is averaged
+    over all dwells, which determines a response below the noise of one dwell.
 
     """
     late = means[:, means.shape[1] // 2:].mean(axis=1, keepdims=True)
@@ -81,17 +81,17 @@ def _last_seen(answer: Array, width: int) -> int:
     """
     Return the number of bins until the response stays within four standard deviations of noise.
 
-    It is averaged over `width` bins and looked for in the first third. The noise is the scatter of
-    the response in the last half.
+    The response is averaged over `width` bins and examined in the first third. The noise is the
+    standard deviation of the response in the last half.
 
     """
     if len(answer) < 8 * width:
         return 0
     smooth = uniform_filter1d(answer, width, mode='nearest')
-    # A response of 20 ppm of the change is not worth a cut, even without noise.
+    # A response below 20 ppm of the change of rate is not cut, even without noise.
     spread = max(float(smooth[len(smooth) // 2:].std()), 2e-5)
     last = -1
     for place in np.flatnonzero(np.abs(smooth[:len(smooth) // 3]) > 4.0 * spread):
-        # After ten quiet bins it is over; what comes later is chance.
+        # After ten bins within the limit the response has ended; later ones exceed it by chance.
         last = int(place) if place - last <= 10 else last
     return last + 1 + width // 2 if last >= 0 else 0

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Steadiness: what a stretch of a log must keep to be a dwell, and where a rate keeps it."""
+"""Steadiness: the limits of a dwell, and the stretches of a log with a steady reference rate."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uni
 @dataclass(frozen=True)
 class Steadiness:
     """
-    What a stretch of a log must keep to be a dwell.
+    The limits of a stretch of a log that is a dwell.
 
     Attributes
     ----------
-    duration : least duration after all cuts, s
-    margin : least cut at both ends, s; a time offset between gyro and reference stays out of the
-        means
+    duration : minimum duration after all cuts, s
+    margin : minimum cut at both ends, s, which excludes a time offset between gyro and reference
+        from the means
     rate : largest deviation of the reference, smoothed over the margin, from its middle, rad/s;
         less where it is quieter
-    relative : part of the rate that is added to that, 1
-    heading : largest deviation of a reference heading from a straight line, besides its steps,
-        rad; less where it is straighter
+    relative : fraction of the rate that is added to that, 1
+    heading : largest deviation of a reference heading from a straight line, in addition to its
+        steps, rad; less where it is straighter
     gap : in longer gaps the reference is taken as unknown, s
     settling : longest settling time of a gyro, s
     temperature : a dwell that warms by more than this is divided, K
     outlier : a sample this many robust standard deviations from its neighbours, and from the
         middle of the dwell, is left out
-    share : least share of the log in dwells, 1; a log that swings looks steady now and then
+    share : minimum share of the log in dwells, 1; a swing is steady for short times only
 
     """
 
@@ -68,8 +68,8 @@ def steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
                  - minimum_filter1d(smooth, width, mode='nearest'))
     allowed = float(np.clip(5.0 * np.median(deviation), 0.02 * DEGREE, limits.rate))
     calm = deviation <= allowed + limits.relative * np.abs(smooth)
-    # The windows of both filters reach over the end of a ramp; half of that is given back, so that
-    # the margin stays.
+    # The windows of both filters extend beyond the end of a ramp; half of that is added to the
+    # stretch again, so that the margin remains.
     calm = maximum_filter1d(calm, 2 * (width // 2) + 1)
     calm[1:] &= np.diff(time) <= limits.gap
     return [slice(run.start + part.start, run.start + part.stop) for run in runs(calm)
@@ -78,7 +78,7 @@ def steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
 
 
 def _level(rate: Array, allowed: float, relative: float) -> Iterator[slice]:
-    """Divide a stretch where its rate drifts: parts of a slow ramp are too short for dwells."""
+    """Divide a stretch where its rate drifts; the parts of a slow ramp are shorter than dwells."""
     start, low, high = 0, math.inf, -math.inf
     for place, value in enumerate(rate.tolist()):
         low, high = min(low, value), max(high, value)

@@ -53,8 +53,8 @@ def _blocks(time: Array, heading: Array) -> tuple[Numbers, Array, Array]:
 
 def _crookedness(heading: Array, most: float) -> float:
     """Return three times the median deviation from a straight line within 1 s, rad, clipped."""
-    # A vibration of the table cannot be seen over a whole number of its periods, so several
-    # lengths are used.
+    # A vibration of the table cancels over a whole number of its periods, so several lengths are
+    # used.
     reaches = [reach for reach in (2, 3, 5) if len(heading) > 2 * reach]
     deviations = [
         np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach]))
@@ -78,10 +78,10 @@ def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterato
 
 
 def _walked(time: Array, heading: Array, cone: slice, tolerance: float, step: float) -> slice:
-    """Fit a line to the middle of a stretch, extend it while it holds, and cut the ramps off."""
+    """Fit a line to the middle of a stretch, extend it within the tolerance, exclude the ramps."""
     fifth = _length(cone) // 5
     middle = slice(cone.start + fifth, cone.stop - fifth)
-    # At most by its own length at both ends, so that the work is not quadratic in the log.
+    # By at most its own length at both ends, so that the time is linear in the length of the log.
     first, last = max(0, cone.start - _length(cone)), min(len(time), cone.stop + _length(cone))
     line = heading[middle].mean() + slope(time[middle], heading[middle]) * (
         time[first:last] - time[middle].mean())
@@ -99,8 +99,8 @@ def _step_back(deviation: Array, tolerance: float, step: float) -> int:
     """
     Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
 
-    On a ramp the heading deviates with the square of time, so the ratio of two deviations gives
-    its beginning; a short ramp began later.
+    On a ramp the deviation of the heading is proportional to the square of time, so the ratio of
+    two deviations gives its beginning; a short ramp began later.
 
     """
     reach = round(0.5 / _BLOCK)

@@ -42,12 +42,12 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import outliers, repeated_samples, runs
 import numpy as np
 
-#: Number of parts of a dwell between which its warming is taken.
+#: Number of parts of a dwell whose mean temperatures are compared.
 _PARTS = 12
 
 
 class Stretches(NamedTuple):
-    """The rows of each dwell, and what was left out."""
+    """The rows of each dwell, and remarks on samples that were left out."""
 
     samples: Samples
     rows: list[Numbers]
@@ -79,8 +79,8 @@ def find_stretches(log: Log, limits: Steadiness) -> Stretches:
     elif not _known(log.reference_heading):
         found = _found(by_rate, limits)
     else:
-        # A rate that was made of a coarse encoder's steps is seldom steady; the heading behind it
-        # may be straight.
+        # A rate derived from the steps of a coarse encoder is hardly ever steady; the heading may
+        # be straight.
         found, other = _found(by_rate, limits), _found(by_heading, limits)
         found = found if found.duration > 0.9 * other.duration else other
     if found.share < limits.share:
@@ -152,7 +152,7 @@ def _calm(samples: Samples, limits: Steadiness) -> list[slice]:
 
 
 def _scale(samples: Samples, parts: list[slice]) -> float:
-    """Return the rough ratio of output to reference; it may be negative or in other units."""
+    """Return the approximate ratio of output to reference, of any sign and unit."""
     rate = np.array([_rate(samples, part) for part in parts])
     output = np.array([np.median(samples.output[part]) for part in parts])
     # Rests alone do not determine it.
@@ -168,7 +168,7 @@ def _rate(samples: Samples, part: slice) -> float:
 
 def _divided(samples: Samples, dwells: list[Numbers],
              limits: Steadiness) -> tuple[list[Numbers], list[str]]:
-    """Divide the dwells along which the temperature changes, so that its slope can be seen."""
+    """Divide the dwells in which the temperature changes, so that its slope can be fitted."""
     if samples.temperature is None:
         return dwells, []
     pieces = [_pieces(samples.time[rows], samples.temperature[rows], limits) for rows in dwells]

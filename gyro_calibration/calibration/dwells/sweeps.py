@@ -18,7 +18,7 @@ from gyro_calibration.calibration.dwells.samples import Numbers
 from gyro_calibration.logs.log import Array, DEGREE
 import numpy as np
 
-#: If the median sweep has fewer dwells than this, the order is taken as chance.
+#: If the median sweep has fewer dwells than this, the order of the rates is taken as random.
 _SHORTEST = 4
 #: Blocks of consecutive dwells, where the order shows no sweeps.
 _BLOCKS = 9
@@ -34,9 +34,9 @@ def sweeps(rate: Array) -> Numbers:
     """
     Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
 
-    Tables go through the rates in one direction, or through their sizes with changing sign, with
+    The rates of a sweep increase or decrease, or their absolute values do with changing sign, with
     or without a rest between them. Where the order shows no sweeps, blocks of consecutive dwells
-    are taken for sweeps: they are as far apart in time.
+    are taken as sweeps.
 
     """
     turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
@@ -53,9 +53,9 @@ def sweeps(rate: Array) -> Numbers:
 
 
 def _passes(value: Array) -> Numbers:
-    """Give passes through values their numbers; one begins where the direction turns back."""
+    """Assign numbers to passes through values; a pass begins where the direction reverses."""
     change = np.diff(value)
-    # Rates that were found differ slightly in size if their sign is opposite.
+    # Mean rates of opposite sign differ slightly in absolute value.
     steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
     numbers = np.zeros(len(value), dtype=int)
     direction = 0.0
