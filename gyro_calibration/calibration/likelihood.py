@@ -14,10 +14,10 @@ The likelihood of a gyro's output, given its heading: scale factor error, bias, 
 Everything is computed on increments between blocks of up to half a second: rates integrated by the
 trapezoid rule against the reference.
 
-What a run does within a block (vibration, backlash, an eccentric encoder) is no random walk. The
+Errors within a block (vibration, backlash, an eccentric encoder) are no random walk. The
 covariance of the increments is a banded matrix with one unknown ratio, which is solved exactly for
 each ratio of a grid. Blocks are shorter where the heading swings so fast that means over 0.5 s
-would lose it.
+would attenuate it.
 
 """
 
@@ -39,15 +39,15 @@ from scipy.linalg import helmert
 @dataclass(frozen=True)
 class Goodness:
     """
-    Whether what a fit leaves is what the known noise explains.
+    Comparison of the residual of a fit with the known noise.
 
     Attributes
     ----------
     chi_square : sum of squares of the residual over the variance that is known
     freedom : degrees of freedom
     probability : of as much, or more, by chance
-    noise_ratio : noise that adds up in the heading, over what is known of it; noise that repeats
-        or averages out is not included
+    noise_ratio : noise that accumulates in the heading, over the known one; noise that repeats or
+        averages out is not included
 
     """
 
@@ -81,21 +81,21 @@ class Fit:
     covariance : of (s, b), shape (2, 2); nan where the method gives none
     time_offset : how late the gyro is against the profile, s
     angle_random_walk, reference_noise : as the run shows them, rad/√s and rad in one reading
-    residual : how far the unlikeliest stretch turned otherwise than the profile, rad, and how
-        unlikely that is, in standard deviations
+    residual : largest deviation of a stretch of the run from the profile, rad, and its
+        significance in standard deviations
     time_offset_deviation : standard deviation of the time offset, s
     influence : the effect of the noise of each block on (s, b), shape (n, 2), and the times of the
         blocks, s, shape (n,), as one array (n, 3)
-    stretch : that stretch, from and to, s
+    stretch : beginning and end of that stretch, s
     start_heading, start_heading_deviation : true heading where gyro and reference begin, from the
         reference's first heading, and its standard deviation, rad; nan against a profile, which
         defines its own start
     squares, freedom : sum of squares of the residual, in units of white noise of 1 rad/√s, and its
         degrees of freedom
-    goodness : whether that is what the noise explains; None where the noise is not known
-    repeating : error of the heading that repeats with the motion, rad, where it spoiled the bias
-        of the blocks
-    slip : standard deviation between the turns of a profile of the part that each lost, 1
+    goodness : comparison of that with the noise; None where the noise is not known
+    repeating : error of the heading that repeats with the motion, rad, where the bias was fitted
+        to windows because of it
+    slip : standard deviation between the turns of a profile of the fraction that each lost, 1
 
     """
 
@@ -118,8 +118,8 @@ class Fit:
     slip: float = 0.0
 
 
-#: Standard deviations that no stretch reaches by chance: 10 000 stretches, all runs of a
-#: robot's life.
+#: Limit of significance, standard deviations: noise does not exceed it in 10 000 stretches a run,
+#: in all runs of a robot.
 CHANCE = 7.0
 
 
@@ -129,7 +129,7 @@ class _Points:
     Where the reference is known: times, s, headings, rad, and variances, shape (n,) each.
 
     The variances are known up to one factor. Errors that several points share have columns, shape
-    (n, k), and prior standard deviations, shape (k,), of which parts may hold: `parts`, shape
+    (n, k), and prior standard deviations, shape (k,), times one row of the factors `parts`, shape
     (m, k).
 
     """
@@ -145,14 +145,14 @@ class _Points:
 @dataclass(frozen=True)
 class _Increments:
     """
-    How far the gyro and the reference turned between blocks, each a mean over some points.
+    Increments of the headings of gyro and reference between blocks, each a mean over some points.
 
     Attributes
     ----------
     columns : reference increments, rad; intervals, s; the change by a time offset, rad/s; by a
         lag, rad/s²; by errors that several points share, rad; shape (n, 4 + k)
     prior, expected : prior standard deviations and means of the values, shape (4 + k,)
-    parts : of the prior standard deviations that may hold, shape (m, 4 + k)
+    parts : possible factors of the prior standard deviations, shape (m, 4 + k)
     turned : increments of the gyro's integral, rad, shape (n,)
     walk, neighbours : variance of the increments of a random walk, and covariance of each with the
         one before, s, shape (n,)
@@ -175,19 +175,19 @@ class _Increments:
     since: Array
 
 
-#: Longest block, s. Errors within it (vibration, backlash, an eccentric encoder) are no random
-#: walk and must not be taken for one.
+#: Longest block, s. Errors within a block (vibration, backlash, an eccentric encoder) are no
+#: random walk, and are not modelled as one.
 BLOCK = 0.5
-#: Prior standard deviations: of the error of the delay that is being found, s, and of the lag, s².
+#: Prior standard deviations: of the error of the present delay, s, and of the lag, s².
 DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
 
 
-#: Two offsets fit alike if one leaves at most so many times what the other does.
+#: Two offsets fit equally well if the ratio of their misfits is below this.
 _ALIKE = 1.5
 
 
-#: Rate and acceleration are taken over this time, s, or an interval if longer, to either side:
-#: over less they are those of the noise alone.
+#: Rate and acceleration are differences over this time, s, or an interval if longer, to either
+#: side: over less, noise dominates them.
 _SMOOTH = 0.01
 
 
@@ -269,11 +269,11 @@ class _Pairing:
         """
         Return the offset, s, at which most increments fit.
 
-        A slip counts only by the blocks that it is in. A motion that repeats itself fits about
-        alike at several offsets: the smallest of these is returned.
+        A slip affects only the blocks that contain it. A periodic motion fits about equally well
+        at several offsets: the smallest of these is returned.
 
         """
-        # a profile is smoother than what was measured
+        # a profile is smoother than measured headings
         step = 0.02 if self.sampled else 0.04
         offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
         misfits = np.array([self._misfit(offset) for offset in offsets])
@@ -327,35 +327,35 @@ def _points(motion: Motion, block: float, slip: float) -> _Points:
 
 #: Standard deviation of the scale factor error by which the two senses of turning may differ.
 ASYMMETRY = 1e-4
-#: Prior standard deviations of what a robot follows one turn differently by than the others:
-#: delay, s, and lag, s².
+#: Prior standard deviations of the differences between turns in the response of a robot: delay, s,
+#: and lag, s².
 _TURN_DELAY, _TURN_LAG = 0.1, 0.02
-#: Of a longer motion, neighbouring turns are taken together, so that they are at most so many.
+#: Largest number of groups of neighbouring turns with a delay and a lag of their own.
 _MOST_TURNS = 12
-#: A response of higher order, as of a robot that overshoots: times, s, of the second differences
-#: of the heading that it consists of, and their prior standard deviation, 1.
+#: A response of higher order, as of a robot that overshoots, as a sum of second differences of the
+#: heading: their times, s, and prior standard deviation, 1.
 _RESPONSE, _RESPONSE_DEVIATION = (0.15, 0.3, 0.45, 0.6, 0.8), 0.3
-#: Parts of the prior standard deviations of what follows, and of slips, that may hold.
+#: Possible factors of the prior standard deviations of the response, and of slips.
 _FOLLOWING, _SLIPS = np.array([0.001, 0.1, 1.0]), np.array([0.001, 0.03, 0.1, 0.3, 1.0])
 
 
 def following(motion: Motion, time: Array, slip: float) -> tuple[Array, Array, Array]:
     """
-    Return what gyro and robot may make of a profile otherwise than scale, bias, delay and lag.
+    Return the deviations from a profile that scale, bias, delay and lag do not describe.
 
-    The gyro's scale may differ between the two senses of turning. The robot may follow by a
-    response of higher order than a lag, follow each turn with its own delay and lag, as one whose
-    acceleration is limited does, and slip in each, and in each end of one.
+    The gyro's scale may differ between the two senses of turning. The response of the robot may be
+    of higher order than a lag, and have a delay and a lag of its own in each turn, as where the
+    acceleration is limited. The robot may slip in each turn, and while it decelerates.
 
     Parameters
     ----------
     time : s, shape (n,)
-    slip : largest standard deviation of the slip of a turn, as a part of it
+    slip : largest standard deviation of the slip of a turn, as a fraction of it
 
     Returns
     -------
-    columns of headings, rad, shape (n, k), their prior standard deviations, shape (k,), and the
-    parts of these that may hold, shape (m, k)
+    columns of headings, rad, shape (n, k), their prior standard deviations, shape (k,), and
+    possible factors of these, shape (m, k)
 
     """
     rate, heading = motion.rate_at(time), motion.heading_at(time)
@@ -366,7 +366,7 @@ def following(motion: Motion, time: Array, slip: float) -> tuple[Array, Array, A
     if count < 2:
         return np.empty((len(time), 0)), np.empty(0), np.ones((1, 0))
     inside = (-(-turn * count // turn.max()))[:, None] == np.arange(1, count + 1)
-    # what all turns share is delay, lag and scale
+    # the mean over the turns is delay, lag and scale
     apart = helmert(count).T
     columns = [rate[:, None] * (inside @ apart), acceleration[:, None] * (inside @ apart)]
     columns.append(np.column_stack([
@@ -408,7 +408,8 @@ def _crossings(motion: Motion, step: float) -> _Points:
               if len(time) else time)
     turned = np.where(moved[index] > 1.5 * step, 1.0,
                       np.clip(turned * np.diff(motion.time)[index] / step, _SHARPEST, 1.0))
-    # none counts more than the median one: a reference is seldom as good as its slowest steps
+    # none has more weight than the median one: the accuracy of a reference is seldom that of its
+    # slowest steps
     turned = np.maximum(turned, np.median(turned)) if len(time) else turned
     alone = np.diff(index, prepend=-1, append=len(moved)) == 1
     edges = (moved[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
@@ -422,9 +423,9 @@ _SHARPEST = 0.05
 
 def _stands(motion: Motion, step: float, block: float) -> _Points:
     """
-    Return the readings that last longer than a block, single ones, and the first and last.
+    Return the readings that are constant for longer than a block, single ones, the first and last.
 
-    All samples of one that lasts count as one reading. At the first and the last the gyro rests if
+    All samples of a constant reading count as one. At the first and the last the gyro rests if
     they last much longer than the readings next to them; then their samples share one error.
 
     """
@@ -465,7 +466,7 @@ def _random_walk(time: Array, weight: Array, begins: NDArray[np.intp]) -> tuple[
 
 
 def robust_residual(columns: Array, turned: Array, passes: int) -> Array:
-    """Return the residual of a fit in which large residuals count by their size (Huber)."""
+    """Return the residual of a fit in which large residuals have a linear loss (Huber)."""
     weights = np.ones(len(turned))
     for _ in range(passes):
         weighted = weights[:, None] * columns
@@ -530,7 +531,7 @@ def _estimate(data: _Increments, noise: _Covariance, instrument: Array,
 @dataclass(frozen=True)
 class _Mixture:
     """
-    All sizes of the two noises and of the priors, by their likelihood.
+    Estimates averaged over the sizes of both noises and of the priors, weighted by likelihood.
 
     Attributes
     ----------
@@ -546,7 +547,7 @@ class _Mixture:
 
 
 def _mixture(data: _Increments, parts: Array) -> _Mixture:
-    """Return the mixture over all ratios of the noises and these parts of the priors, (m, k)."""
+    """Return the average over all ratios of the noises and factors of the priors, (m, k)."""
     ratios = _RATIOS * float(np.median(data.walk) / np.median(data.reference))
     priors, count, known = data.prior * parts, len(data.turned), np.isfinite(data.prior)
     given = []
@@ -592,7 +593,7 @@ def _mixture(data: _Increments, parts: Array) -> _Mixture:
 
 
 def _least(data: _Increments) -> float:
-    """Return the least variance of the noise that rounding lets be seen."""
+    """Return the smallest variance of the noise above rounding errors."""
     return 1e-18 * float(np.mean(data.turned ** 2 / data.walk))
 
 
@@ -625,18 +626,18 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     A robot follows its profile late and smoothly, so delay and lag are fitted too: without them, a
     first-order lag of 0.2 s causes 0.9 % of scale factor error. The lag is of first order against
     a profile of rates, which a robot only follows; against headings, which were measured on the
-    robot itself, it is small and taken to second order. What else a profile leaves open
-    (`following`) is fitted within its priors, and so is a stretch with a turn of its own, as far
-    as it is probable.
+    robot itself, it is small and taken to second order. Other deviations from a profile
+    (`following`) are fitted within their priors, and so is a stretch with a turn of its own,
+    weighted by its probability.
 
     Parameters
     ----------
     time : s since the start of the motion, shape (n,)
     rate : output of the gyro, rad/s, shape (n,)
-    motion : what the gyro was put through
+    motion : of the gyro
     largest_time_offset : how late or early the gyro's stamps may be against the motion, s
     lag : prior standard deviation of the lag, s²; a sine does not separate it from the scale
-    slip : largest standard deviation of the slip of each turn of a profile, as a part of it
+    slip : largest standard deviation of the slip of each turn of a profile, as a fraction of it
 
     Raises
     ------
@@ -668,7 +669,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     covariance = mixture.covariance[:2, :2]
     found, edges, inside, chance = _unlikeliest(estimate, data)
     if pairing.sampled:
-        # noise that comes with turning alone, such as slip of wheels, exceeds its robust size
+        # noise during turns only, such as slip of wheels, exceeds its robust estimate
         chance = max(chance, math.sqrt(max(found.left, 0.0) / (len(inside) - 4.0)))
     else:
         values = mixture.values[:2]
@@ -678,7 +679,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
                       + part * (1.0 - part) * np.outer(apart, apart))
         values = values + part * apart
     scale, bias = values.tolist()
-    # with a slip, the columns of turns, less what they share, and then those of ends of turns
+    # with a slip, first the columns of the differences between turns, then of the ends of turns
     slips = mixture.values[data.prior == slip]
     slips = slips[:len(slips) // 2]
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
@@ -693,9 +694,9 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
                slip=math.sqrt(float(np.mean(slips ** 2))) if slip and len(slips) else 0.0)
 
 
-#: The noise is found again where the offset moved by more than this, s.
+#: The noise is estimated again where the offset changed by more than this, s.
 _ALIGNED = 1e-3
-#: A robot that follows its profile with a lag is later than at its start by up to this, s.
+#: Largest additional delay of a robot that follows its profile with a lag, s.
 FOLLOWING = 0.25
 
 
@@ -704,7 +705,7 @@ def _squares(data: _Increments, estimate: _Estimate, sampled: bool) -> tuple[flo
     if not sampled:
         estimate = _estimate(data, _Covariance(data, 0.0), data.columns, estimate.prior)
     return (float(estimate.residual @ estimate.noise.solve(estimate.residual)),
-            estimate.freedom + (not sampled))  # the ratio of the noises is not found
+            estimate.freedom + (not sampled))  # the ratio of the noises is not estimated
 
 
 def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float]:
@@ -739,9 +740,9 @@ class Stretch:
     ----------
     first, last : edges that it begins and ends at
     rate : its excess rate, rad/s
-    gain, left : squares that it takes away, and that it leaves
-    gains, squares : squares that each stretch takes away, and of its column without the part that
-        the fit explains, for all stretches that the fit leaves open, shape (m,)
+    gain, left : sum of squares that it explains, and that remains
+    gains, squares : sums of squares that each stretch explains, and of its column without the part
+        that the fit explains, for all stretches that are distinguishable from the fit, shape (m,)
 
     """
 
@@ -759,9 +760,9 @@ class Stretch:
 
         Parameters
         ----------
-        freedom : degrees of freedom that a stretch leaves
+        freedom : remaining degrees of freedom
         rate : standard deviation of the excess rates that are expected, rad/s
-        chance : of the white noise
+        chance : standard deviation of the white noise
 
         """
         none = max(self.left + self.gain, 1e-300)
@@ -770,8 +771,8 @@ class Stretch:
         return float(np.exp(np.minimum(odds, 100.0)).sum()) / max(len(odds), 1)
 
 
-#: A turn that the profile does not have, by hand or by a slip at one place: standard deviation of
-#: its rate, rad/s, and its odds before the run is seen.
+#: A turn that the profile does not contain, by hand or by a single slip: standard deviation of its
+#: rate, rad/s, and its prior odds.
 TURNED, TURNED_ODDS = 0.0175, 0.1
 #: Largest number of places of a run at which a stretch begins or ends.
 _EDGES = 150
@@ -780,10 +781,10 @@ _EDGES = 150
 def _unlikeliest(estimate: _Estimate, data: _Increments) -> tuple[
         Stretch, NDArray[np.intp], Array, float]:
     """
-    Return the unlikeliest stretch, the edges, its increments at 1 rad/s, s, and what is chance.
+    Return the unlikeliest stretch, the edges, its increments at 1 rad/s, s, and the noise.
 
-    The values are fitted together with the excess turn of each stretch, so that a slip does not
-    hide itself, and the size of chance is taken from a robust fit.
+    The values are fitted together with the excess turn of each stretch, so that they do not absorb
+    a slip. The standard deviation of the noise is that of a robust fit.
 
     """
     noise, interval = estimate.noise, data.columns[:, 1]
@@ -831,7 +832,7 @@ def unlikeliest(columns: Array, steps: Array, turned: Array) -> Stretch:
     differences = sums[:, None] - sums
     norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
                      for matrix in (products, whole))
-    # not one that scale and bias explain nearly as well, nor one of no length
+    # neither stretches that scale and bias explain nearly as well, nor empty ones
     distinct = np.triu(norms > _APART * wholes, 1)
     gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
     first, last = np.unravel_index(int(gains.argmax()), gains.shape)
@@ -842,6 +843,6 @@ def unlikeliest(columns: Array, steps: Array, turned: Array) -> Stretch:
                    gains[distinct], norms[distinct])
 
 
-#: Part of a stretch that the columns of a fit must leave, so that the two are distinguishable;
-#: with less left, a stretch turns far by chance.
+#: Fraction of a stretch that the columns of a fit must not explain, so that the two are
+#: distinguishable; with less, noise gives a stretch a large turn.
 _APART = 0.2

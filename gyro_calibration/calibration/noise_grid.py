@@ -20,7 +20,7 @@ The model of ``n`` observations is::
 * ``e`` has the covariance ``sum(size_k**2 * banded_k)``; each ``banded_k`` is tridiagonal
   (`BandedNoise`).
 * ``u``, shape (q,), has independent elements with variances ``sum(size_j**2 * variance_j)``
-  (`SharedNoise`). It describes what many observations have in common: a bias that wanders
+  (`SharedNoise`). It describes errors that many observations have in common: a bias that wanders
   (`wander`), or the bias of one sweep of a rate table.
 
 The sizes are not known. For each point of a grid over them the restricted likelihood (REML:
@@ -30,12 +30,12 @@ of ``e`` and ``P`` the prior precision of ``(values, u)``::
     log L = -1/2 [log|V| + log|A| - log|P|+ + y'V⁻¹y - c'A⁻¹c],    A = X'V⁻¹X + P,    c = X'V⁻¹y
 
 where ``|P|+`` is the product of the precisions that are not zero. Estimates and their covariance
-are averaged over the grid, so that the intervals of the values hold what is unknown of the noise
-(law of total variance). The prior of each size is flat in its logarithm within the range given.
-The grid is refined three times, around what is likely.
+are averaged over the grid, so that the intervals of the values include the uncertainty of the
+noise (law of total variance). The prior of each size is flat in its logarithm within the range
+given. The grid is refined three times around its likely points.
 
 Headings at points ``t_0 ... t_n`` become increments over the spans between them (`heading_noise`).
-A gap of the reference is a long span, nothing else. The parts of the noise of such increments:
+A gap of the reference is a long span. The parts of the noise of such increments:
 
 =================  =========  ==================================================================
 name               unit       noise
@@ -71,10 +71,11 @@ import numpy as np
 from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dpttrf, dpttrs
 
-#: Points of the grid a size: first over its whole range, and in each further pass around what is
-#: likely.
+#: Points of the grid for each size, and passes: the first is over the whole range, each further
+#: one around the likely points.
 POINTS, PASSES = 5, 4
-#: Cosines that describe a wandering bias; what is faster is hardly distinguished from white noise.
+#: Cosines that describe a wandering bias; faster changes are hardly distinguishable from white
+#: noise.
 COSINES = 24
 
 
@@ -125,8 +126,8 @@ class PriorSize:
     """
     A value whose normal prior has a standard deviation of unknown size.
 
-    What the data show weakly is then drawn towards the mean of its prior, and what they show
-    clearly is not.
+    A value that the data determine weakly is drawn towards the mean of its prior, a value that
+    they determine well is not.
 
     Attributes
     ----------
@@ -144,12 +145,12 @@ class PriorSize:
 @dataclass(frozen=True)
 class GridFit:
     """
-    What a regression found, averaged over the sizes of the noise.
+    The result of a regression, averaged over the sizes of the noise.
 
     Attributes
     ----------
     values : estimates, shape (m,)
-    covariance : of the values, shape (m, m), with what is unknown of the noise
+    covariance : of the values, shape (m, m), including the uncertainty of the noise
     sizes : for each size its name, its estimate (mean of the logarithm), and the limits that hold
         95 %
     likely : the size of each part at the point of the grid with the largest likelihood, by name
@@ -274,21 +275,21 @@ def wander(
     cosines: int = COSINES,
 ) -> tuple[Array, list[SharedNoise]]:
     """
-    Return what a wandering bias adds to increments between points, and the parts of its noise.
+    Return the columns of a wandering bias in increments between points, and its noise parts.
 
     About its mean over the log a bias is the sum of ``u_j cos(ω_j (t - t_0))`` with ``ω_j = π j /
     T``. The variance of ``u_j`` is ``2 / T`` times the two-sided spectrum at ``ω_j``, ``B²/ω`` and
     ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. A bias among the
     values of the regression is the mean over the log. How far that is from the bias where the log
-    began has the variance ``2/π B²`` and ``K² T / 3``, which no log shows: `noise_grid` adds it to
-    the variance of the value `wandering`.
+    began has the variance ``2/π B²`` and ``K² T / 3``, which is not observable in the log:
+    `noise_grid` adds it to the variance of the value `wandering`.
 
     Parameters
     ----------
     time : of the points, s, shape (n + 1,)
     bias_instability : range of B, rad/s, or None without flicker
     rate_random_walk : range of K, rad/s/√s, or None without rate random walk
-    cosines : as many, but at most half as many as spans
+    cosines : their number, limited to half the number of spans
 
     Returns
     -------
@@ -323,7 +324,7 @@ class _Regression:
 
     @property
     def parts(self) -> list[BandedNoise | SharedNoise | PriorSize]:
-        """Return all that has a size."""
+        """Return the parts of the noise and the priors of unknown size."""
         return [*self.banded, *self.shared, *self.priors]
 
     def noise(self, sizes: Iterable[float]) -> Tridiagonal:
@@ -358,7 +359,7 @@ class _Regression:
         """
         weighted = noise.solve(np.column_stack([self.columns, self.observed]))
         gram = self.columns.T @ weighted
-        # scaled, for the columns have different units
+        # scaled, since the columns have different units
         scale = 1.0 / np.sqrt(np.maximum(np.diag(gram[:, :-1]) + precisions, 1e-300))
         normal = (
             (gram[:, :-1] + precisions[:, :, None] * np.eye(len(gram)))

@@ -13,11 +13,11 @@ The scatter of dwells about a gyro's effects, and the uncertainty of the effects
 
 The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own,
 that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
-that the sensor does not show). Their sizes are found by restricted likelihood, so that thirty
+that the sensor does not show). Their sizes are estimated by restricted likelihood, so that thirty
 dwells of one sweep do not count as thirty independent ones.
 
-The sizes are found about a smooth surface over rate and temperature, before any effect is fitted.
-Found with too few effects, they would absorb what a missing effect leaves.
+The sizes are estimated about a smooth surface over rate and temperature, before any effect is
+fitted. About too few effects, they would include the error of a missing effect.
 
 """
 
@@ -36,9 +36,9 @@ from scipy.stats import t as student
 
 #: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
 OUTLYING = 6.0
-#: With a smaller spread, K, a sensor's own error looks like a change of temperature.
+#: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
 SMALLEST_TEMPERATURE_SPREAD = 1.0
-#: With fewer, what the dwells of a sweep have in common is not distinguishable from chance.
+#: With fewer, errors common to the dwells of a sweep are not distinguishable from random errors.
 FEWEST_SWEEPS = 4
 #: Largest number of blocks of dwells that replace sweeps where there are fewer sweeps.
 _MOST_BLOCKS = 60
@@ -97,8 +97,8 @@ def parts_of(dwells: Dwells) -> Numbers:
     """
     Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
 
-    It is the sweep, as what its dwells have in common does not predict other sweeps. Fewer than
-    four sweeps show too little of the gyro without one of them, two temperatures nothing of the
+    It is the sweep, since errors that its dwells have in common do not predict other sweeps. Fewer
+    than four sweeps do not determine a model without one of them, nor do two temperatures the
     slope between them: then parts are blocks of time, or the dwells.
 
     """
@@ -135,7 +135,7 @@ class Whitener:
     def _stretched(self, values: Array, power: float) -> Array:
         """Multiply by a power of the covariance in units of the dwells' own."""
         sizes = np.maximum(self._sizes, 1e-12)
-        # the covariance is the identity plus the products of two columns a sweep
+        # the covariance is the identity plus the products of two columns for each sweep
         inner = (self._directions * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :]
                  @ self._directions.swapaxes(1, 2))
         columns = values.reshape(len(values), -1)
@@ -144,15 +144,15 @@ class Whitener:
                                   along[self.parts]).reshape(values.shape)
 
 
-# how large it is
+# its size
 
 def find_scatter(dwells: Dwells) -> Scatter:
     """Return how dwells scatter, by restricted likelihood, and which of them are outlying."""
     kept = not_outlying(dwells)
     used = take(dwells, kept)
     error, surface = used.output - used.rate, _surface(used)
-    # The likelihood does not depend on what the surface explains; errors near zero would be lost
-    # in rounding otherwise.
+    # The likelihood does not depend on the part that the surface explains; without its removal,
+    # small errors would be lost in rounding.
     error = error - surface @ (surface.T @ error)
     size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
     relative = size / max(float(np.abs(used.rate).max()), 1e-9)
@@ -162,7 +162,7 @@ def find_scatter(dwells: Dwells) -> Scatter:
         return Scatter(  # type: ignore[misc]
             *np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)
 
-    # not by a simplex, which collapses onto a bound and stays there
+    # a simplex would collapse onto a bound
     best = minimize(
         lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
         np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B',
@@ -178,10 +178,10 @@ def _sought(dwells: Dwells) -> int:
 
 
 def not_outlying(dwells: Dwells) -> Mask:
-    """Return which dwells are not outlying, by a fit that counts residuals by their size."""
+    """Return which dwells are not outlying, by a robust fit of the surface."""
     surface = _surface(dwells)
     residual = np.abs(robust_residual(surface, dwells.output - dwells.rate, 20))
-    # Such a fit passes through as many dwells as it has columns; these do not show the scatter.
+    # Such a fit passes through as many dwells as it has columns; these are left out of the median.
     spread = 1.4826 * float(np.median(np.sort(residual)[surface.shape[1]:]))
     return (residual <= OUTLYING * spread + 1e-12) | (len(dwells) < _FEWEST_DWELLS)
 
@@ -217,7 +217,7 @@ def freedom_beside_surface(dwells: Dwells) -> int:
 
 def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
                            columns: Array) -> float:
-    """Return the log-likelihood of the scatter, whatever the values are, up to a constant."""
+    """Return the restricted log-likelihood of the scatter, up to a constant."""
     deviation = scatter.deviation(dwells)
     sums = _Sums.of(dwells, deviation, np.column_stack([columns, error]))
     (gram,), (of_sweeps,) = sums.reduced(np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
@@ -231,7 +231,7 @@ def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
 @dataclass(frozen=True)
 class _Sums:
     """
-    The sums of columns that a likelihood needs, whatever the scatter of sweeps is.
+    The sums of products of columns in the likelihood, for any scatter of sweeps.
 
     Attributes
     ----------
@@ -273,7 +273,7 @@ class _Sums:
         return self.gram - taken, np.linalg.slogdet(inner)[1].sum(axis=1)
 
 
-# what it leaves open
+# uncertainty of the values
 
 @dataclass(frozen=True)
 class Uncertainty:
@@ -283,9 +283,9 @@ class Uncertainty:
     Few dwells and few sweeps do not determine how large the scatter is. So the distribution of the
     values is averaged over possible scatters, weighted by their restricted likelihood: that of the
     dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior
-    probability that sweeps share nothing is one half; if they do share something, it is about as
-    large as the scatter of a dwell (half Cauchy, Gelman 2006). The maximum of the likelihood alone
-    would be at zero about every other time, and its intervals too narrow.
+    probability that sweeps have no common error is one half; otherwise its prior scale is the
+    scatter of a dwell (half Cauchy, Gelman 2006). The maximum of the likelihood alone would be at
+    zero in about half of the cases, and its intervals would be too narrow.
 
     Attributes
     ----------
@@ -307,7 +307,7 @@ class Uncertainty:
     @classmethod
     def of(cls, dwells: Dwells, scatter: Scatter, columns: Array, error: Array) -> Uncertainty:
         """
-        Average over what the scatter may be.
+        Average over the possible scatters.
 
         Parameters
         ----------
@@ -400,7 +400,7 @@ def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array
 
 
 def _prior(sizes: Array) -> Array:
-    """Return the prior of each size: one half for 0, a half Cauchy for the others."""
+    """Return the prior of each size: one half at 0, a half Cauchy above."""
     if len(sizes) == 1:
         return np.ones(1)
     return np.concatenate([[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2)

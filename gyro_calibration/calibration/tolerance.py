@@ -9,14 +9,13 @@
 # under the License.
 
 """
-What a calibrated rate may be off by in another run, at other temperatures and at other rates.
+Error of a calibrated rate in another run, at other temperatures and at other rates.
 
-The covariance of the values says how well the dwells determine them, if the gyro is as the model
-says, and the same for ever. Bias and scale factor change from sweep to sweep, and so they do from
-the calibration to what comes after it. Outside of the temperatures and rates that were seen, what
-the data did not show counts: slopes over temperature that were not fitted, curves, and a response
-that bends otherwise. How large these may be follows from a larger fit, with normal priors for what
-dwells do not tell.
+The covariance of the values states how well the dwells determine them, if the model is complete
+and the gyro does not change. Bias and scale factor change from sweep to sweep, and by as much
+after the calibration. Outside of the calibrated temperatures and rates, effects that were not
+fitted add errors: slopes and curvatures over temperature, and another nonlinearity. Their size
+follows from a larger fit, with normal priors for the values that the dwells do not determine.
 
 """
 
@@ -32,9 +31,9 @@ from gyro_calibration.logs.log import Array
 from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
 
-#: Standard deviations of what gyros have, by data sheets: the change of the bias with temperature,
+#: Standard deviations between gyros, by data sheets: the change of the bias with temperature,
 #: rad/s/K (L3G4200D: 0.03 deg/s/K), that of the scale factor, 1/K (L3G4200D: 2 % over 60 K), and
-#: the nonlinearity at the fastest rate that is left by the fitted one, 1 (L3G4200D: 0.2 %).
+#: the nonlinearity at the fastest rate that is not fitted, 1 (L3G4200D: 0.2 %).
 BIAS_SLOPE, SCALE_SLOPE, NONLINEARITY = Prior().coefficient, 3e-4, 2e-3
 
 #: dwells at rates, rad/s, and temperatures, degC -> change of the output for each value, (n, m)
@@ -44,11 +43,11 @@ Columns = Callable[[Array, Array], Array]
 def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Columns,
                  covariance: Array) -> Tolerance:
     """
-    Return what a rate may be off by beyond the covariance of the values.
+    Return the error of a rate that the covariance of the values does not contain.
 
-    Effects that were not fitted may still be there, as far as they do not show: a fit with more
-    columns has a larger variance than that of the values. Its mean over the dwells adds to the
-    variance of the bias; half a width beyond what was seen it gives the slopes.
+    Effects that were not fitted may exist below the noise: a fit with more columns has a larger
+    variance than that of the values. Its mean over the dwells is added to the variance of the
+    bias; its value half a width outside of the calibrated range gives the slopes.
 
     Parameters
     ----------
@@ -80,7 +79,7 @@ def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Col
     inverse = np.linalg.pinv(gram, hermitian=True)
 
     def more(rate: Array, warm: Array) -> Array:
-        """Return the variance that the larger fit has beyond that of the values, (rad/s)²."""
+        """Return the variance of the larger fit less that of the values, (rad/s)²."""
         wide, row = larger(rate, warm) / lengths, columns(rate, warm)
         return np.maximum(((wide @ inverse) * wide).sum(axis=1)
                           - ((row @ covariance) * row).sum(axis=1), 0.0)
