@@ -11,19 +11,20 @@
 """
 Calibrate against a course over ground: the direction of travel by satellites.
 
-A course is no heading. It is off by the side slip, smoothed, late or early against the gyro, lost
-below some speed, and for seconds at a time much worse than usual. The gyro's own noise is small
-compared with that, so the course is regressed on the gyro, over spans of some seconds::
+A course differs from the heading by the side slip. It is smoothed, late or early against the gyro,
+lost below some speed, and in bursts of some seconds several times less accurate. The noise of the
+gyro is small compared with that, so the course is regressed on the gyro, over spans of some
+seconds::
 
     Δcourse = p Δ(integral of the output) - q Δt + d Δrate + c Δacceleration + noise
     s = 1 / p - 1,  b = q / p
 
-``d`` is what is left of the delay and what side slip adds in proportion to the rate; ``c`` is
-what smoothing does. The noise sizes are those of `noise_grid`; each point of the course has a
-variance of its own, by how far the course is off around it.
+``d`` is the rest of the delay plus the side slip in proportion to the rate; ``c`` is the effect of
+smoothing. The noise sizes are those of `noise_grid`; each point of the course has a variance of
+its own, by the errors of the course around it.
 
-What a drive leaves open is decided by a prior: scale factor error and bias are small numbers, of a
-size that is not known (`PriorSize`) but at most what the technology of the gyro allows.
+Where a drive does not determine scale factor error and bias, a prior does: normal about zero, with
+a standard deviation that is not known (`PriorSize`), but limited by the technology of the gyro.
 
 """
 
@@ -54,23 +55,24 @@ PRIORS = {
 }
 #: Length of a span, s; smoothing over a second then leaves the scale to a percent of its error.
 SPAN = 2.0
-#: How late or early the stamps of a gyro may be against satellites, s.
+#: Largest time offset of the stamps of a gyro against satellites, either way, s.
 LARGEST_TIME_OFFSET = 1.5
 #: A reference that is lost for this part of the time, or noisier than this from span to span, rad,
 #: is taken for a course; one in steps of more than this, rad, for an encoder.
 LOST, NOISY, ROUNDED = 0.003, 0.25 * DEGREE, 2e-4
-#: Fewer spans do not show the noise of a course.
+#: Minimum number of spans; fewer do not determine the noise of a course.
 FEWEST_SPANS = 10
-#: Standard deviations of what is left of the delay, s, and of what smoothing does, s².
+#: Prior standard deviations of the rest of the delay, s, and of the smoothing, s².
 DELAY, SMOOTHING = 0.2, 0.1
-#: A course that is bad is so for about this long, s; stretches of this length count as one.
+#: Typical duration of a burst of errors of a course, s; length of the stretches between which the
+#: scatter is taken, s.
 BURST, STRETCH = 5.0, 15.0
-#: The few errors within a burst hardly show its variance: a course has the errors of Student's
-#: distribution with so many degrees of freedom, more of them with each error that is seen.
+#: The few errors within a burst hardly determine its variance: the errors of a course have
+#: Student's distribution with so many degrees of freedom, plus one for each observed error.
 FREEDOM = 4.0
 #: The gyro's noises that are possible, rad/√s and rad/s/√s, and cosines for its wander.
 WHITE, WALK, COSINES = (1e-5, 1e-2), (1e-7, 1e-4), 8
-#: A gyro that follows leaves less of the course than this, rad, whatever the side slip.
+#: Largest deviation of the course from a gyro that follows it, with any side slip, rad.
 FOLLOWED = 3.0 * DEGREE
 
 
@@ -96,7 +98,7 @@ class _Spans:
 
 
 class _Drive:
-    """Gyro and course, brought together at any time offset."""
+    """Gyro and course, aligned at any time offset."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion):
         """Average the course over spans that are at least half known."""
@@ -201,10 +203,10 @@ def fit_course(
 
 def is_course(time: Array, rate: Array, motion: Motion) -> bool:
     """
-    Tell whether a reference is a course over ground: lost now and then, or noisy, and no encoder.
+    Tell whether a reference is a course over ground: partly lost, or noisy, and no encoder.
 
-    It is lost below some speed, where there is no direction of travel. An encoder shows by its
-    step; smaller ones are what a file is rounded to.
+    It is lost below some speed, where there is no direction of travel. An encoder is recognized by
+    its step; smaller steps are rounding of the file.
 
     Parameters
     ----------
@@ -227,7 +229,7 @@ def is_course(time: Array, rate: Array, motion: Motion) -> bool:
 
 
 def _columns(spans: _Spans) -> Array:
-    """Return what p, q, d and c add to the increments of the course, shape (n - 1, 4)."""
+    """Return the columns of p, q, d and c in the increments of the course, shape (n - 1, 4)."""
     return np.diff(
         np.column_stack([spans.turned, -spans.time, spans.rate, spans.acceleration]), axis=0
     )
@@ -255,7 +257,7 @@ def _regression(spans: _Spans, points: Array, technology: str) -> GridFit:
 
 
 def _point_errors(spans: _Spans, points: Array) -> Array:
-    """Return how far each point of the course is off a fit in which large errors count less."""
+    """Return the error of each point of the course about a fit weighted by their variances."""
     columns = np.column_stack([spans.time, spans.rate, np.ones(len(spans.time))])
     weights = 1.0 / np.sqrt(points)[:, None]
     error = spans.course - spans.turned
@@ -273,7 +275,7 @@ def _burst_variance(spans: _Spans, error: Array) -> Array:
 
 
 def _refuse_other_motion(spans: _Spans) -> None:
-    """Refuse a gyro that leaves as much of the course's turns as it takes away."""
+    """Refuse a gyro that explains less than half of the variation of the course."""
     left, there = (
         _curved(spans.time, each) for each in (spans.course - spans.turned, spans.course)
     )
@@ -287,7 +289,7 @@ def _refuse_other_motion(spans: _Spans) -> None:
 
 
 def _curved(time: Array, heading: Array) -> float:
-    """Return how far a heading is off a line within stretches, rad, as a median."""
+    """Return the median deviation of a heading from a line within stretches, rad."""
     number = np.floor((time - time[0]) / STRETCH).astype(np.intp)
     off = [np.empty(0)]
     for each in np.unique(number):

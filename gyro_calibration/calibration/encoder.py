@@ -14,12 +14,12 @@ Calibrate a gyro against an encoder: scale factor error, bias and the residual h
 The input is a log in time with a reference heading. There are two methods: the likelihood of the
 headings, and the regression of the encoder's rate on the gyro, sample by sample.
 
-The error of an encoder is constant as long as its reading is, and known where the reading changes
-by a step; so readings are used at their steps. An error of step / sqrt(12) at each sample would
-give rests too much weight: with 0.088 deg and a gyro of low noise the variance of the scale was 58
+The error of an encoder is constant while its reading is, and known where the reading changes by a
+step; so readings are used at their steps. An error of step / sqrt(12) at each sample would give
+rests too much weight: with 0.088 deg and a gyro of low noise the variance of the scale was 58
 times the Cramer-Rao bound. The interval of the scale is the scatter between pieces of the log,
-since what a swing leaves in each period is no noise of the fit; that of the bias is its wander
-between pieces.
+since the error that repeats in each period of a swing is no noise of the fit; that of the bias is
+its wander between pieces.
 
 """
 
@@ -60,9 +60,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-#: Of a log, s: three years, or stamps in another unit.
+#: Longest log, s: three years; a longer one has stamps in another unit.
 LONGEST = 1e8
-#: Least step of a reference, rad: headings of a file are not known better.
+#: Smallest step of a reference, rad: the resolution of headings in a file.
 ROUNDING = 1e-6
 
 
@@ -128,8 +128,8 @@ class EncoderCalibration:
     drift : of the bias after the fit; the wander is part of the bias's standard deviation
     reference : its headings over time, s since it began
     before, after : the residual heading without calibration and with it
-    lost_samples : number missing between the stamps, where these are regular enough to tell
-    remarks : what to know, one sentence each
+    lost_samples : number missing between the stamps, where these are regular enough to count them
+    remarks : on the result, one sentence each
 
     """
 
@@ -157,7 +157,7 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the
         encoder's rate on the gyro; None for 'course' where the reference is one, else 'likelihood'
     noise : of the gyro, if it is known; goes into the model
-    limits : what is believed
+    limits : of an accepted calibration
     technology : of the gyro, one of `course_over_ground.PRIORS`; with 'course' its prior decides
         what a drive leaves open
 

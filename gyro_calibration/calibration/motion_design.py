@@ -9,18 +9,17 @@
 # under the License.
 
 """
-The motion, within what a robot can do, after which the heading of a later drive errs least.
+The motion within the limits of a robot that minimizes the heading error of a later drive.
 
-What a run determines is known before it is driven. `fit_likelihood` weighs increments of headings;
-the same columns, the same priors on delay and lag and the noise figures of the gyro give the
-covariance of scale factor error s and bias b. The rest after the run is combined with them as in
-`check_rest`. With that follows the covariance of the heading of any later drive that is integrated
-from them. Flicker and random walk of the bias, which the fit does not weigh, go through its
-weights.
+The accuracy of a run is computed before it is driven. `fit_likelihood` weighs increments of
+headings; the same columns, the same priors on delay and lag and the noise figures of the gyro give
+the covariance of scale factor error s and bias b. The rest after the run is combined with them as
+in `check_rest`. From these follows the covariance of the heading of a later drive. Flicker and
+random walk of the bias, which the fit does not weigh, are propagated through its weights.
 
-A motion that comes back has no net turn, so that s and b are estimated independently: the bias as
-well as white noise N allows in the time T, N / √T, and as the rest shows it, whatever the motion.
-The motion decides on s.
+A motion that returns has no net turn, so that the estimates of s and b are independent. The
+deviation of the bias depends on the white noise N, the time T, N / √T, and the rest, but not on
+the motion; that of s depends on the motion.
 
 """
 
@@ -51,25 +50,24 @@ from scipy.special import ndtri
 
 #: Cells in which the noise is counted, in one block of the fit; points of the motion in one cell.
 _CELLS, _POINTS = 5, 5
-#: Cells of the drive: of 1 s, but at most so many.
+#: Largest number of cells of the drive, of 1 s or longer.
 _MOST = 600
-#: Of a normal value, half are further off than so many standard deviations.
+#: Median of the absolute value of a normal variable, standard deviations.
 _MEDIAN = float(ndtri(0.75))
 
 
 @dataclass(frozen=True)
 class Ability:
     """
-    What a robot can do.
+    The limits of the motion of a robot.
 
     Attributes
     ----------
-    rate, acceleration, jerk : at most so much either way, rad/s, rad/s², rad/s³; inf for a jerk
-        that does not matter
-    slowest : no turn is slower than this between its ramps, rad/s, as where a drive does not turn
-        smoothly
-    lowest, highest : the heading stays between them, rad, beginning at 0
-    rest : the robot stands at least so long at the beginning and at the end, s
+    rate, acceleration, jerk : largest absolute values, rad/s, rad/s², rad/s³; inf for no limit of
+        the jerk
+    slowest : smallest rate of a turn between its ramps, rad/s, at which the robot turns smoothly
+    lowest, highest : limits of the heading, rad, which begins at 0
+    rest : minimum duration of the rests at the beginning and at the end, s
 
     """
 
@@ -88,7 +86,7 @@ class Ability:
                 np.minimum(self.acceleration / self.jerk, jerked))
 
     def ramp(self, rate: Number) -> Number:
-        """Return how long the robot takes from rest to a rate, s."""
+        """Return the duration of a ramp from rest to a rate, s."""
         rising, rounding = self.rising(rate)
         return rising + rounding
 
@@ -100,7 +98,7 @@ class Ability:
         return min(self.rate, low if low < 2.0 * jerked else steep)
 
     def reach(self, duration: float) -> float:
-        """Return how far the robot turns in that time, s, from rest to rest, rad."""
+        """Return the largest turn from rest to rest in a duration, s, rad."""
         half, rounding = 0.5 * duration, self.acceleration / self.jerk
         rate = min(self.rate, self.acceleration * (half - rounding) if half > 2.0 * rounding
                    else 0.25 * self.jerk * half ** 2)
@@ -110,16 +108,16 @@ class Ability:
 @dataclass(frozen=True)
 class Prediction:
     """
-    What a calibration by a motion is expected to be worth.
+    The expected accuracy of a calibration by a motion.
 
     Attributes
     ----------
     scale_deviation : standard deviation of s, 1
     bias_deviation : standard deviation of b against the mean bias of the drive that follows,
         rad/s; without flicker and random walk it is what the calibration states
-    heading_error : mean of the error of the heading over that drive, taken positive, rad
-    floor : the part of it that white noise causes: what stays if s and the bias at every moment
-        were known
+    heading_error : mean absolute error of the heading over that drive, rad
+    floor : the part of it that white noise causes, which remains if s and the bias are known at
+        all times
 
     """
 
@@ -141,9 +139,9 @@ class Forecast:
         ----------
         noise : of the gyro; its angle random walk is above 0
         duration : of the motions, s
-        drive : what the robot does after the rest, begun again where it ends
+        drive : motion of the robot after the rest, repeated where it ends
         length : of the drive, s
-        rest : after the motion, which is taken in from `SETTLED` s on, s; 0 for none
+        rest : duration of the rest, which begins `SETTLED` s after the motion, s; 0 for none
 
         """
         self._noise, self._duration, self._length, self._rest = noise, duration, length, rest
@@ -161,9 +159,10 @@ class Forecast:
         """
         Return the heading error, rad, by blocks of one length for all motions.
 
-        A fit takes shorter blocks where the motion is fast, and loses less at both ends: the bias
-        is better by 0.3 %. A search would find that, and prefer motions that gain it at the cost
-        of the scale. So it would prefer slow ones, where senses of turning may differ.
+        A fit takes shorter blocks where the motion is fast, and loses less at both ends, which
+        improves the bias by 0.3 %. A search with these blocks would prefer fast motions for it, at
+        the cost of the scale; with the allowance for a difference between the senses of turning it
+        would prefer slow ones.
 
         """
         blocks = math.ceil(self._duration / min(BLOCK, self._duration / 40.0))
@@ -180,7 +179,7 @@ class Forecast:
         variance = (noises.drive - 2.0 * (self._used * shared).sum(axis=0)
                     + (self._used * (own @ self._used)).sum(axis=0))
         error = math.sqrt(2.0 / math.pi) * float(np.sqrt(np.maximum(variance, 0.0)).mean())
-        # of the mean bias of the drive, white noise is no part
+        # white noise is no part of the mean bias of the drive
         of_mean = (float(noises.drive[-1]) / self._length ** 2
                    - self._noise.angle_random_walk ** 2 / self._length)
         of_bias = own[1, 1] - 2.0 * shared[1, -1] / self._length + of_mean
@@ -191,7 +190,7 @@ class Forecast:
         """
         Return the weights of (s, b) on increments of the gyro's integral and the rest, (2, n).
 
-        Then their covariance by what the fit leaves open of gyro and robot, shape (2, 2).
+        Then their covariance by errors of gyro and robot that the fit does not determine, (2, 2).
 
         """
         count = blocks * _CELLS * _POINTS
@@ -217,7 +216,7 @@ class Forecast:
         gain, combined = combined_rest(
             stated, _MEDIAN * math.sqrt(stated[1, 1] + expected), variance)
         of_run = np.eye(2) - np.outer(gain, (0.0, 1.0))
-        # the chance that the robot turned otherwise is no noise, but the calibration states it
+        # the probability of another turn of the robot is no noise, but part of the stated variance
         more = combined - of_run @ stated @ of_run.T - variance * np.outer(gain, gain)
         return (np.column_stack([of_run @ weights, gain]),
                 of_run @ left @ left.T @ of_run.T + more)
@@ -226,16 +225,16 @@ class Forecast:
 @dataclass(frozen=True)
 class _Noises:
     """
-    Noise of what a run and its rest show, and of the heading of the drive.
+    Noise of the observations of a run and its rest, and of the heading of the drive.
 
-    Shown are the increments between the blocks of the run, rad, and the mean rate of the rest,
-    rad/s, if there is one: n values.
+    The n observations are the increments between the blocks of the run, rad, and the mean rate of
+    the rest, rad/s, if there is one.
 
     Attributes
     ----------
-    inverse : of the covariance that white noise gives the increments, rad⁻²
-    run : covariance of what is shown by all noise, shape (n, n)
-    shared : covariance of what is shown with the heading of the drive, shape (n, m)
+    inverse : of the covariance of the increments by white noise, rad⁻²
+    run : covariance of the observations by all noise, shape (n, n)
+    shared : covariance of the observations with the heading of the drive, shape (n, m)
     drive : variance of the heading of the drive, rad², shape (m,)
 
     """
@@ -267,7 +266,7 @@ def _noises(noise: Noise, duration: float, blocks: int, rest: float, length: flo
 
 
 def _spread(blocks: int, length: float) -> Array:
-    """Return heading between blocks for a unit rate in each cell, s, (blocks - 1, cells)."""
+    """Return the heading between blocks for a unit rate in each cell, s, (blocks - 1, cells)."""
     rising = (np.arange(_CELLS) + 0.5) / _CELLS
     before, after = np.eye(blocks)[:-1], np.eye(blocks)[1:]
     return (np.kron(before, rising) + np.kron(after, rising[::-1])) * length / _CELLS
@@ -316,17 +315,17 @@ def _ramp(ability: Ability, rate: float) -> tuple[Array, Array]:
     return time, (squares[0] - squares[1] - squares[2] + squares[3]) / (2.0 * rising * rounding)
 
 
-#: Less than this is no angle, rad.
+#: Smallest angle of a turn, rad.
 _LEAST = 1e-9
 
 
 class _Family:
     """
-    Motions to and fro between two headings, of one length, as points of a unit cube.
+    Motions of one duration that alternate between two headings, as points of a unit cube.
 
-    The axes: how many turns, which way first, how far up and down the place is used, the rates of
-    one pair of turns and of the next, and how much of the time is rest between turns. Angles are
-    stretched until the time is used or the place ends.
+    The axes: number of turns, sense of the first one, fractions of the headings above and below 0
+    that are used, rates of one pair of turns and of the next, and fraction of the time that is
+    rest between turns. Angles are stretched up to the duration or the limits of the heading.
 
     """
 
@@ -379,7 +378,7 @@ class _Family:
 
 @dataclass(frozen=True)
 class Plan:
-    """A motion, and what it is expected to be worth."""
+    """A motion and the expected accuracy of a calibration by it."""
 
     motion: Motion
     prediction: Prediction
@@ -397,7 +396,7 @@ def best(ability: Ability, forecast: Forecast, duration: float, generator: np.ra
 
     Raises
     ------
-    DataRefused : the robot can make no such motion, or none that would be believed
+    DataRefused : the robot cannot make such a motion, or none would calibrate it well enough
 
     """
     _refuse(ability, duration)
@@ -415,12 +414,12 @@ def best(ability: Ability, forecast: Forecast, duration: float, generator: np.ra
     return believed(Plan(motion, forecast.predict(motion)))
 
 
-#: Of the axes of `_Family`.
+#: Bounds of the axes of `_Family`.
 _BOUNDS = [(0.0, 1.0)] * 4 + [(0.2, 1.0)] * 2 + [(0.0, 0.6)]
 
 
 def _refuse(ability: Ability, duration: float) -> None:
-    """Refuse what leaves no time or no place for a turn there and one back."""
+    """Refuse limits that leave no time or no place for a turn there and one back."""
     shortest = 2.0 * ability.rest + 4.0 * ability.ramp(ability.slowest)
     if duration <= shortest:
         raise DataRefused(
@@ -436,7 +435,7 @@ def _refuse(ability: Ability, duration: float) -> None:
 
 
 def believed(plan: Plan, limits: Limits | None = None) -> Plan:
-    """Return the plan, or refuse one by which no self-calibration would be believed."""
+    """Return the plan, or refuse one whose self-calibration would be refused."""
     limits, motion = limits or Limits(), plan.motion
     deviation, spread = (plan.prediction.scale_deviation,
                          float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05)))))

@@ -57,7 +57,7 @@ class EffectsUnidentifiable(DataRefused):
 @dataclass(frozen=True)
 class Calibration:
     """
-    A model fitted to dwells, and what the fit shows.
+    A model fitted to dwells, with residuals and cross-validation.
 
     Attributes
     ----------
@@ -116,10 +116,10 @@ class Calibration:
         return math.sqrt(float(self.model.covariance[place, place]))
 
     def chance_of(self, effect: Effect) -> float:
-        """Return the two-sided probability of as much of an effect where there is none."""
+        """Return the two-sided p-value of an effect."""
         used = take(self.dwells, self.scatter.kept)
         term = next(each for each in self.terms if each.effect is effect)
-        # The whole effect, not its derivative by a shape: near zero, that of a sine vanishes too.
+        # The whole effect, not its derivative by a shape, which vanishes near zero for a sine.
         error = np.broadcast_to(term.error(channels_of(used)), len(used))
         others = np.column_stack([np.empty((len(used), 0)), *(
             columns_of(used, [each]) for each in self.terms if each is not term)])
@@ -170,7 +170,7 @@ class Calibration:
 
 
 def channels_of(dwells: Dwells) -> Channels:
-    """Return what the effects look at."""
+    """Return the inputs of the effects."""
     temperature = (np.full(len(dwells), np.nan) if dwells.temperature is None
                    else dwells.temperature)
     return Channels(dwells.rate, dwells.output, temperature)
@@ -183,9 +183,9 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect],
     """
     Fit effects to dwells by generalised least squares, solved by QR.
 
-    Effects of the rate look at the reference rate. The polynomial of Ojeda et al. (eq. 9 to 12)
-    looks at the output, which does no harm where the output is an average. A shape is found by
-    Gauss-Newton steps from the best of a grid over its bounds.
+    Effects of the rate are evaluated at the reference rate. The polynomial of Ojeda et al. (eq. 9
+    to 12) is evaluated at the output, whose noise is small where it is an average. A shape is
+    found by Gauss-Newton steps from the best of a grid over its bounds.
 
     Parameters
     ----------
@@ -224,13 +224,13 @@ def _start(parameter: Parameter, dwells: Dwells) -> float:
 
 
 def error_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
-    """Return what effects leave of the errors of the dwells, rad/s, shape (n,)."""
+    """Return the errors of the dwells that the effects do not explain, rad/s, shape (n,)."""
     channels = channels_of(dwells)
     return dwells.output - dwells.rate - sum(term.error(channels) for term in terms)
 
 
 def columns_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
-    """Return what the error changes by for each fitted value, shape (n, m)."""
+    """Return the derivatives of the error by each fitted value, shape (n, m)."""
     channels = channels_of(dwells)
     return np.column_stack([row for term in terms for row in term.sensitivity(channels)])
 
@@ -240,10 +240,10 @@ def _forward(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
     Return the columns, shape (n, m), and residual of the output at the reference rate.
 
     The columns are the change of the output for each fitted value; the residual is the output less
-    that of the model. The polynomial looks at the output. With the measured one among the columns,
-    a scale factor error of -1 would make every residual zero, whatever sweeps share, and the
-    likelihood would prefer a large scatter of their scale: the Jacobian of output against error is
-    missing there. Columns and residual are therefore those at the expected output:
+    that of the model. The polynomial depends on the output. With the measured output in the
+    columns, a scale factor error of -1 would make every residual zero for any error of sweeps, and
+    the likelihood would prefer a large scatter of their scale: the Jacobian of output against
+    error is missing there. Columns and residual are therefore those at the expected output:
     ``Δoutput = Δerror / (1 - g)`` with ``g`` the slope of the error over the output.
 
     """
@@ -277,7 +277,7 @@ def _with(term: Term, place: int, value: float) -> Term:
 
 
 def _linear_misfit(dwells: Dwells, terms: Sequence[Term]) -> float:
-    """Return the sum of squares that is left when the coefficients, not the shapes, are fitted."""
+    """Return the residual sum of squares with the coefficients fitted and the shapes fixed."""
     channels = channels_of(dwells)
     columns = [term.columns(channels)[place - len(term.effect.shapes)]
                for term in terms for place in term.fitted if place >= len(term.effect.shapes)]
@@ -318,7 +318,7 @@ def _factor(dwells: Dwells, terms: Sequence[Term],
     return orthogonal, triangle, lengths
 
 
-# what a fit shows
+# the result
 
 def _calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter,
                  whitener: Whitener) -> Calibration:
@@ -397,7 +397,7 @@ def _unidentifiable(terms: Sequence[Term], triangle: Array) -> EffectsUnidentifi
         'leave one out', names)
 
 
-# looking at it
+# bins of errors
 
 @dataclass(frozen=True)
 class Bin:
@@ -434,7 +434,7 @@ def binned(fit: Calibration, values: Array, most: int = 8) -> list[Bin]:
 
 def _bin(fit: Calibration, low: float, high: float, chosen: Mask) -> Bin:
     part, residual = take(fit.dwells, chosen), fit.residual[chosen]
-    # What a sweep shares does not average out within it.
+    # Errors common to a sweep do not average out within it.
     sweeps = np.unique(part.sweep, return_inverse=True)[1]
     variance = (np.sum(fit.deviation[chosen] ** 2)
                 + np.sum(summed(fit.scatter.shared(part), sweeps) ** 2))

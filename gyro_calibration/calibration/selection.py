@@ -13,9 +13,9 @@ Selection of a gyro's effects: by the prediction of left-out sweeps, each choice
 
 Bias, scale factor error and their slopes over temperature belong to every model, as every gyro has
 them: the slopes where the dwells determine them better than a data sheet does. Another effect is
-taken where the error of left-out sweeps falls with it and its evidence is beyond chance, given the
-number of effects tried. Where two effects explain the data alike, the one that the physics of the
-instrument gives decides, if the instrument is known.
+taken where it reduces the error of left-out sweeps and is significant, given the number of effects
+tried. Where two effects explain the data equally well, the one by the physics of the instrument is
+taken, if the instrument is known.
 
 """
 
@@ -49,16 +49,16 @@ FALSE_ALARM_RATE = 0.01
 #: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
 #: one of thirty thousand calibrations.
 DISTINGUISHED = 4.0
-#: With fewer, the data hardly prefer one of two causes.
+#: Standard deviations below which the data do not prefer one of two causes.
 HARDLY = 2.0
-#: Of effects that look alike, the one that the physics of an instrument gives.
+#: Technology -> the effect, of two that are hard to distinguish, that its physics causes.
 TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
                 'mems': CUBIC_NONLINEARITY}
 _CONFOUNDERS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
-#: What every gyro has, if the dwells determine it better than these standard deviations, of what
-#: data sheets leave open.
+#: Effects of every gyro that are fitted where their standard deviation is below these, which are
+#: those of data sheets.
 _SLOPES = {BIAS_TEMPERATURE: BIAS_SLOPE, SCALE_FACTOR_TEMPERATURE: SCALE_SLOPE}
-#: An effect that is of no use without another one.
+#: Effect -> another one that it is fitted with only.
 _NEEDS = {BIAS_TEMPERATURE_QUADRATIC: BIAS_TEMPERATURE}
 
 
@@ -72,7 +72,7 @@ class Choice:
     effect : its name
     taken : whether it is in the model
     without, with_it : error of left-out sweeps, rad/s; nan where a fit was not possible
-    chance : probability of so much evidence by chance alone; nan as before
+    chance : p-value of the effect; nan as before
     reason : one sentence
 
     """
@@ -88,7 +88,7 @@ class Choice:
 @dataclass(frozen=True)
 class Confounders:
     """
-    Two effects that explain the same.
+    Two effects that explain the same errors.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Confounders:
 
 @dataclass(frozen=True)
 class Selection:
-    """A calibration with the effects that the data support, the reasons, and what looks alike."""
+    """A calibration with the effects that the data support, the reasons, and confounded pairs."""
 
     calibration: Calibration
     choices: tuple[Choice, ...]
@@ -174,7 +174,7 @@ def _tried(effects: Sequence[Effect]) -> int:
 
 
 def _base(dwells: Dwells, scatter: Scatter) -> Calibration:
-    """Fit bias and scale factor error, or what of them can be seen."""
+    """Fit bias and scale factor error, or the one of them that the dwells determine."""
     for effects in ((BIAS, SCALE_FACTOR_ERROR), (BIAS,), (SCALE_FACTOR_ERROR,)):
         fit = _try(dwells, effects, scatter)
         if fit is not None:
@@ -192,7 +192,7 @@ def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibra
 
 def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
     """
-    Return whether more effects predict left-out sweeps better, each beyond chance.
+    Return whether more effects predict left-out sweeps better, and each is significant.
 
     A response that no longer grows with the rate at some dwells cannot be undone there.
 
@@ -244,9 +244,9 @@ def _prune(fit: Calibration, base: Sequence[Effect], limit: float) -> Calibratio
 def decided(fit: Calibration, technology: str | None,
             bounded: Effect | None = None) -> tuple[Calibration, tuple[Confounders, ...]]:
     """
-    Decide between effects that explain the same.
+    Decide between effects that explain the same errors.
 
-    Without a technology, a `bounded` effect is taken where the data hardly prefer the other one.
+    Without a technology, a `bounded` effect is taken where the data do not prefer the other one.
 
     """
     found = []
@@ -256,7 +256,7 @@ def decided(fit: Calibration, technology: str | None,
             if taken in fit.effects:
                 swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other),
                                fit.scatter)
-            # rates at the zeros of a sine let it explain anything
+            # with all rates at its zeros a sine fits any data
             if swapped is not None and swapped.folded_beyond is None:
                 fit, confounders = _decide((fit, taken), (swapped, other), technology, bounded)
                 found.append(confounders)

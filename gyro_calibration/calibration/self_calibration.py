@@ -11,9 +11,9 @@
 """
 Scale factor error and bias from about 20 s of known motion, with the reasons to refuse a run.
 
-The gyro is taken as ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). There are three
-methods: the two of the paper, unchanged, and a likelihood fit that does not have their errors and
-does not need the start of the motion to the millisecond.
+The model is ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). There are three methods:
+the two of the paper, unchanged, and a likelihood fit, which has no error by the rectangle rule and
+estimates the time offset between gyro and motion.
 
 """
 
@@ -61,21 +61,20 @@ class Limits:
 
     Attributes
     ----------
-    samples : minimum number
+    samples : minimum number of samples
     gap : longest between samples, s
     rate_spread : smallest standard deviation of the profile's rate, rad/s; one speed does not
         separate scale from bias
     scale_factor_error : largest, 1
     bias : largest, rad/s
     scale_standard_deviation : largest standard deviation of the scale, 1
-    residual : largest turn of a stretch of the run otherwise than the profile, beyond chance, rad
+    residual : largest significant deviation of a stretch of the run from the profile, rad
     time_offset : largest lag of the gyro behind the profile, either way, s
-    noise_ratio, unexplained : noise that adds up in the heading is at most so many times the known
-        noise, or turns the run by at most so much, rad
+    noise_ratio, unexplained : largest noise that accumulates in the heading, as a multiple of the
+        known noise and as its heading error over the run, rad; a run that exceeds both is refused
     rest : length of the check after the run, s
     drift : largest corrected rate at rest after the run, rad/s, unless the noise explains more
-    repeating : largest error of the heading that repeats with the motion, rad, for it will
-        repeat afterwards too
+    repeating : largest error of the heading that repeats with the motion, rad
     heading : largest error of the heading after five minutes, rad, unless it was larger without
         the calibration (`likelihood` only)
 
@@ -100,7 +99,7 @@ class Limits:
 @dataclass(frozen=True)
 class Reference:
     """
-    The errors of a reference that no run can show; all zero for an exact one, or a measured one.
+    The errors of a reference that are not observable in a run; zero for an exact or measured one.
 
     Attributes
     ----------
@@ -116,8 +115,8 @@ class Reference:
     random_walk: float = 0.0
 
 
-#: Wheels that follow commanded rates slip by up to so much of each turn on a good floor, 1; slip
-#: that is the same in each turn looks like a scale factor error.
+#: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
+#: equal slip in all turns is indistinguishable from a scale factor error.
 _SLIPPING = 0.01
 
 
@@ -215,8 +214,9 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         fit = _fit_likelihood(time, rate, motion, limits.time_offset, reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
-    # what no run shows: wander of the bias, and errors of the reference, with the part that all
-    # turns lose; of losses between zero and a largest the root mean square is twice the deviation
+    # errors not observable in a run: wander of the bias, and errors of the reference with the
+    # slip that all turns have; the root mean square of slips between zero and a largest one is
+    # twice their standard deviation
     scale, floor = 1.0 + fit.scale_factor_error, 0.0 if noise is None else noise.floor
     hidden = np.diag([(scale * max(reference.scale_deviation, 2.0 * fit.slip)) ** 2,
                       floor ** 2 + (scale * reference.rate_deviation) ** 2])
@@ -350,7 +350,7 @@ class RestCheck:
     rate : mean of the corrected rate, rad/s
     deviation : its standard deviation by noise, calibration and wander, rad/s
     limit : largest mean that is accepted, rad/s
-    fit : the calibration, with what the rest says of its bias
+    fit : the calibration, with its bias updated by the rest
 
     """
 
@@ -421,7 +421,7 @@ def rest_variance(noise: Noise, duration: float, white: float, change: float) ->
 
 
 def _with_rest(fit: Fit, rate: float, variance: float) -> Fit:
-    """Return the fit with what a rest after its run says of the bias, as in `combined_rest`."""
+    """Return the fit with its bias updated by a rest after its run, as in `combined_rest`."""
     if not np.isfinite(fit.covariance).all():
         return fit
     gain, covariance = combined_rest(fit.covariance, rate, variance)
@@ -433,10 +433,9 @@ def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Arra
     """
     Combine a run with the rest after it.
 
-    A run may be off by more than its stated deviation: by a slip, by a turn by hand, or by a robot
-    that follows otherwise. That and a run as stated have even odds before the rest is seen. How
-    much more is not known: the ratio of that error to the stated deviation has a half-Cauchy
-    prior, as often below 1 as above, and now and then many times more.
+    The error of a run may exceed its stated deviation: by a slip, a turn by hand, or another
+    response of the robot. That and a run as stated have even odds before the rest is seen. The
+    ratio of that error to the stated deviation has a half-Cauchy prior with a median of 1.
 
     Parameters
     ----------
@@ -446,7 +445,7 @@ def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Arra
 
     Returns
     -------
-    by how much s and b change with that rate, shape (2,), and their covariance, shape (2, 2)
+    derivatives of s and b by that rate, shape (2,), and their covariance, shape (2, 2)
 
     """
     stated, run = covariance[1, 1], covariance[:, 1]
@@ -467,8 +466,8 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
     """
     Return the samples of the rest after a run, from `SETTLED` s after the motion on.
 
-    It begins later, by up to its length in the limits, where the robot still moves then, as one
-    that swings out. It lasts until the robot moves, at most as long as the motion did. None where
+    It begins later, by up to its length in the limits, where the robot still moves then, as after
+    an overshoot. It lasts until the robot moves, at most as long as the motion did. None where
     the log ends before, or the robot drives on.
 
     Parameters
@@ -486,7 +485,7 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
                for each in begins]
     if windows[0].stop - windows[0].start < 10 or time[-1] < begin + 0.9 * limits.rest:
         return None
-    # a difference of halves scatters by twice the deviation of a mean
+    # the standard deviation of a difference of halves is twice that of the mean
     sizes = np.array([_change_at_rest(corrected[each])
                       / max(2.0 * _deviation_of_mean(corrected[each]), 1e-300)
                       for each in windows])
@@ -494,7 +493,7 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
     first = next((each for each in late.tolist() if sizes[each] < 2.0), int(late[-1]))
     means = np.array([part.mean() for part in np.array_split(corrected[windows[first]], 4)])
     apart = max(CHANCE * 2.0 * _deviation_of_mean(corrected[windows[first]]), _DRIVING)
-    # a slow and steady turn is no drive: before the fit it passed for a bias
+    # a slow and steady turn is no drive: the fit took it as a bias
     if abs(means.mean()) > limits.bias or np.ptp(means) > 2.0 * apart:
         return None
     moving = first + 1 + np.flatnonzero(sizes[first + 1:] > 4.0)
@@ -503,13 +502,13 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
 
 
 def _change_at_rest(rate: Array) -> float:
-    """Return how far the halves of a rest differ, rad/s."""
+    """Return the difference between the means of the halves of a rest, rad/s."""
     begun, ended = (float(half.mean()) for half in np.array_split(rate, 2))
     return abs(ended - begun)
 
 
-#: Time after the profile at which a robot is at rest, s; change of the rate within a rest by which
-#: it is driving on, rad/s.
+#: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
+#: which the robot is driving, rad/s.
 SETTLED, _DRIVING = 1.0, 0.25 * DEGREE
 
 
@@ -530,7 +529,7 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None,
     ----------
     time : s, shape (n,)
     rate : compensated by the model, rad/s, shape (n,)
-    noise : of the gyro, if it is known; the mean is not taken to be better known than it allows
+    noise : of the gyro, if it is known; it gives the smallest standard deviation of the mean
     output : of the gyro before its model, where that differs, shape (n,); it shows a dead gyro
 
     Raises
@@ -555,7 +554,7 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None,
         raise DataRefused(f'the gyro was moved: its mean changed by {beyond.max() / DEGREE:.2f} '
                           'deg/s within the rest; keep it still and run again')
     noise = noise or Noise()
-    # ten blocks may scatter by half of what they should by chance
+    # the standard deviation of ten blocks may by chance be half of the true one
     white = max(blocks.var(ddof=1) / 10.0,
                 noise.angle_random_walk ** 2 / float(time[-1] - time[0]))
     bias = float(rate.mean())

@@ -9,11 +9,11 @@
 # under the License.
 
 """
-What a gyro's error makes of a full turn of 360 degrees (Ojeda et al., section 4).
+The heading error of a full turn of 360 degrees (Ojeda et al., section 4).
 
-An error of the rate, rad/s, adds up to an error of the heading in each turn, rad, which is larger
-the slower the turn is. Two errors are compared: with the bias of a rest before the mission only,
-and with a model and then the bias that is left at rest.
+An error of the rate, rad/s, integrates to an error of the heading in each turn, rad, in proportion
+to the duration of the turn. Two errors are compared: with the bias of a rest before the mission
+only, and with a model and then the bias that remains at rest.
 
 """
 
@@ -48,8 +48,8 @@ class TurnErrors:
     static : with the static bias only, rad per turn
     modelled : with the model, and the static bias after it, rad per turn
     sweep : that the turn was measured in
-    place : where it stands in its file
-    remarks : where the static bias comes from, and what has no error, one sentence each
+    place : of each turn in its file
+    remarks : on the source of the static bias, and on turns without an error, one sentence each
 
     """
 
@@ -78,8 +78,8 @@ def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnEr
 
     Raises
     ------
-    DataRefused : nothing turns as fast as that with a rate by the model, nothing shows the static
-        bias, or the gyro is upside down
+    DataRefused : no dwell of that rate has a rate by the model, none determines the static bias,
+        or the gyro is upside down
 
     """
     known = np.isfinite(rate)
@@ -121,7 +121,7 @@ def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) ->
 
 @dataclass(frozen=True)
 class _Rest:
-    """The dwells of a sweep that show the static bias, and their weights, shape (k,)."""
+    """The dwells of a sweep that determine the static bias, and their weights, shape (k,)."""
 
     sweep: int
     temperature: float
@@ -156,7 +156,7 @@ def _at_rest(dwells: Dwells, number: int) -> _Rest | None:
 
 
 def _between_turns(dwells: Dwells, number: int) -> _Rest | None:
-    """Return the slowest turn each way of a sweep: the line between their errors passes rest."""
+    """Return the slowest turn each way of a sweep; the bias is interpolated between them."""
     ways = [np.flatnonzero((dwells.sweep == number) & (way * dwells.rate > 0.0))
             for way in (1.0, -1.0)]
     if not all(map(len, ways)):

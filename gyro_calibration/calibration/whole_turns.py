@@ -37,29 +37,29 @@ TURN = 2.0 * math.pi
 MARKING = 1.0 * DEGREE
 #: Shortest rest, s, and the time at its end that is left out while the robot stops or starts, s.
 REST, _SETTLING = 1.0, 0.25
-#: Means over this length separate rest from motion, s; a robot that turns faster than this, rad/s,
-#: does not rest, however noisy the gyro.
+#: Length of the means that separate rest from motion, s, and the smallest deviation that is
+#: motion for any noise of the gyro, rad/s.
 _PART, _MOVING = 0.25, 0.5 * DEGREE
-#: The angle must be nearer to the number of turns than this part of a turn; half a turn would be
-#: as near to the next number.
+#: Largest difference between the angle and the number of turns, in turns; half a turn would be as
+#: near to the next number.
 AMBIGUOUS = 0.35
 #: Scale factor error up to which the turns are counted by the gyro itself, 1.
 COUNTED = 0.05
-#: How often two rests of one bias are refused as different.
+#: Probability of refusing two rests of equal bias as different.
 _FALSE_REFUSALS = 1e-4
 
 
 @dataclass(frozen=True)
 class Turns:
     """
-    What whole turns showed.
+    The result of a calibration by whole turns.
 
     Attributes
     ----------
     fit : s and b with their covariance
-    turns : how many, counter-clockwise positive
+    turns : number, counter-clockwise positive
     duration : from rest to rest, s
-    rests : how long the rests at both ends lasted, s
+    rests : durations of the rests at both ends, s
 
     """
 
@@ -83,9 +83,9 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     ----------
     time : s, shape (n,)
     rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
-    turns : how many, counter-clockwise positive; None for the nearest whole number, for a scale
+    turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
         factor error up to `COUNTED`
-    noise : of the gyro, if it is known; what the bias may wander goes into the standard deviations
+    noise : of the gyro, if it is known; the standard deviations include the wander of the bias
     marking : standard deviation of the angle between the two rests on the mark, rad
     output : of the gyro before its model, where that differs, shape (n,)
 
@@ -98,7 +98,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)
-    # N², rad²/s: what neighbours show of it, and no less than what is known
+    # N², rad²/s: by differences between neighbours, and at least the known one
     white = max(white_noise(rate) ** 2 * float(np.median(np.diff(time))),
                 noise.angle_random_walk ** 2)
     begin, end = _motion(time, rate, white)
@@ -125,13 +125,13 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
 
 
 def _motion(time: Array, rate: Array, white: float) -> tuple[float, float]:
-    """Return where the turns begin and end, s: the rest before and the rest after them."""
+    """Return the times at which the turns begin and end, s, after and before the rests."""
     part = ((time - time[0]) / _PART).astype(int)
     means = np.bincount(part, rate) / np.maximum(np.bincount(part), 1)
     limit = max(CHANCE * math.sqrt(white / _PART), _MOVING)
     lengths = []
     for name, values in (('before', means), ('after', means[:-1][::-1])):
-        # how many of the means, from the first on, differ by no more than by chance
+        # number of means, from the first on, whose differences are within the noise
         middle = np.array([np.median(values[:end]) for end in range(1, len(values) + 1)])
         steady = int(np.argmax(np.append(np.abs(values - middle) > limit, True)))
         lengths.append(steady * _PART - _SETTLING)
@@ -146,7 +146,7 @@ def _motion(time: Array, rate: Array, white: float) -> tuple[float, float]:
 
 
 def _refuse_bias(difference: float, expected: float, bias: float, limits: Limits) -> None:
-    """Refuse rests that differ by more than chance (`expected` is 1 sigma), or no bias, rad/s."""
+    """Refuse rests that differ significantly (`expected` is 1 sigma), or a large bias, rad/s."""
     if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSALS)) * expected, limits.drift):
         raise DataRefused(
             f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
@@ -158,7 +158,7 @@ def _refuse_bias(difference: float, expected: float, bias: float, limits: Limits
 
 
 def _counted(measured: float, turns: int | None, limits: Limits) -> int:
-    """Return the number of turns, or refuse what cannot be whole turns."""
+    """Return the number of turns, or refuse an angle that is no whole number of turns."""
     count = round(measured) if turns is None else turns
     if not count:
         raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
