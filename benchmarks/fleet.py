@@ -244,7 +244,7 @@ def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
 
 def _records(generator: Generator, units: int, drives: int, effect: float = 0.0
              ) -> list[dict[str, Any]]:
-    """Return records of a fleet in which nothing stands out, with 1 % of false names."""
+    """Return records of a fleet without outliers, with false alarms in 1 % of the diagnoses."""
     found = []
     size = {'bias': (0.4, 0.01, 0.01, 0.02), 'scale_factor_error': (0.3, 0.6, 0.1, 0.4),
             'time_offset': (0.0, 0.4, 0.02, 0.002)}

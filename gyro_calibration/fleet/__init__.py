@@ -9,11 +9,11 @@
 # under the License.
 
 """
-A fleet: many logs of many gyros, and what is the unit's, the type's and the reference's.
+A fleet: many logs of many gyros, with errors attributed to the unit, the type and the reference.
 
-Reading order, each imports only from those before it: `table` (which log is of which unit),
-`work` (on one log), `run` (of many tasks), `pooling` (of one value over the logs of a type, and
-its outliers), `summary` (of a type, and models for its units), `report` (the page, and tables for
+Reading order, each imports only from those before it: `table` (the unit of each log), `work` (on
+one log), `run` (of many tasks), `pooling` (of one value over the logs of a type, and its
+outliers), `summary` (of a type, and models for its units), `report` (the page, and tables for
 other programs).
 
 """

@@ -9,20 +9,21 @@
 # under the License.
 
 """
-Partial pooling: what of a value is the type's, the unit's, the drive's, and of one power-on.
+Partial pooling: the parts of a value by type, unit, drive and power-on.
 
 Value ``y`` of the log ``i`` of unit ``u`` on drive ``d`` is taken as::
 
     y_i = x_i' beta + unit_u + t_i' slope_u + drive_d + power_on_i + error_i
 
 * ``beta``: mean of the type, and its slopes over age and temperature ``t``;
-* ``unit``, ``slope``, ``drive`` and ``power_on``: normal, with the standard deviations *between
-  units*, of the slopes of units about that of the type, *between drives* and *between power-ons*
-  that are sought;
-* ``error``: of the variance that the calibration of the log states, ``sigma_i²``, the share
-  ``lambda`` is the log's own. The rest is an error of the reference, which all units of a drive
-  have in common, so it is among what differs between drives; or it is more than there is, for a
-  single log cannot tell the error of its reference from that of its gyro.
+* ``unit``, ``slope``, ``drive`` and ``power_on``: normal, with unknown standard deviations
+  *between units*, of the slopes of units about that of the type, *between drives* and *between
+  power-ons*;
+* ``error``: of the variance ``sigma_i²`` that the calibration of the log states, the share
+  ``lambda`` is independent between logs. The rest is an error of the reference, which all units of
+  a drive have in common, so it is part of the variance between drives; or the stated variance is
+  too large, since a single log does not distinguish the error of its reference from that of its
+  gyro.
 
 The restricted likelihood (REML) of the variances is integrated, not maximized, so that intervals
 hold with few units and few drives: estimates are averaged over points of a quasi-random sequence,
@@ -33,11 +34,11 @@ it is flat in the logarithms of the expected mean squares, and the intervals are
 The equations are those of mixed models (Henderson 1975): units are eliminated first, as each log
 is of one unit, so that only the columns of drives and ``beta`` are solved for.
 
-A unit or drive that stands out is given an effect of its own and all else is pooled again, so that
-it is compared with what the others predict for one more unit. Its chance is multiplied by the
-number of those that it was chosen from (Bonferroni). Where there are many, the next is tested with
-it, for two that stand out hide each other; the last one below the level counts, and all before it
-(generalized extreme studentized deviate, Rosner 1983).
+An outlying unit or drive is given an effect of its own and the others are pooled again, so that it
+is compared with their prediction for one more unit. Its p-value is multiplied by the number of
+those that it was chosen from (Bonferroni). With 15 or more, the next one is tested together with
+it, since two outliers mask each other; the last one below the level, and all before it, are
+outliers (generalized extreme studentized deviate, Rosner 1983).
 
 """
 
@@ -58,15 +59,16 @@ from scipy.special import ndtr
 from scipy.stats import qmc
 
 Numbers = NDArray[np.intp]
-#: The standard deviations that are sought, and the share of the errors that is a log's own.
+#: The estimated standard deviations, and the share of the stated variance that is independent
+#: between logs.
 UNITS, DRIVES, POWER_ONS, OWN = 'units', 'drives', 'power_ons', 'own_share'
-#: Of the slopes of units over the first columns and the second.
+#: Standard deviations of the slopes of units over the first column and the second.
 SLOPES = ('slopes_0', 'slopes_1')
-#: Logs of a unit, at different values of a column, that show a slope of its own.
+#: Minimum number of logs of a unit, at different values of a column, for a slope of its own.
 _FEWEST = 3
-#: Points of the sequence over the variances, and of a slice through the likeliest.
+#: Points of the sequence over the variances, and of a slice through the likeliest point.
 _POINTS, _SLICE = 512, 41
-#: Largest standard deviation that is possible, in those of the values about their median.
+#: Largest possible standard deviation, in standard deviations of the values about their median.
 _LARGEST = 30.0
 
 
@@ -109,16 +111,16 @@ class Observed:
 @dataclass(frozen=True)
 class Wanted:
     """
-    Linear functions of what is estimated: of fixed effects, one unit and one drive each.
+    Linear functions of the estimates: of fixed effects, one unit and one drive each.
 
     Attributes
     ----------
     fixed : shape (k, 1 + columns)
     unit, drive : numbers, -1 for none, shape (k,)
     error : standard deviation that a log will state; its own share is added, shape (k,)
-    of_unit : what of the unit: weights of its value and of its slopes, shape (1 + slopes,)
-    more : name of a variance -> how often it is added, for what is not estimated, such as the
-        next power-on
+    of_unit : weights of the value of the unit and of its slopes, shape (1 + slopes,)
+    more : name of a variance -> its multiple that is added, for quantities that are not estimated,
+        such as the next power-on
 
     """
 
@@ -161,7 +163,7 @@ class _Equations:
             self.pair_unit, self.pair_drive = np.divmod(pairs, self.drives)
 
     def chunks(self, points: int) -> list[slice]:
-        """Return parts of the points that are solved for at a time, so that memory is bounded."""
+        """Divide the points into parts that are solved together, which bounds the memory."""
         size = (self.units * self.columns * (1 + self.of.slopes) + self.columns ** 2
                 + len(self.of))
         step = max(2_000_000 // size, 1)
@@ -214,7 +216,7 @@ class _Solved:
                 normal[:, index, place] = normal[:, place, index]
             normal[:, index, index] = self._scale ** 2 * summed(at.to_drive, here)
             normal[:, range(kept, total), range(kept, total)] += 1.0
-        # what is of a unit is among the fixed effects, and first
+        # the columns of a unit are the first fixed effects
         precision = (np.eye(parts) + tau[:, None, :, None] * tau[:, None, None, :]
                      * across[:, :, :, :parts])
         self._within = np.linalg.inv(precision)
@@ -269,13 +271,13 @@ class Pooled:
     Attributes
     ----------
     observed : the values
-    names : of the variances that the logs can tell apart
+    names : of the variances that the logs distinguish
     likeliest : name -> variance (of `OWN`, a share) at the largest restricted likelihood
 
     """
 
     def __init__(self, observed: Observed):
-        """Pool; raise `DataRefused` where there is less than two logs more than fixed effects."""
+        """Pool; raise `DataRefused` where there are not more logs than fixed effects."""
         fixed = observed.fixed
         if len(observed) < fixed.shape[1] + 1:
             raise DataRefused(f'{len(observed)} logs do not show how much a value varies; at '
@@ -287,7 +289,7 @@ class Pooled:
         # columns of about one, so that the equations are well conditioned
         self._scales = np.maximum(np.abs(fixed).max(axis=0), 1e-300)
         self._fixed = fixed / self._scales
-        # smaller errors than 1e-5 of what values differ by would leave no digits to solve with
+        # errors below 1e-5 of the spread of the values would make the equations ill-conditioned
         self._scaled = replace(
             observed, value=(observed.value - self._middle) / self._size,
             deviation=np.maximum(observed.deviation / self._size, 1e-5),
@@ -312,7 +314,7 @@ class Pooled:
         return found or {POWER_ONS: np.zeros(len(points))}
 
     def _log_likelihood(self, points: Array, prior: bool = False) -> Array:
-        """Return the restricted likelihoods at points, or their product with the prior."""
+        """Return the restricted log-likelihoods at points, or with the log-prior added."""
         found = []
         for part in self._equations.chunks(len(points)):
             sizes = self._sizes(points[part])
@@ -323,7 +325,7 @@ class Pooled:
         return np.concatenate(found)
 
     def _search(self, without: str = '') -> Array:
-        """Return the point of the largest restricted likelihood, perhaps without a variance."""
+        """Return the point of largest restricted likelihood, optionally without one variance."""
         if not self.names:
             return np.empty(0)
         bounds = [(self._bounds[name][0],) * 2 if name == without else self._bounds[name]
@@ -335,7 +337,7 @@ class Pooled:
                 point = tried[np.argmax(self._log_likelihood(tried))]
         found = minimize(self._downhill, point, method='L-BFGS-B', jac=True, bounds=bounds,
                          options={'maxiter': 60})
-        # an optimum at the floor is often missed by the slope there
+        # the gradient search often misses an optimum at the floor
         ends = [_moved(found.x, place, np.array([low])) for place, (low, _) in enumerate(bounds)]
         tried = np.vstack([found.x, point, *ends])
         best: Array = tried[np.argmax(self._log_likelihood(tried))]
@@ -356,7 +358,7 @@ class Pooled:
         for place, name in enumerate(self.names):
             axis = np.linspace(*self._bounds[name], _SLICE)
             along = self._log_likelihood(_moved(self._best, place, axis), prior=True)
-            # wider than the slice, for what the other variances leave open
+            # wider than the slice, since the other variances are not known
             density = np.exp(0.6 * (along - along.max()))
             density = density + 0.1 * density.mean()
             cells = 0.5 * (density[1:] + density[:-1]) * np.diff(axis)
@@ -370,7 +372,7 @@ class Pooled:
 
     @cached_property
     def components(self) -> dict[str, Component]:
-        """Return the standard deviations by name, and the share of the errors that is own."""
+        """Return the standard deviations by name, and the independent share of the errors."""
         found, likeliest, sample = {}, self._sizes(self._best[None]), self._sizes(self._sample)
         for name in self.names:
             order = np.argsort(sample[name])
@@ -379,7 +381,7 @@ class Pooled:
             values = np.array([likeliest[name][0], *bounds])
             if name != OWN:
                 without = self._log_likelihood(np.vstack([self._best, self._search(name)]))
-                # a variance of zero is rejected at 2.5 %, one-sided, with half of the chance at
+                # a variance of zero is rejected at 2.5 %, one-sided; half of the probability is at
                 # zero (Self and Liang 1987)
                 values = np.sqrt(values) * [1.0, 2.0 * (without[0] - without[1]) > 3.841, 1.0]
             size = (1.0 if name == OWN else self._size / self._scales[1 + SLOPES.index(name)]
@@ -406,7 +408,7 @@ class Pooled:
         return constant + self._size * mean, self._size ** 2 * np.maximum(variance, 1e-30)
 
     def _solutions(self) -> Iterator[tuple[Mapping[str, Array], _Solved]]:
-        """Give variances and solutions at the points; what is solved at once is kept."""
+        """Give variances and solutions at the points; a solution of all points is kept."""
         parts = self._equations.chunks(len(self._sample))
         for part in parts:
             sizes = self._sizes(self._sample[part])
@@ -426,7 +428,7 @@ class Pooled:
         return Interval(value, deviation, low, high)
 
     def chance(self, wanted: Wanted) -> Array:
-        """Return the chances, two-sided, that what is wanted is as far from 0, shape (k,)."""
+        """Return the two-sided p-values of linear functions against 0, shape (k,)."""
         mean, variance = self._moments(wanted)
         below = self._weight @ ndtr(-mean / np.sqrt(variance))
         return np.minimum(2.0 * np.minimum(below, 1.0 - below), 1.0)
@@ -435,7 +437,7 @@ class Pooled:
                fixed: Array | None = None, error: Array | float = 0.0,
                part: int = 0, **more: float) -> Wanted:
         """
-        Return what is wanted; by default the mean of the type, or of units and drives.
+        Return linear functions; by default the mean of the type, or of units and drives.
 
         Parameters
         ----------
@@ -453,7 +455,7 @@ class Pooled:
                       np.eye(1 + self.observed.slopes)[part], more)
 
     def score(self, column: Array) -> float:
-        """Return how many standard deviations one more fixed effect is from 0, roughly."""
+        """Return the approximate z-score of one more fixed effect."""
         fixed = np.column_stack([self._fixed, column])
         sizes = self._sizes(self._best[None])
         solved = _Solved(_Equations(self._scaled, fixed, DRIVES in self.names), sizes)
@@ -463,7 +465,7 @@ class Pooled:
         return float(mean[0, 0] / math.sqrt(variance[0, 0]))
 
     def standing(self, kind: str) -> Array:
-        """Return how many standard deviations each unit or drive is off the others, roughly."""
+        """Return the approximate z-score of each unit or drive against the others."""
         number = self.observed.unit if kind == UNITS else self.observed.drive
         sizes = self._sizes(self._best[None])
         size = np.maximum(sizes.get(kind, np.zeros(1)), 1e-4)
@@ -477,7 +479,7 @@ class Pooled:
 
 
 def _distinguishable(of: Observed) -> list[str]:
-    """Return the variances that the logs can tell apart."""
+    """Return the variances that the logs distinguish."""
     logs = np.bincount(of.unit)
     names = [UNITS] if len(logs) > 1 else []
     for name, column in zip(SLOPES, of.columns.T[:of.slopes]):
@@ -511,7 +513,7 @@ def _log_prior(at: _Equations, sizes: Mapping[str, Array]) -> Array:
     variance = sizes.get(POWER_ONS, found)[:, None] + own * of.deviation ** 2
 
     def jeffreys(name: str, mean: Array) -> Array:
-        """Return it for a variance in addition to that of the means of groups."""
+        """Return the log-prior of a variance in addition to that of the means of groups."""
         size = sizes[name][:, None]
         return np.asarray(0.5 * np.log(np.sum((size + mean) ** -2.0, axis=1)))
 
@@ -540,7 +542,7 @@ def _moved(point: Array, place: int, values: Array) -> Array:
 def _quantile(mean: Array, variance: Array, weight: Array, chance: float) -> Array:
     """Return quantiles of mixtures of normal distributions, shape (k,), by bisection."""
     deviation = np.sqrt(variance)
-    # beyond this a mixture has no more of its weight than the chance
+    # the probability of a mixture outside of this is negligible
     low, high = (mean - 40.0 * deviation).min(axis=0), (mean + 40.0 * deviation).max(axis=0)
     for _ in range(70):
         middle = 0.5 * (low + high)
@@ -549,20 +551,20 @@ def _quantile(mean: Array, variance: Array, weight: Array, chance: float) -> Arr
     return np.asarray(0.5 * (low + high))
 
 
-#: Fewer units or drives do not show what is usual.
+#: Minimum number of units or drives for a test of outliers.
 FEWEST = 4
 
 
 @dataclass(frozen=True)
 class Outlier:
     """
-    A unit or drive that stands out.
+    An outlying unit or drive.
 
     Attributes
     ----------
     number : of the unit or drive
-    excess : by how much it differs from what the others predict, in the unit of the value
-    chance : that the farthest of as many would be as far off
+    excess : difference from the prediction by the others, in the unit of the value
+    chance : p-value of the largest difference of as many units or drives
 
     """
 
@@ -574,13 +576,13 @@ class Outlier:
 def outliers(observed: Observed, kind: str, level: float, pooled: Pooled | None = None
              ) -> list[Outlier]:
     """
-    Return the units or drives that stand out.
+    Return the outlying units or drives.
 
     Parameters
     ----------
     observed : one value over the logs of a type
     kind : `pooling.UNITS` or `pooling.DRIVES`
-    level : chance that any stands out where none does
+    level : probability of an outlier where there is none
     pooled : the value, where it is pooled already
 
     """
@@ -610,14 +612,14 @@ def outliers(observed: Observed, kind: str, level: float, pooled: Pooled | None 
 @dataclass(frozen=True)
 class Change:
     """
-    A unit that is another one from some date on.
+    A unit whose value changes at some date.
 
     Attributes
     ----------
     unit : its number
-    since : number of the first date on which it is another one
+    since : number of the first date after the change
     size : of the change, in the unit of the value
-    chance : that the largest of as many possible changes would be as large
+    chance : p-value of the largest of as many possible changes
 
     """
 
@@ -630,13 +632,13 @@ class Change:
 def changes(observed: Observed, date: Numbers, level: float, pooled: Pooled | None = None
             ) -> list[Change]:
     """
-    Return the units that change between dates, beyond how they repeat; the clearest change alone.
+    Return the most significant change of a unit between dates, beyond the scatter of power-ons.
 
     Parameters
     ----------
     observed : one value over the logs of a type
     date : number of the date of each log, in their order, or -1, shape (n,)
-    level : chance that any changes where none does
+    level : probability of a change where there is none
     pooled : the value, where it is pooled already
 
     """
@@ -656,7 +658,7 @@ def changes(observed: Observed, date: Numbers, level: float, pooled: Pooled | No
 
 
 def _last(pooled: Pooled) -> tuple[float, float]:
-    """Return the last fixed effect, and the chance that it is as far from zero."""
+    """Return the last fixed effect and its p-value."""
     row: Array = np.zeros((1, pooled.observed.fixed.shape[1]))
     row[0, -1] = 1.0
     wanted = pooled.wanted(fixed=row)

@@ -29,11 +29,11 @@ import numpy as np
 _SPREADS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
             (DRIVES, 'common to a drive'))
 _PER = {'age': 'year', 'temperature': 'K'}
-#: Rows from which on a table is scrolled inside the page and has a field to search.
+#: Tables with more rows are scrolled inside the page and have a search field.
 _LONG = 12
 _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')
-#: Sorts a table by the column that is clicked, and shows the rows that hold a text.
+#: Sorts a table by the clicked column, and shows the rows that contain a text.
 _SCRIPT = Markup("""<script>
 'use strict';
 for (const table of document.querySelectorAll('table.sortable')) {
@@ -80,7 +80,7 @@ def report(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> 
     Parameters
     ----------
     types : as `summary.summarized` returns them
-    records : of all logs, those too that are no evidence
+    records : of all logs, including excluded ones
 
     """
     used = sum(len(found.records) for found in types)
@@ -185,7 +185,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
 
 
 def _cell(text: str, key: float | None = None) -> Markup:
-    """Return a cell, and what it is sorted by."""
+    """Return a cell with its sort key."""
     return element('td', text, data_key=text if key is None else f'{key:.9g}')
 
 

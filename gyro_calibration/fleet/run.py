@@ -11,9 +11,9 @@
 """
 Many tasks on the processes of this machine, or on another executor of `concurrent.futures`.
 
-Only some tasks are handed out at a time, so that ten thousand take no more memory than ten. A
-worker that is killed takes the others of its pool with it: the tasks that were handed out are then
-done again one by one, the one that kills its worker again is reported, and the rest goes on.
+Two tasks for each worker are submitted at a time, so that the memory does not depend on the number
+of tasks. A worker that is killed breaks its pool: the submitted tasks are then repeated one by
+one, the one that kills its worker again is reported, and the others continue.
 
 """
 
@@ -40,26 +40,25 @@ from typing import Any, TypeVar
 Task = TypeVar('Task')
 Found = TypeVar('Found')
 _Work = Callable[[Task], Found]
-#: Tasks handed out for each worker.
+#: Tasks submitted for each worker.
 _AHEAD = 2
 
 
 class Lost(Exception):
-    """A task that has no result, for its worker was killed; the message says so."""
+    """A task has no result, since its worker was killed; the message states the reason."""
 
 
 @contextmanager
 def processes(workers: int, memory: float | None = None, preload: Sequence[str] = ()
               ) -> Iterator[Callable[[int], Executor]]:
     """
-    Give what makes executors of processes on this machine, and end all of them.
+    Give a function that makes executors of processes on this machine; shut all down at the end.
 
     Parameters
     ----------
-    workers : of an executor, at most
+    workers : largest number in an executor
     memory : bytes that a worker may allocate; None without a limit
-    preload : modules that are imported once, and not by each worker that takes the place of
-        another
+    preload : modules that are imported once, and not by each new worker
 
     """
     context = get_context('forkserver')
@@ -77,7 +76,7 @@ def processes(workers: int, memory: float | None = None, preload: Sequence[str] 
 
 
 def _begin(memory: float | None) -> None:
-    """Limit what a worker may allocate, and let it end where the program that began it ends."""
+    """Limit the memory of a worker, and end it when the program that started it ends."""
     parent = parent_process()
     assert parent is not None
     # the program holds the other end of this pipe, and SIGIO ends a process
@@ -93,16 +92,16 @@ def _begin(memory: float | None) -> None:
 @contextmanager
 def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
     """
-    Give what makes executors of a Dask cluster.
+    Give a function that makes executors of a Dask cluster.
 
     Raises
     ------
     ImportError : `distributed` is not installed
-    OSError, ValueError : no scheduler answers there, or it is no address
+    OSError, ValueError : no scheduler answers at the address, or it is no address
 
     """
     from distributed import Client
-    if '://' not in address:  # a client of no scheduler waits for it when it is deleted
+    if '://' not in address:  # a client without a scheduler blocks when it is deleted
         raise ValueError(f'{address} has no protocol')
     with Client(address, timeout='10s', set_as_default=False) as client:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
@@ -142,7 +141,7 @@ def finished(work: _Work[Task, Found], tasks: Iterable[Task], workers: int,
                 yield task, each.result()
             except BrokenExecutor:
                 suspects.append(task)
-            except Exception as error:  # of a cluster: it has seen workers die of it
+            except Exception as error:  # of a cluster whose workers were killed by the task
                 yield task, Lost(_killed(error))
         if suspects:
             executor.shutdown(wait=True, cancel_futures=True)
@@ -171,5 +170,5 @@ def _killed(error: Exception) -> str:
 
 
 def usual_workers() -> int:
-    """Return how many workers this machine has cores for."""
+    """Return the number of cores that this process may use."""
     return max(len(os.sched_getaffinity(0)), 1)

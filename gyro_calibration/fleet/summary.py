@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""From the records of logs to what is the type's, the unit's and the reference's."""
+"""From the records of logs to the errors of the type, the unit and the reference."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-#: Chance that a fleet in which nothing stands out, changes or is missing gives any alarm.
+#: Probability of an alarm in a fleet without outliers, changes and missing effects.
 FALSE_ALARMS = 0.01
 Record = Mapping[str, Any]
 
@@ -58,19 +58,19 @@ class Found:
     Attributes
     ----------
     name, unit : of the value, in SI
-    slow : whether it is an effect that one log cannot tell from the wander of the bias
+    slow : whether it is an effect that one log does not distinguish from the wander of the bias
     records : of the logs that hold it
     pooled : its variances
     mean : of the type
     units : of each, as the mean over power-ons
-    from_type : by how much each unit differs from the mean of the type
-    next_log : what a further power-on of each unit will have, without an error of the reference
-    new_unit : what one more unit of the type will have
-    drives : what the logs of each drive have in common, apart from type and unit
+    from_type : difference of each unit from the mean of the type
+    next_log : prediction for a further power-on of each unit, without an error of the reference
+    new_unit : prediction for one more unit of the type
+    drives : error common to the logs of each drive, apart from type and unit
     slopes : name -> drift of the type, over age in years or over temperature in K
-    unit_slopes : the same of each unit, where the logs show by how much units differ
-    chance : that the mean of the type is as far from zero by chance
-    outlying_units, outlying_drives, changed : what stands out
+    unit_slopes : the same of each unit, where the logs determine the difference between units
+    chance : p-value of the mean of the type against zero
+    outlying_units, outlying_drives, changed : outliers and changes
 
     """
 
@@ -101,7 +101,7 @@ class Found:
 @dataclass(frozen=True)
 class TypeFound:
     """
-    What is known of one type.
+    The results of one type.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class TypeFound:
     units, drives, dates : their names in the order of their numbers
     records : of the logs
     values : by name
-    level : chance of a false alarm of each kind and value
+    level : probability of a false alarm of each kind and value
 
     """
 
@@ -124,7 +124,7 @@ class TypeFound:
 
 def summarized(records: Sequence[Record]) -> list[TypeFound]:
     """
-    Return what is known of each type, by the records of logs that are evidence.
+    Return the results of each type, by the records of logs that are not excluded.
 
     Parameters
     ----------
@@ -134,8 +134,8 @@ def summarized(records: Sequence[Record]) -> list[TypeFound]:
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
     values = {kind: _names(logs[kind]) for kind in types}
-    # of a value a unit, a drive, a change, and an effect of the type; and of the effects of
-    # diagnoses the type's, a unit's and a drive's
+    # four tests of each value: outlying units, outlying drives, changes, effects of the type; and
+    # three of the effects of diagnoses: of the type, of a unit, of a drive
     tests = 4 * sum(map(len, values.values())) + 3 * len(types)
     return [_of_type(kind, logs[kind], values[kind], FALSE_ALARMS / tests) for kind in types]
 
@@ -228,14 +228,14 @@ def in_words(of: Interval, place: int, unit: str, name: str) -> str:
 
 
 def sentences(found: TypeFound) -> Iterator[str]:
-    """Say whose each value is, and what stands out."""
+    """Give the sentences on the origin of each value, its outliers and its changes."""
     for each in found.values.values():
         yield from _shares(found, each)
     slow = [each for each in found.values.values() if each.slow]
     if repeating := lacking(found):
         first, *others = repeating
-        also = (f'; {listed([spoken(each.name) for each in others], "or")} would look alike'
-                if others else '')
+        names = listed([spoken(each.name) for each in others], 'or')
+        also = f'; not distinguishable from {names}' if others else ''
         size = in_words(first.mean, 0, first.unit, first.name)
         yield (f'{spoken(first.name)}: it repeats in all units, so the model of the type lacks '
                f'it: {size}{also}')
@@ -246,15 +246,15 @@ def sentences(found: TypeFound) -> Iterator[str]:
 
 
 def _shares(found: TypeFound, each: Found) -> Iterator[str]:
-    """Give what a value owes to units, drives and power-ons, and which stand out."""
+    """Give the origin of a value: unit, drive or power-on; then outliers and changes."""
     if not each.slow:
         shares = {name: each.components[name] for name in (UNITS, DRIVES, POWER_ONS)
                   if name in each.components}
         owner = max(shares, key=lambda name: shares[name].estimate, default='')
-        whose = {UNITS: "is the unit's: most of it differs between units and repeats",
-                 DRIVES: "is the reference's or the vehicle's: most of it is common to the units "
-                 'of a drive, and differs between drives',
-                 POWER_ONS: 'differs most from one power-on to the next'}
+        whose = {UNITS: 'is an error of the unit: most of its variance is between units',
+                 DRIVES: 'is an error of the reference or the vehicle: most of its variance is '
+                 'between drives, and common to the units of a drive',
+                 POWER_ONS: 'is not repeatable: most of its variance is between power-ons'}
         if owner and shares[owner].low > 0.0:
             yield f'{spoken(each.name)} {whose[owner]}'
     for outlier in each.outlying_units:
@@ -272,7 +272,7 @@ def _shares(found: TypeFound, each: Found) -> Iterator[str]:
 
 
 def lacking(found: TypeFound) -> list[Found]:
-    """Return the slow effects that repeat in all units, the clearest first."""
+    """Return the slow effects that repeat in all units, the most significant first."""
     slow = [each for each in found.values.values() if each.slow and each.chance < found.level]
     return sorted(slow, key=lambda each: each.chance)
 
@@ -286,10 +286,10 @@ class Counted:
     ----------
     effect : its name
     logs, units, of : number of logs and of units that show it, and of logs that were diagnosed
-    owner : of it, 'type', 'unit' or 'drive'; '' where as many are no more than false names
+    owner : of it, 'type', 'unit' or 'drive'; '' where false alarms explain the number of logs
     name : of the unit or drive
-    chance : that so many logs show one effect by false names, times the units or drives that it
-        was chosen from
+    chance : p-value of the number of logs under false alarms only, times the number of units or
+        drives that it was chosen from
 
     """
 
@@ -304,11 +304,11 @@ class Counted:
 
 def counted(found: TypeFound) -> list[Counted]:
     """
-    Return whose the established effects of diagnoses are, by the numbers of logs that show them.
+    Assign the established effects of diagnoses by the numbers of logs that show them.
 
-    A diagnosis names some effect falsely at a rate that is stated. An effect is the type's where
-    it is in more logs than that explains even without the unit, and without the drive, that show
-    it most; else it is the unit's or the drive's whose own logs show it more often.
+    A diagnosis names a false effect at a stated rate. An effect is assigned to the type where more
+    logs show it than that rate explains, even without the unit, and without the drive, that show
+    it most; else to the unit or the drive whose own logs show it more often.
 
     """
     logs = [each for each in found.records if each['diagnosis']]
@@ -324,7 +324,7 @@ def counted(found: TypeFound) -> list[Counted]:
             own = {name: np.array([each[kind] == name for each in logs]) for name in groups}
             if len(groups) > 1:
                 rest.append(max(_by_chance(has[~of]) for of in own.values()))
-                # of one drive, or of one unit, it cannot be known whose it is
+                # logs of one drive, or of one unit, do not distinguish the two
                 owners += [(len(groups) * _by_chance(has[of]), kind, name)
                            for name, of in sorted(own.items())
                            if len({each[other] for each, one in zip(logs, of) if one}) > 1]
@@ -337,22 +337,22 @@ def counted(found: TypeFound) -> list[Counted]:
 
 
 def _by_chance(has: NDArray[np.bool_]) -> float:
-    """Return the chance that as many of some logs show one effect by false names."""
+    """Return the p-value of the number of logs with an effect under false alarms only."""
     return float(binom.sf(has.sum() - 1, len(has), Diagnosis.false_alarm_rate))
 
 
 def _of_count(each: Counted, units: int) -> str:
     of_type = ('the references of all drives have it' if each.effect.startswith('reference_')
                else 'the model of the type lacks it')
-    whose = {'type': of_type, '': 'no more logs than false names explain',
-             'unit': f"the unit's, {plain(each.name)}",
-             'drive': f"the drive's, {plain(each.name)}: its reference's, or the vehicle's"}
+    whose = {'type': of_type, '': 'within the rate of false alarms',
+             'unit': f'assigned to unit {plain(each.name)}',
+             'drive': f'assigned to drive {plain(each.name)}, its reference or its vehicle'}
     return (f'{spoken(each.effect)}: established in {each.logs} of {each.of} logs, of '
             f'{each.units} of {units} units: {whose[each.owner]}')
 
 
 def data(found: TypeFound) -> dict[str, Any]:
-    """Return what is known of a type as JSON can hold it."""
+    """Return the results of a type as JSON data."""
     return {'type': found.name, 'units': list(found.units), 'drives': list(found.drives),
             'logs': len(found.records), 'level': found.level,
             'values': {name: _value_data(found, each) for name, each in found.values.items()},
@@ -402,9 +402,9 @@ def models(found: TypeFound) -> Iterator[tuple[str, GyroModel]]:
     """
     Give for a further unit of a type, with the name '', and for each unit: name and model.
 
-    They hold the values that are usual, and as tolerance how far a power-on may be from them, so
-    that their interval of 95 % is that of the fleet. The compensation counts the tolerance until
-    there is a self-calibration; that takes it as its prior (`GyroModel.prior`).
+    They hold the mean values, and as tolerance the deviation of a power-on from them, so that
+    their interval of 95 % is that of the fleet. The compensation adds the tolerance until there is
+    a self-calibration, which uses it as its prior (`GyroModel.prior`).
 
     """
     yield '', _model(found, None)
@@ -422,7 +422,7 @@ def _model(found: TypeFound, unit: int | None) -> GyroModel:
         effect = CATALOGUE[name]
         of, place = (each.new_unit, 0) if unit is None else (each.next_log, unit)
         low, high = float(of.low[place]), float(of.high[place])
-        # of as wide a normal distribution
+        # of the normal distribution with this interval
         value, deviation = 0.5 * (high + low), 0.5 * (high - low) / NORMAL_95
         if effect.shapes or len(effect.parameters) > 1 or not math.isfinite(deviation):
             continue

@@ -29,11 +29,11 @@ from gyro_calibration.files import InputError, opened, plain, read_bytes
 from gyro_calibration.logs.ros_bag import metadata_of
 from gyro_calibration.model.settings_file import read_settings
 
-#: What is known of a log, apart from its path.
+#: Fields of a log in a table, in addition to its path.
 KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 LOGS = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
-#: Bytes of a table, and of the notes of a log, that are read.
+#: Largest numbers of bytes that are read of a table, and of the notes of a log.
 _MOST, _NOTES = 50_000_000, 4096
 #: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
 _KEYED = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)', re.IGNORECASE)
@@ -53,8 +53,8 @@ class Entry:
     log : its path
     unit : which gyro; '' where it is not known
     type : of the gyro; logs of one type are pooled
-    drive : what units that were moved together share, with its reference; '' where the log stands
-        alone
+    drive : name common to units that were moved together with one reference; '' for a log that is
+        a drive of its own
     date : ISO 8601, or ''
     temperature : degC; None where it is not known
 
@@ -68,7 +68,7 @@ class Entry:
     temperature: float | None = None
 
     def with_missing(self, stated: Mapping[str, str]) -> Entry:
-        """Return the entry with what it does not hold yet."""
+        """Return the entry with its empty fields filled."""
         new: dict[str, Any] = {name: plain(text.strip()) for name, text in stated.items()
                                if name in KEYS and text.strip()
                                and getattr(self, name) in ('', None)}
@@ -83,7 +83,7 @@ class Entry:
         return replace(self, **new)
 
     def merged(self, other: Entry) -> Entry:
-        """Return what two tables say of one log; raise `InputError` where they contradict."""
+        """Return the fields of one log by two tables; raise `InputError` where they differ."""
         new = {name: getattr(other, name) for name in KEYS
                if getattr(other, name) not in ('', None)}
         for name, value in new.items():
@@ -103,7 +103,7 @@ def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
     Parameters
     ----------
     paths : as a user gives them
-    without : a folder that is not searched, as that of the results
+    without : a folder that is not searched, such as that of the results
 
     Raises
     ------
@@ -124,7 +124,7 @@ def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
 
 
 def _of(path: str, visited: set[str]) -> Iterator[Entry]:
-    """Give the logs of what a user named; a folder that was visited before has none."""
+    """Give the logs of a path; a folder that was visited before has none."""
     if os.path.isdir(path):
         yield from _inside(Path(path), visited)
     elif not os.path.exists(path) and glob(path, recursive=True):
@@ -162,7 +162,7 @@ def _text(path: str) -> str:
 
 
 def _header(path: str) -> list[str]:
-    """Return the columns of a table of logs; none of another file, as of a log."""
+    """Return the columns of a table of logs; none of another file, such as a log."""
     try:
         with opened(path) as file:
             line = file.readline(_NOTES).decode('utf-8-sig', 'replace')
@@ -174,12 +174,12 @@ def _header(path: str) -> list[str]:
 
 
 def _separator(line: str) -> str:
-    """Return what separates values, as in a log: comma, semicolon or tab."""
+    """Return the separator of values, as in a log: comma, semicolon or tab."""
     return max(',;\t', key=line.count)
 
 
 def _resolved(path: str, log: str) -> str:
-    """Return the path of a log that a table names: from the folder of the table, or as it is."""
+    """Return the path of a log in a table: relative to the table, or to the working folder."""
     seen = Path(path).parent / log
     return str(seen) if seen.exists() or not Path(log).exists() else log
 
@@ -207,11 +207,11 @@ def _rows(path: str, columns: Sequence[str]) -> Iterator[Entry]:
 
 def pattern(text: str) -> re.Pattern[str]:
     """
-    Return what reads a file name such as ``rc_car_{drive}_unit{unit}``.
+    Return the regular expression of a file name such as ``rc_car_{drive}_unit{unit}``.
 
     Raises
     ------
-    ValueError : it names nothing, or what a log has not
+    ValueError : it names no field, or an unknown one
 
     """
     parts = re.split(r'\{(\w*)\}', text)
@@ -225,15 +225,14 @@ def pattern(text: str) -> re.Pattern[str]:
 
 def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
     """
-    Return an entry with what its file name, notes or metadata say in addition.
+    Return an entry with its empty fields filled from file name, notes or metadata.
 
-    What a table says counts first, then a pattern of the user's, then notes and metadata, then
-    names that are usual.
+    The order of precedence is: table, pattern of the user, notes and metadata, usual file names.
 
     Parameters
     ----------
     entry : with a log that exists
-    named : how a user's files are named, of `pattern`
+    named : pattern of the file names, by `pattern`
 
     """
     stem = re.sub(f'({"|".join(map(re.escape, sorted(LOGS, key=len, reverse=True)))})$', '',
@@ -244,7 +243,7 @@ def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
 
 
 def _usual(stem: str) -> dict[str, str]:
-    """Return what a file name says; what is left apart from unit and date names the drive."""
+    """Return the fields in a file name; the rest apart from unit and date is the drive."""
     stated, rest = {}, stem
     for name, shape in _NAMED.items():
         if found := shape.search(rest):
@@ -256,7 +255,7 @@ def _usual(stem: str) -> dict[str, str]:
 
 
 def _notes(path: str) -> dict[str, str]:
-    """Return what notes of a log, or metadata of a recording, say."""
+    """Return the fields in the notes of a log, or in the metadata of a recording."""
     if os.path.isdir(path):
         return {**_custom(Path(path)), **_of_recordings(sorted(Path(path).glob('*.mcap')))}
     if path.endswith('.mcap'):

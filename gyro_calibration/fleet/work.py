@@ -9,12 +9,12 @@
 # under the License.
 
 """
-What is done with one log of a fleet: calibrated, diagnosed, and kept as data.
+The work on one log of a fleet: calibration, diagnosis and its record.
 
-A single log cannot tell slow effects (a ramp, a warm-up, the temperature) from the wander of the
-bias. Each is fitted alone with scale factor error and bias, to the increments of the heading over
-spans, with the noise of `noise_grid`. Over many logs what repeats is an effect, and what does not
-is wander.
+A single log does not distinguish slow effects (a ramp, a warm-up, the temperature) from the wander
+of the bias. Each is fitted alone with scale factor error and bias, to the increments of the
+heading over spans, with the noise of `noise_grid`. An effect repeats over many logs, wander does
+not.
 
 """
 
@@ -53,9 +53,9 @@ from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: Spans a log, and the shortest, s.
+#: Number of spans in a log, and the shortest one, s.
 _SPANS, _SHORTEST = 60, 2.0
-#: A log that lasts for less, s, shows nothing slow.
+#: Shortest log for slow effects and for the bias at rest, s.
 _LEAST = 60.0
 
 
@@ -141,7 +141,7 @@ def _noise(time: Array, rate: Array, rest: bool) -> list[BandedNoise]:
 
 
 def _effects(log: Log, at: Array) -> dict[str, tuple[str, Array]]:
-    """Return what each effect of size one adds to the increments, with its unit."""
+    """Return the unit and the column of each effect in the increments."""
     assert log.time is not None
     since = at - log.time[0]
     middle = 0.5 * since[-1]
@@ -157,25 +157,25 @@ def _effects(log: Log, at: Array) -> dict[str, tuple[str, Array]]:
     return found
 
 
-#: A log that was calibrated, and one that is no evidence.
+#: Status of a log that was calibrated, and of one that is excluded.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
-#: Of the records; another one is not taken for this one.
+#: Schema of the records; records of another one are not read.
 SCHEMA = 'gyro_calibration/fleet_log/2'
 
 
 @dataclass(frozen=True)
 class Task:
     """
-    What is to be done with a log.
+    The work on a log, with its options.
 
     Attributes
     ----------
     entry : the log
     folder : of the results
     technology : of the gyros, one of `course_over_ground.PRIORS`
-    named : how files are named, of `table.pattern`
+    named : pattern of the file names, by `table.pattern`
     generator : for the diagnosis, the same for each log; None without a diagnosis
-    usual_type : of a log whose type is not stated
+    usual_type : of logs whose type is not stated
     rate : Hz, of the samples of logs without a usable time
 
     """
@@ -190,30 +190,30 @@ class Task:
 
     @property
     def name(self) -> str:
-        """Return the name of the log's files among the results, another for each path."""
+        """Return the name of the log's files among the results, which is unique for its path."""
         stem = re.sub(r'[^A-Za-z0-9_.-]', '_', Path(self.entry.log).name.partition('.')[0])
         path = os.path.abspath(self.entry.log).encode(errors='surrogateescape')
         return f'{stem[:60]}-{hashlib.sha256(path).hexdigest()[:8]}'
 
     @property
     def record(self) -> Path:
-        """Return the path of the record that is kept."""
+        """Return the path of the stored record."""
         return Path(self.folder) / 'logs' / f'{self.name}.json'
 
 
 def done(task: Task) -> dict[str, Any]:
     """
-    Return the record of a log, and keep it; one that was kept of the same content is taken.
+    Return the record of a log, and store it; a stored record of the same content is used again.
 
-    It is data that JSON can hold, and the same to the bit wherever it is computed. What a table
-    says of the log may change without that it is computed again.
+    It is JSON data, and equal to the bit on all machines. A change of unit, type or drive in a
+    table does not cause a new computation.
 
     Returns
     -------
     ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
-    ``content`` of the values in it; ``values`` has name -> value,
-    standard deviation and unit; ``slow`` the same of effects that a single log cannot tell from
-    the wander of the bias, each fitted alone; ``diagnosis`` a summary
+    ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
+    ``slow`` the same of effects that a single log does not distinguish from the wander of the
+    bias, each fitted alone; ``diagnosis`` a summary
 
     """
     try:
@@ -233,7 +233,7 @@ def done(task: Task) -> dict[str, Any]:
 
 
 def refused(entry: Entry, why: str) -> dict[str, Any]:
-    """Return the record of a log that is no evidence."""
+    """Return the record of an excluded log."""
     return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated(entry),
             'status': NO_EVIDENCE, 'reason': why}
 
@@ -251,7 +251,7 @@ def _why(error: Exception, path: str) -> str:
 
 
 def _key(task: Task, content: str) -> str:
-    """Return what is another where another record would be found."""
+    """Return a hash of all that the record depends on."""
     drawn = None if task.generator is None else task.generator.bit_generator.state
     about = [SCHEMA, __version__, task.technology, task.rate, task.entry.log, content, drawn]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
@@ -292,10 +292,10 @@ def _calibrated(task: Task) -> dict[str, Any]:
 def calibrate(log: Log, technology: str = 'mems'
               ) -> tuple[str, GyroModel, dict[str, dict[str, Any]]]:
     """
-    Return how a log was calibrated, its model, and values that a model does not hold.
+    Return the method of calibration of a log, its model, and values that a model does not hold.
 
-    A reference heading over time is taken as `calibrate_encoder` takes it, what rests shows the
-    bias alone, and anything else is taken for dwells.
+    A log in time with a reference heading is calibrated by `calibrate_encoder`, a log at rest
+    gives the bias only, and any other one is calibrated by dwells.
 
     Raises
     ------

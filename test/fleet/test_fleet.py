@@ -363,7 +363,8 @@ def records(ramp=0.0, wander=1.0):
 def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
     (found,) = summarized(records(ramp))
     told = '; '.join(sentences(found))
-    assert "bias is the unit's" in told and "time offset is the reference's" in told
+    assert 'bias is an error of the unit' in told
+    assert 'time offset is an error of the reference' in told
     assert said in told and 'differs from its type' not in told
     json.dumps(data(found), allow_nan=False)
 
