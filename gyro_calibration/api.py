@@ -9,7 +9,7 @@
 # under the License.
 
 """
-The public interface: what the verbs of the command line do, for a script or a notebook.
+The public interface: the functions of the command line for scripts and notebooks.
 
 All quantities are in SI: s, rad, rad/s; temperatures are in degC. Each function takes a `Log` and
 returns a record that prints its answer, as the verb of the same name does. Data that allow no
@@ -207,7 +207,7 @@ def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     ----------
     log : with time
     model : with an angle random walk in its noise, which `allan` finds
-    hindsight : let all that came later count too
+    hindsight : smooth the heading by all later samples
 
     Raises
     ------
@@ -237,7 +237,7 @@ class Run(_Answer):
     model : the given model with the new self-calibration
     scale_factor_error, bias : 1 and rad/s
     scale_factor_error_std, bias_std : 1 and rad/s
-    fit : all that was fitted, with the lag of the gyro and the goodness of the fit
+    fit : all results of the fit, with the delay of the gyro and the goodness of fit
 
     """
 
@@ -366,7 +366,8 @@ class NoiseFigures(_Answer):
     Attributes
     ----------
     chart : Allan deviations with their bounds
-    fit : the figures: angle random walk, bias instability, rate random walk, quantization, ramp
+    fit : the noise figures: angle random walk, bias instability, rate random walk, quantization,
+        ramp
 
     """
 
@@ -404,12 +405,12 @@ def allan(log: Log) -> NoiseFigures:
 @dataclass(frozen=True)
 class Diagnosed(_Answer):
     """
-    What a simulation with a model gets wrong of a log.
+    The error of a simulation against a log, and its causes.
 
     Attributes
     ----------
-    model : the extended model; the given one where nothing is offered
-    found : findings, gates, gain and all else, as in diagnosis.json
+    model : the extended model; the given one where no extension is offered
+    found : findings, gates, gain and all further results, as in diagnosis.json
 
     """
 
@@ -432,13 +433,13 @@ class Diagnosed(_Answer):
 def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
              kind: str | None = None) -> Diagnosed:
     """
-    Say what a simulation with a model gets wrong of logs, name the causes, extend the model.
+    Measure the error of a simulation against logs, name the causes, extend the model.
 
     Parameters
     ----------
     logs : of one gyro, each with a reference, or at rest; or a single rate table
     model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
-    seed : of what is drawn to learn what chance shows
+    seed : of the random draws of significance tests
     kind : of the reference: rate_command, encoder, motion_capture, course, odometry, gyro or rest;
         None takes what the log shows
 

@@ -9,20 +9,20 @@
 # under the License.
 
 """
-Published numbers of the sources of gyro_calibration beside ours, and contradictions in them.
+Published numbers of the sources of gyro_calibration, the numbers computed here, contradictions.
 
-This is evidence, not a part of the product: it uses gyro_calibration as any other program does,
-and only the verbs `reproduce` and `demo` use it.
+This package is evidence and no part of the product: it imports gyro_calibration as any other
+program does, and only the verbs `reproduce` and `demo` import it.
 
-One file a source; `finding` holds what they share. Published numbers are in the units of their
-source. Each has a function ``reproduce(generator, runs, progress)``: the source of the noise; the
-number of simulated drives or turntable runs, of which calibrations on a rate table are a
-twentieth; and a display of how many are done.
+There is one file for each source; `finding` holds the common records. Published numbers are in the
+units of their source. Each file has a function ``reproduce(generator, runs, progress)``: the
+generator of the noise; the number of simulated drives or turntable runs (a twentieth of it for
+calibrations on a rate table); and a display of the progress.
 
 """
 
 from gyro_calibration_reproduction import bot_thoughts, hong_park, ojeda_chung_borenstein
 
-#: In the order of their years.
+#: In order of publication.
 SOURCES = {'ojeda': ojeda_chung_borenstein.reproduce, 'hong_park': hong_park.reproduce,
            'bot_thoughts': bot_thoughts.reproduce}

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The results of a reproduction: published numbers beside ours, and contradictions."""
+"""The results of a reproduction: published and computed numbers, and contradictions."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from typing import Any
 @dataclass(frozen=True)
 class Comparison:
     """
-    One published number beside ours, both in the unit of the source.
+    A published number and the one computed here, both in the unit of the source.
 
     Attributes
     ----------
     quantity, unit : of both numbers
-    ours : the number that comes out here
-    published : as it is printed, since its last digit shows its accuracy; ``< 2`` is a bound,
-        ``~ 10`` an order of magnitude, '' means that the source has no such number
+    ours : the computed number
+    published : as printed, since its last digit shows its accuracy; ``< 2`` is a bound, ``~ 10``
+        an order of magnitude, '' means that the source has no such number
     place : in the source
-    uncertainty : of ours, from the finite number of runs
-    why : in a few words, why ours differs, if it does
+    uncertainty : of the computed number, from the finite number of runs
+    why : reason of a difference, in a few words, printed where there is one
     note : in a few words, printed in any case
-    own_figures : whether ours follows from other figures of the source alone, so that a difference
-        is a contradiction within it
+    own_figures : whether the computed number follows from other figures of the source alone, so
+        that a difference is a contradiction within it
 
     """
 
@@ -55,7 +55,7 @@ class Comparison:
 
     @property
     def agrees(self) -> bool:
-        """Return whether ours is the published number, within last digit and uncertainty."""
+        """Return whether both numbers agree within last digit and uncertainty."""
         if self.published.startswith('<'):
             return self.ours + self.uncertainty < self.value
         if self.published.startswith('~'):
@@ -85,7 +85,7 @@ class Comparison:
 
 
 def _rounded(ours: float, uncertainty: float, published: str) -> str:
-    """Return ours with two digits of its uncertainty, or with one digit more than is published."""
+    """Return a number with two digits of its uncertainty, or one digit more than published."""
     if uncertainty:
         digits = max(0, 1 - math.floor(math.log10(uncertainty)))
         return f'{ours:.{digits}f} +- {uncertainty:.{digits}f}'
@@ -101,7 +101,7 @@ def _decimals(number: str) -> int:
 
 def from_own_figures(quantity: str, unit: str, ours: float, published: str, place: str,
                      why: str = '', note: str = '') -> Comparison:
-    """Return a comparison of what a source prints with what follows from its other figures."""
+    """Return a comparison of a printed number with the one by other figures of its source."""
     return Comparison(quantity, unit, ours, published, place, why=why, note=note, own_figures=True)
 
 

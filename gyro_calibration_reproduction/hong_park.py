@@ -12,7 +12,7 @@
 Hong and Park (2008), heading of indoor mobile robots by a MEMS gyro.
 
 Source: "Minimal-drift heading measurement using a MEMS gyro for indoor mobile robots", Sensors 8.
-Published numbers are in their units; ours are computed in SI and converted.
+Published numbers are in their units; numbers here are computed in SI and converted.
 
 """
 
@@ -188,7 +188,7 @@ def _exchanged_columns() -> Contradiction:
                          '[{right_first:.4f}, {right_second:.4f}].')
 
 
-# what the figures of the gyro say
+# drift by the noise figures of the gyro
 
 def drift_in_half_an_hour() -> tuple[float, float]:
     """Return the drift in 30 min by bias instability and by angle random walk, deg."""
@@ -252,8 +252,8 @@ FILTERS = {'single samples': Threshold(THRESHOLD * DEGREE, 0.0),
 _FILTER = ('below the noise of a sample', 'the exact times of rest give no more',
            's and b act during turns')
 _OTHER = 'their error held more than s, b and noise'
-#: The methods of `drive_errors`: words, the row of table 1, its reduction of the error of pure
-#: integration, %, and why it differs here, where only s, b and noise are simulated.
+#: The methods of `drive_errors`: name, the row of table 1, its reduction of the error of pure
+#: integration, %, and the reason of the difference here, where only s, b and noise are simulated.
 METHODS = (
     ('pure integration', PURE, '', ''),
     ('self-calibration by eq. 7', CALIBRATED, '31', _OTHER),

@@ -12,7 +12,7 @@
 Ojeda, Chung and Borenstein (2000), rate-table calibration of fibre-optic gyros.
 
 Source: "Precision calibration of fiber-optics gyroscopes for mobile robot navigation", ICRA.
-Published numbers are in their units; ours are computed in SI and converted.
+Published numbers are in their units; numbers here are computed in SI and converted.
 
 """
 

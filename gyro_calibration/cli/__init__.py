@@ -9,13 +9,13 @@
 # under the License.
 
 """
-What the program can do: one file a verb.
+The command line: one file for each verb.
 
-Each has a function ``add`` that describes the verb to argparse, and a function from its arguments
-to an `Answer`. Units that people use are converted here.
+Each file has a function ``add`` that describes the verb to argparse, and a function from its
+arguments to an `Answer`. Units of the command line are converted to SI here.
 
 """
 
-#: Their files, in the order of the help. Only that of the verb that was called is imported.
+#: The files of the verbs, in the order of the help. Only that of the called verb is imported.
 VERBS = ('fit', 'compensate', 'self_calibrate', 'plan', 'allan', 'turn', 'diagnose', 'fleet',
          'simulate', 'export', 'emulate', 'record', 'reproduce', 'demo')

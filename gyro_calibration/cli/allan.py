@@ -33,7 +33,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 
-#: Symbol -> unit that people use, and how many of it are one in SI.
+#: Symbol -> usual unit, and the factor from SI to it.
 UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE),
          'K': ('deg/h/√h', 216000.0 / DEGREE), 'Q': ('arcsec', 3600.0 / DEGREE),
          'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
@@ -76,7 +76,7 @@ def _allan(given: argparse.Namespace) -> Answer:
 
 
 def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
-    """Return what was found, for people."""
+    """Return the noise figures as lines for people."""
     lost = int(np.isnan(record.rate).sum())
     return [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
             f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks,
@@ -97,7 +97,7 @@ def _line(symbol: str, figure: Figure) -> str:
 
 
 def names(fit: NoiseFit) -> dict[str, str]:
-    """Return what a chart calls the figures that are seen, by symbol."""
+    """Return the labels in a chart of the detected figures, by symbol."""
     return {symbol: f'{_words(figure)} {symbol} = {figure.value * UNITS[symbol][1]:.3g} '
             f'{UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value}
 

@@ -82,7 +82,7 @@ _WORDS = {
 
 @dataclass
 class _Found:
-    """Counts over the blocks so far; heading and deviation are the last ones, rad."""
+    """Counts over the blocks so far; heading and deviation of the last sample, rad."""
 
     rows: int = 0
     rows_without_output: int = 0
@@ -140,7 +140,7 @@ class Piece:
 
 def _compensated(given: argparse.Namespace, model: GyroModel,
                  found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
-    """Give the log block by block with its new columns, and count what is found in it."""
+    """Give the log block by block with its new columns, and update the counts."""
     for piece in _chosen(given, model):
         found.add(piece)
         yield piece.log, piece.rows()
@@ -189,9 +189,9 @@ def _pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold) -> Iter
     for log in logs:
         known = plausible(model, log)
         if variance is None:
-            # The noise of a rate depends on the interval between samples. All rates have the
-            # interval of the first block, since a lost sample makes no gyro less noisy. Rows
-            # without output may stand between samples.
+            # The noise of a rate depends on the interval between samples. That of the first block
+            # is used for all rates, since a lost sample does not reduce the noise of a gyro. Rows
+            # without output may lie between samples.
             variance = 0.0 if log.time is None else model.noise.rate_variance(float(np.median(
                 np.diff(log.time[known] if known.sum() > 1 else log.time))))
         yield Piece(
@@ -200,7 +200,7 @@ def _pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold) -> Iter
 
 
 def followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Iterator[Piece]:
-    """Give the whole log as one piece, followed as the node follows its samples."""
+    """Give the whole log as one piece, with heading and bias tracked as by the node."""
     yield from _checked(iter([_followed(log, model, hindsight, name)]), model, name)
 
 
@@ -232,9 +232,9 @@ def _followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Piece:
 
 def _begun(model: GyroModel, log: Log, keep: bool) -> tuple[HeadingEstimator, float]:
     """
-    Return what follows the log, and the date of time 0, s since 1970.
+    Return the estimator of the log, and the date of time 0, s since 1970.
 
-    Where stamps are no dates, the age of a calibration is unknown, and 0 is assumed.
+    Where stamps are no dates, the age of a calibration is unknown and assumed to be 0.
 
     """
     assert log.time is not None
@@ -272,14 +272,14 @@ def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockI
     return columns
 
 
-#: When samples were taken, where a model moves stamps, and the columns of these times, which are
-#: interpolated at the stamps of the rows.
+#: Column of the true times of samples, where a model moves stamps, and the columns at these times,
+#: which are interpolated to the stamps of the rows.
 _TRUE_TIME, _MOVED = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad',
                                    'rate_std_rad_s')
 
 
 def _on_stamps(pieces: Iterator[Piece]) -> Iterator[Piece]:
-    """Interpolate columns of moved stamps at the stamps of the rows, with neighbouring blocks."""
+    """Interpolate columns at true times to the stamps of the rows, with neighbouring blocks."""
     before: Piece | None = None
     here = next(pieces, None)
     while here is not None:
@@ -307,7 +307,7 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
         'heading', 'deviation', 'unknown', 'errors', 'first_error'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
     if heading is not None:
-        # A deviation of zero only shows that the model has neither noise nor covariance.
+        # The deviation is zero where the model has neither noise nor covariance.
         sure = deviation if deviation > 0.0 else None
         data.update(heading_rad=heading, heading_std_rad=sure)
         known = '' if sure is None else f' +- {sure / DEGREE:.2f}'

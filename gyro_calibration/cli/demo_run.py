@@ -56,7 +56,7 @@ from tqdm import tqdm
 PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
 INTERVAL = 0.01  # s between samples
-ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
+ACCELERATION = 3.0  # rad/s², limit of the robot's wheels
 ATTEMPTS = 3  # to calibrate
 DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20),
                (4, 0), (1, 0)])
@@ -69,17 +69,17 @@ class Refused(OSError):
 @dataclass
 class Robot:
     """
-    A robot that turns as commanded, within what its wheels can do, with the gyro of a model.
+    A robot that turns as commanded, within the acceleration limit, with the gyro of a model.
 
-    Where this process is held up, the samples come late, but the robot has turned meanwhile as it
-    was commanded by then. Each phase has its own noise, so that the noise of a seed does not
-    depend on when a phase begins.
+    Where this process is delayed, the samples are late, but the robot has turned meanwhile as
+    commanded. Each phase has its own noise, so that the noise of a seed does not depend on the
+    beginning of a phase.
 
     Attributes
     ----------
     noise : of each phase (start, each attempt to calibrate, drive), rad/s
     phase : number of the phase
-    commands : those to come into force, with the time when they came, s, and the rate, rad/s
+    commands : not yet applied, each with the time of its receipt, s, and the rate, rad/s
     truth : of each sample the time by the clock of this machine, s, and the true heading, rad
 
     """
@@ -169,7 +169,7 @@ class Client:
         return answer.result().message
 
     def is_ready(self) -> bool:
-        """Return whether gyro and heading come, and another node commands the robot."""
+        """Return whether gyro and heading are received and another node commands the robot."""
         return bool(self.raw and self.headings) and self._node.count_publishers('cmd_vel') > 1
 
     def turn(self, rate: float) -> None:
@@ -217,8 +217,8 @@ def run_demo(out: Path, seed: int) -> Answer:
     calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
                                           out.absolute() / 'gyro')
     calibration_file.unlink(missing_ok=True)
-    # The graph stays apart from the network of a robot and from other graphs on this machine; so
-    # it needs no rights in a secured one.
+    # The graph is separate from the network of a robot and from other graphs on this machine, so
+    # it needs no permissions in a secured one.
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     model = read_model(_share('config', 'xv3500.yaml'))
@@ -252,7 +252,7 @@ def _share(*parts: str) -> Path:
 
 
 def _perform(client: Client, robot: Robot) -> float:
-    """Calibrate and drive; return when the drive began, s."""
+    """Calibrate and drive; return the time at which the drive began, s."""
     total = round(CALIBRATION.duration + 4.0 + DRIVE.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
               disable=None) as bar:

@@ -68,7 +68,7 @@ def _diagnose(given: argparse.Namespace) -> Answer:
 def diagnosed(logs: Sequence[Log], model: GyroModel | None, seed: int, kind: str | None = None,
               names: Sequence[str] = (), on_progress: OnProgress = lambda share, words: None
               ) -> Diagnosis:
-    """Diagnose logs in time, or a rate table; a given model that is not extended stays itself."""
+    """Diagnose logs in time, or a rate table; a model that is not extended is unchanged."""
     table = any(log.time is None for log in logs)
     if table and len(logs) > 1:
         raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
@@ -82,7 +82,7 @@ def diagnosed(logs: Sequence[Log], model: GyroModel | None, seed: int, kind: str
 
 
 def write_diagnosis(folder: str | Path, found: Diagnosis) -> list[str]:
-    """Write all files; what they hold is made before the first of them is touched."""
+    """Write all files; their content is made before the first one is written."""
     content = {'diagnosis.json': json.dumps(found.figures(), indent=2, allow_nan=False) + '\n',
                'report.html': report(found), 'model.yaml': model_text(found.model)}
     for name in content:

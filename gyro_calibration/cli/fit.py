@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb fit: from logs with a reference to a model, and how good it is."""
+"""The verb fit: from logs with a reference to a model and its accuracy."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import POLYNOMIAL, write_model
 import numpy as np
 
-#: What people read instead of the unit of the file, and the factor to it.
+#: SI unit -> unit in tables for people, and the factor to it.
 _UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
           'rad/s/K²': ('deg/s/K²', 1 / DEGREE), 's/rad': ('s/deg', DEGREE),
           's²/rad²': ('s²/deg²', DEGREE ** 2)}
@@ -221,7 +221,7 @@ def _model_data(model: GyroModel) -> dict[str, Any]:
 
 
 def _dwell_data(selection: Selection) -> dict[str, Any]:
-    """Return how good a calibration from dwells is, and why it has these effects."""
+    """Return the accuracy of a calibration from dwells, and the reasons for its effects."""
     fit = selection.calibration
     table, scatter = fit.dwells, fit.scatter
     return {
@@ -252,10 +252,10 @@ def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
             'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
 
 
-# in words, in units that people use
+# lines for people, in their units
 
 def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
-    """Give what was fitted to dwells, how good it is, and why it has these effects."""
+    """Give the result of a fit to dwells, its accuracy, and the reasons for its effects."""
     fit = selection.calibration
     yield from (*_measured_lines(fit), '', *_value_lines(model), '', *_quality_lines(fit), '',
                 *_bin_lines(fit), *_choice_lines(selection))
@@ -263,7 +263,7 @@ def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
 
 def heading_lines(model: GyroModel, found: EncoderCalibration,
                   remarks: Iterable[str]) -> Iterator[str]:
-    """Give what was fitted to a heading, and the errors before and after."""
+    """Give the result of a fit to a heading, and the errors before and after."""
     yield from (*_value_lines(model), '')
     if math.isfinite(found.fit.time_offset):
         yield (f'Delay of the gyro behind the reference: {1000.0 * found.fit.time_offset:.1f} ms; '

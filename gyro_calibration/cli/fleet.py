@@ -160,7 +160,7 @@ def _lines(found: TypeFound) -> Iterator[str]:
 
 
 def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str, Any]]:
-    """Return the record of each log, in the order of the logs, whatever was finished first."""
+    """Return the record of each log, in the order of the logs."""
     found: dict[str, dict[str, Any]] = {}
     try:
         with (_executors(given) as (workers, create),
@@ -177,7 +177,7 @@ def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str,
 
 @contextmanager
 def _executors(given: argparse.Namespace) -> Iterator[Any]:
-    """Give the number of workers, and what makes executors of them."""
+    """Give the number of workers, and the function that makes executors of them."""
     workers = given.workers or usual_workers()
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
@@ -198,7 +198,7 @@ def _executors(given: argparse.Namespace) -> Iterator[Any]:
 
 
 def _usable(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return records in which what only the whole fleet shows to be no evidence is none."""
+    """Return the records, with those excluded whose fault only the whole fleet shows."""
     first: dict[str, str] = {}
     for each in sorted(records, key=lambda one: not one['unit']):
         first.setdefault(each['content'], each['log'])
@@ -220,5 +220,5 @@ def _usable(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _noise(record: dict[str, Any]) -> float:
-    """Return the angle random walk of a log at rest, where motion adds nothing to it; else 0."""
+    """Return the angle random walk of a log at rest; 0 for other logs, whose motion adds to it."""
     return record['noise']['angle_random_walk'] if record.get('method') == 'rest' else 0.0

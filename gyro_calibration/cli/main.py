@@ -23,8 +23,8 @@ from pathlib import Path
 import sys
 from typing import Any, NoReturn
 
-# The matrices of a fit are small; threads that wait for each other make it ten times slower on a
-# busy machine. NumPy reads the variable once.
+# The matrices of a fit are small; synchronization of threads makes it ten times slower on a busy
+# machine. NumPy reads the variable once.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser(words[0] if words else '').parse_args(words)
     try:
         for name, value in vars(given).items():
-            # as from a shell variable that is not set
+            # for example from a shell variable that is not set
             if value == '' or isinstance(value, list) and '' in value:
                 raise UsageError(f'{name.replace("_", "-")} is empty; give a value or omit it')
         for path in given.catalogue:
@@ -98,7 +98,7 @@ def _load_effects(path: str) -> None:
 
 
 def _numbers(value: Any) -> Any:
-    """Return what JSON can hold: null for what is not finite."""
+    """Return JSON data: numbers that are not finite become null."""
     if isinstance(value, dict):
         return {name: _numbers(each) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -107,7 +107,7 @@ def _numbers(value: Any) -> Any:
 
 
 def _show(text: str) -> None:
-    """Print; a closed pipe, as after `head`, or a file name that is not text is no error."""
+    """Print; a closed pipe, such as of `head`, or a file name that is not text is no error."""
     encoding = sys.stdout.encoding or 'utf-8'
     try:
         print(plain(text, kept='\n').encode(encoding, 'backslashreplace').decode(encoding),
@@ -131,7 +131,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser(called: str = '') -> argparse.ArgumentParser:
-    """Return the parser of the verb that is called, or of all where that is none."""
+    """Return the parser of the called verb, or of all verbs."""
     parser = _Parser(prog='gyro_calibration',
                      description='Calibrate, compensate and diagnose gyros with one axis.')
     parser.add_argument('--version', action='version', version=__version__)

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb plan: the motion that calibrates best within what a robot can do."""
+"""The verb plan: the motion that calibrates best within the limits of a robot."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _plan(given: argparse.Namespace) -> Answer:
 
 def read_limits(path: str) -> Ability:
     """
-    Read what a robot can do.
+    Read the limits of a robot.
 
     Raises
     ------

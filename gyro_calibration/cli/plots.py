@@ -12,8 +12,8 @@
 Pictures for people: PNG or SVG, units on the axes, readable in black and white.
 
 Each function returns its figure, and writes it where a path is given; the ending of the path,
-.png or .svg, says in which format. The line below a picture says what to see in it. Arrays are in
-SI, with one value a sample or dwell, shape (n,).
+.png or .svg, sets the format. The caption below a picture explains it. Arrays are in SI, with one
+value for each sample or dwell, shape (n,).
 
 """
 
@@ -37,7 +37,8 @@ import numpy as np
 
 #: Lines that are distinguished without colour.
 _STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
-#: Of values with a sign, symmetric about zero, and of others; both are read by the colour-blind.
+#: Colour maps of values with a sign, symmetric about zero, and of others; both are suitable for
+#: the colour-blind.
 _DIVERGING, _SEQUENTIAL = 'RdBu_r', 'cividis'
 
 
@@ -60,7 +61,7 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
 def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
                    after: Array, name: str = 'reference') -> Any:
     """
-    Draw the heading of a reference, rad, and that of a gyro, and what lies between them.
+    Draw the headings of a reference and of a gyro, rad, and their difference.
 
     `before` and `after` are the heading of the gyro less the reference, without calibration and
     with it.
@@ -144,7 +145,7 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
         # IEEE Std 952 reads angle random walk at 1 s; the others are named along their line
         at = (int(np.argmin(np.abs(along - 1.0))) if symbol == 'N'
               else len(along) * (1 if symbol in 'BQ' else 2) // 3)
-        # below what rises or lies close to the sum
+        # below lines that rise or are close to the sum
         axes.annotate(symbol, (along[at], up[at]),
                       xytext={'N': (-9, -16), 'K': (10, -14), 'R': (10, -14)}.get(symbol, (0, 6)),
                       textcoords='offset points', fontsize=13, weight='bold', ha='center')

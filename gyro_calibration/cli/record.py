@@ -51,8 +51,8 @@ _Recorder = CsvRecorder | McapRecorder
 
 _TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _INCREMENTS = {'always': True, 'never': False, 'default': None}
-_LARGEST_BAUD = 4_000_000  # bit/s; no line of Linux is faster
-_PATIENCE = 5.0  # s; without a message, until topics without a publisher are named
+_LARGEST_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
+_PATIENCE = 5.0  # s; after which topics without a publisher are named
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -144,9 +144,9 @@ def _prints_on_standard_error() -> Iterator[None]:
 
 
 class _Session:
-    """The common part of both ways to record: the file, its pieces, the progress, the answer."""
+    """The common part of recordings from port and topics: file, pieces, progress, answer."""
 
-    #: The remedy where no sample came.
+    #: The remedy where no sample was received.
     remedy = ''
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
@@ -158,17 +158,17 @@ class _Session:
 
     @property
     def samples(self) -> int:
-        """How many samples of the gyro came."""
+        """Number of samples received from the gyro."""
         raise NotImplementedError
 
     @property
     def lost(self) -> int:
-        """How many are known to be lost."""
+        """Number of samples known to be lost."""
         raise NotImplementedError
 
     @property
     def _path(self) -> str:
-        """The file that grows."""
+        """Path of the file that is being written."""
         return str(self._given.out)
 
     def _open(self) -> _Recorder:
@@ -186,7 +186,7 @@ class _Session:
                              'give a new name') from None
 
     def run(self) -> None:
-        """Record until it is to end, and close the file whatever happens."""
+        """Record until the end, and close the file also after an error."""
         try:
             with tqdm(desc=plain(self._given.out), unit=' samples', leave=False,
                       disable=None) as shown:
@@ -236,7 +236,7 @@ class _Session:
 
 
 class _PortSession(_Session):
-    """Records what comes on a port."""
+    """Records samples from a port."""
 
     remedy = 'check the port, the power and the wires of the gyro'
 
@@ -258,7 +258,7 @@ class _PortSession(_Session):
         except ValueError as error:
             raise UsageError(str(error)) from None
         self._last_message = ''
-        # Fixed at the beginning: the stamps must not jump when the clock is set.
+        # Constant, so that the stamps do not jump when the clock is set.
         self._since = time.time_ns() - round(steady() * NSEC_PER_SEC)
         super().__init__(given, stop)
 
@@ -300,7 +300,7 @@ class _PortSession(_Session):
 
     def _report(self, state: State) -> None:
         if state.name == 'failed':
-            self._recorder.flush()  # there is no piece in a silence
+            self._recorder.flush()  # without samples no piece is written
         message = state.problem or state.name
         if (state.name == 'opening' or message == self._last_message
                 or state.name == 'listening' and self._last_message):
@@ -331,7 +331,7 @@ class _PortSession(_Session):
 
 
 class _TopicSession(_Session):
-    """Records what comes on topics."""
+    """Records messages from topics."""
 
     remedy = ('check that a driver publishes, and that ROS_DOMAIN_ID and '
               'ROS_AUTOMATIC_DISCOVERY_RANGE agree')
@@ -379,11 +379,11 @@ class _TopicSession(_Session):
         return self._intervals.lost
 
     def _open(self) -> _Recorder:
-        """Open a recording, of which a log is made at the end."""
+        """Open a recording, from which a log is written at the end."""
         def notes() -> dict[str, str]:
             return about(topics='everything' if self._given.all else ', '.join(self._topics))
         if not self._is_mcap:
-            self._create(self._given.out, notes)  # to see whether it can be
+            self._create(self._given.out, notes)  # fails now where the log cannot be written
         return self._create(self._path, notes)
 
     @property
@@ -391,7 +391,7 @@ class _TopicSession(_Session):
         return self._given.out if self._is_mcap else f'{self._given.out}.mcap'
 
     def run(self) -> None:
-        """Record, and write the log that was asked for; without it the recording remains."""
+        """Record, and write the log; the recording is kept where that fails."""
         super().run()
         if self._is_mcap or self._full:
             return

@@ -41,7 +41,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _reproduce(given: argparse.Namespace) -> Answer:
-    """Give every source its own generator, so that its numbers do not depend on the others."""
+    """Reproduce each source with a generator of its own, independent of the other sources."""
     names = [given.source] if given.source else list(SOURCES)
     with under_way(names[0]) as on_progress:
         found = {name: SOURCES[name](np.random.default_rng(given.seed),
@@ -52,7 +52,7 @@ def _reproduce(given: argparse.Namespace) -> Answer:
 
 
 def _counted(name: str, on_progress: Callable[[float | None, str], None]) -> Progress:
-    """Return what reports the runs of each simulation of a source, which it numbers."""
+    """Return a function that numbers the simulations of a source and reports their runs."""
     number = count(1)
 
     def runs(items: Iterable[Any]) -> Iterator[Any]:

@@ -47,7 +47,7 @@ from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import Motion, motion_of, read_motion
 import numpy as np
 
-#: What --turns takes for a count that the gyro itself is to find.
+#: Value of --turns for the number of turns that is nearest to the angle of the gyro.
 _NEAREST = 'nearest'
 
 
@@ -228,7 +228,7 @@ def recorded(fit: Fit, method: str, log: Log, used: Mask) -> SelfCalibration:
 
 
 def _figures(fit: Fit, check: RestCheck | None) -> dict[str, Any]:
-    """Return what else the fit found, in SI; nan for what is not known."""
+    """Return further results of the fit, in SI; nan where they are not known."""
     good = fit.goodness
     return {'time_offset_s': fit.time_offset,
             'time_offset_standard_deviation_s': fit.time_offset_deviation,

@@ -25,7 +25,7 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import motion_by_name, NAMED, simulate
 import numpy as np
 
-#: Samples of a simulation, which takes 100 bytes for each.
+#: Largest number of samples of a simulation, which needs 100 bytes for each.
 MOST = 20_000_000
 
 

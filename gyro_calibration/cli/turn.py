@@ -70,7 +70,7 @@ def _turn(given: argparse.Namespace) -> Answer:
         raise UsageError('--technology selects effects, and --model has its own; give one of '
                          'the two')
     log = verb.read(given)
-    verb.output_of(given, log)  # counts alone are wrong use here, as for other verbs
+    verb.output_of(given, log)  # a log with counts only is wrong use, as for other verbs
     found = dwells(log)
     with under_way('fit of effects, and errors of turns'):
         rate, kept, remarks, data = (_fitted(found, given.technology) if given.model is None else
@@ -142,7 +142,7 @@ def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
     speed = np.abs(errors.rate)
     steps = DEGREE * np.array([factor * 10.0 ** power
                                for power in range(-3, 5) for factor in (1, 2, 5)])
-    # A step just below the fastest turn would make a bin of next to nothing.
+    # A step just below the fastest turn would make a nearly empty bin.
     edges = np.concatenate([
         [slowest], steps[(steps > 1.01 * slowest) & (steps < speed.max() / 1.2)], [speed.max()]])
     number = _numbers(edges, speed)

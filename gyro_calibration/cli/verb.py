@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What the verbs share: answers, options for logs, errors of usage, progress on a terminal."""
+"""Common parts of the verbs: answers, options for logs, errors of usage, progress bars."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ from gyro_calibration.logs.ros_bag import files_of, is_recording
 from gyro_calibration.model.gyro_model import GyroModel
 from tqdm import tqdm
 
-#: Nothing is shown of what takes less, s.
+#: Time before progress is shown, s.
 DELAY = 2.0
 
 
 @contextmanager
 def under_way(words: str) -> Iterator[Callable[[float | None, str], None]]:
-    """Show what is done, its share where it is known, and the time it takes, from 2 s on."""
+    """Show the present step, its fraction where it is known, and the elapsed time after 2 s."""
     begin, state = time.monotonic(), [f'{words} ...']
 
     def on_progress(share: float | None, words: str) -> None:
@@ -83,7 +83,7 @@ def under_way(words: str) -> Iterator[Callable[[float | None, str], None]]:
 
 @contextmanager
 def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
-    """Show on a terminal how many bytes of a log are read, and give the function that counts."""
+    """Show a bar of the bytes read of a log, and give the function that updates it."""
     size = sum(os.path.getsize(file) for file in files_of(path) if os.path.isfile(file)) or None
     with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=DELAY, leave=False,
               disable=None) as shown:
@@ -91,7 +91,7 @@ def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
 
 
 class UsageError(InputError):
-    """The program was called in a way that cannot work; the message is one sentence."""
+    """Wrong use of the program; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Answer:
 
 
 def wrapped(text: str, indent: int = 0) -> str:
-    """Return a line for people with 120 characters at most, and then others."""
+    """Return a text wrapped to lines of at most 120 characters."""
     return textwrap.fill(text, 120, subsequent_indent=' ' * indent, break_long_words=False,
                          break_on_hyphens=False)
 
@@ -213,7 +213,7 @@ def whole(text: str) -> int:
 
 
 def _picture_file(text: str) -> str:
-    """Return the name of a picture to draw, if one can be drawn."""
+    """Return the name of a picture file, if its format and matplotlib are available."""
     if not text.endswith(('.png', '.svg')):
         raise argparse.ArgumentTypeError(f'{text} is no picture file; give a name that ends in '
                                          '.png or .svg')
@@ -224,7 +224,7 @@ def _picture_file(text: str) -> str:
 
 
 def read(given: argparse.Namespace) -> Log:
-    """Read the log that a verb was given, as its options say."""
+    """Read the log of a verb by its options."""
     with _bytes_of(given.log) as on_progress:
         if is_recording(given.log):
             topics = Topics(given.topic, given.reference_topic, given.temperature_topic,
@@ -250,7 +250,7 @@ def read_each(given: argparse.Namespace) -> Iterator[Log]:
 
 
 def _inside(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
-    """Give logs without what lies outside of --from and --to; at least one has samples."""
+    """Give the parts of logs between --from and --to; at least one has samples."""
     if given.begin <= 0.0 and given.end == math.inf:
         yield from logs
         return
@@ -282,12 +282,12 @@ def origin_of(paths: Iterable[str]) -> dict[str, Any]:
 
 
 def with_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
-    """Return the model of --model as it is, or else the new one with the log as its origin."""
+    """Return a model of --model unchanged, or a new one with the log as its origin."""
     return model if given.model else replace(model, origin=origin_of([given.log]))
 
 
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the log that a verb was given block by block, with a bar that shows how far it is."""
+    """Read the log of a verb block by block, with a progress bar."""
     if is_recording(given.log) or given.unwrap:
         yield from blocks_of(read(given))
         return
