@@ -160,7 +160,6 @@ class GridFit:
         columns of flat prior
     residual : observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
     shared : estimates of u at the likeliest point, shape (q,)
-    shared_covariance : of u at the likeliest point, shape (q, q)
     influence : what the error of each observation adds to the values at the likeliest point, shape
         (n, m); sums over stretches of a log give a covariance that does not rely on the noise
         model
@@ -176,7 +175,6 @@ class GridFit:
     evidence: float
     residual: Array
     shared: Array
-    shared_covariance: Array
     influence: Array
     unseen: float
     _noise: Tridiagonal
@@ -532,7 +530,6 @@ def _averaged(
         ),
         residual,
         all_values[count:],
-        inverse[count:, count:],
         influence,
         unseen,
         noise,

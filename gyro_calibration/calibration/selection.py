@@ -140,7 +140,7 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     best = with_slopes(best)
     if technology is None:
         best, confounders = decided(best, None, SINE_RESPONSE)
-    tried = _tried(best.effects)
+    tried = len(STEADY) - sum(effect in best.effects for effect in (BIAS, SCALE_FACTOR_ERROR))
     choices = tuple(_choice(best, effect, tried, confounders) for effect in STEADY.values())
     return Selection(best, choices, confounders)
 
@@ -166,11 +166,6 @@ def with_slopes(fit: Calibration) -> Calibration:
         if wider is not None and wider.freedom and wider.deviation_of(slope) < usual:
             fit = wider
     return fit
-
-
-def _tried(effects: Sequence[Effect]) -> int:
-    """Return how many effects were tried apart from those that belong to every model."""
-    return len(STEADY) - sum(effect in effects for effect in (BIAS, SCALE_FACTOR_ERROR))
 
 
 def _base(dwells: Dwells, scatter: Scatter) -> Calibration:
@@ -333,9 +328,13 @@ def _choice(fit: Calibration, effect: Effect, tried: int,
     except DataRefused as error:
         return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
-    limit = FALSE_ALARM_RATE / tried
-    reason = (_reason(taken, _supported(smaller, larger, limit)) if larger.freedom
-              else 'as many values as dwells: no significance can be stated; add dwells')
+    reason = 'no better than chance'
+    if not larger.freedom:
+        reason = 'as many values as dwells: no significance can be stated; add dwells'
+    elif taken:
+        reason = ('predicts left-out sweeps better'
+                  if _supported(smaller, larger, FALSE_ALARM_RATE / tried)
+                  else 'belongs to every model')
     return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
                   larger.chance_of(effect), reason)
 
@@ -343,9 +342,3 @@ def _choice(fit: Calibration, effect: Effect, tried: int,
 def swapped_effects(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
     """Return the effects with another one in place of one of them."""
     return tuple(other if each is taken else each for each in effects)
-
-
-def _reason(taken: bool, supported: bool) -> str:
-    if taken:
-        return 'predicts left-out sweeps better' if supported else 'belongs to every model'
-    return 'no better than chance'

@@ -19,12 +19,12 @@ only, and with a model and then the bias that remains at rest.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.calibration.rate_table import Calibration, fit_effects
+from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.calibration.self_calibration import refuse_scale
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 from gyro_calibration.model.compensation import compensate
@@ -91,24 +91,18 @@ def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnEr
                           'faster and has a rate by the model; '
                           'record faster turns, or several sweeps')
     turns = take(dwells, wanted)
-    _refuse_other_way(turns)
+    scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
+    refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
     rests, remark = _rests(dwells)
     nearest = [_nearest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()]
     # eq. 1 and 2, and eq. 13, 15 and 16
     static, modelled = (_turned(dwells, error, wanted, nearest)
                         for error in (dwells.output - dwells.rate, rate - dwells.rate))
-    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place,
-                      (remark, *_unknown(lost)))
-
-
-def _refuse_other_way(turns: Dwells) -> None:
-    scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
-    refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
-
-
-def _unknown(lost: int) -> Iterator[str]:
+    remarks = [remark]
     if lost:
-        yield f'{lost} turns are left out: the other sweeps do not determine the model'
+        remarks.append(f'{lost} turns are left out: the other sweeps do not determine the model')
+    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place,
+                      tuple(remarks))
 
 
 def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) -> Array:
@@ -214,4 +208,4 @@ class Size:
 
 def size(errors: Array) -> Size:
     """Return how large some errors are, shape (n,) with n above 0."""
-    return Size(float(np.sqrt(np.mean(errors ** 2))), float(np.abs(errors).max()), len(errors))
+    return Size(rms(errors), float(np.abs(errors).max()), len(errors))

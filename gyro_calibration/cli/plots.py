@@ -27,6 +27,7 @@ from typing import Any
 from gyro_calibration.allan import AllanChart, NoiseFit
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration
+from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.calibration.turn_error import TurnErrors
 from gyro_calibration.files import replacing
 from gyro_calibration.heading.integration import integrate
@@ -77,7 +78,7 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
         axes.plot(time, error / DEGREE, color='black', linewidth=1)
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set(ylabel='difference [deg]',
-                 title=f'Gyro {when}, less the {name}: rms {_rms(error):.3g} deg')
+                 title=f'Gyro {when}, less the {name}: rms {rms(error) / DEGREE:.3g} deg')
     below.set_xlabel('time [s]')
     return _save(figure, path, 'The lower panels show the difference about its mean, each on its '
                  'own scale. A slope is bias; what follows the turns is scale factor error; an '
@@ -233,7 +234,7 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
         columns.append((dwells.temperature, 'temperature [°C]', rate, 'rate [deg/s]'))
     rows = [(dwells.output - dwells.rate, 'output less rate [deg/s]', 'Before', ''),
             (calibration.residual, 'residual [deg/s]', 'After',
-             f', left-out sweeps {_rms(calibration.left_out[kept]):.3g} deg/s')]
+             f', left-out sweeps {rms(calibration.left_out[kept]) / DEGREE:.3g} deg/s')]
     figure, panels = _panels(2, len(columns), (5.5 * len(columns) + 0.5, 8))
     for column, (across, label, shade, shade_label) in enumerate(columns):
         for row, (error, name, when, more) in enumerate(rows):
@@ -241,16 +242,12 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
             dots = _draw_errors(axes, across, error / DEGREE, kept, shade,
                                 _DIVERGING if shade is rate else _SEQUENTIAL)
             axes.set(xlabel=label, ylabel=name,
-                     title=f'{when}: rms {_rms(error[kept]):.3g} deg/s' + more)
+                     title=f'{when}: rms {rms(error[kept]) / DEGREE:.3g} deg/s' + more)
         if shade is not None:
             figure.colorbar(dots, ax=panels[:, column], label=shade_label, location='bottom',
                             aspect=40, shrink=0.9)
     return _save(figure, path, 'Below: dots without a shape and without bands of one colour are '
                  'noise; a curve or a band is an effect that the model lacks.')
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values ** 2))) / DEGREE
 
 
 def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Array | None,

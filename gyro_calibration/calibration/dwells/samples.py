@@ -65,8 +65,11 @@ def usable(log: Log) -> tuple[Samples, list[str]]:
     rate, heading, temperature = (
         None if values is None else values[good]
         for values in (log.reference_rate, log.reference_heading, log.temperature))
+    places = [f'{time[run.start]:.2f} s' for run in runs(lost)]
+    remark = (f'the reference was lost {times(len(places))}, for {lost.sum()} samples, '
+              f'at {listed(places)}; they are left out')
     return (Samples(time[good], output[good], rate, heading, temperature),
-            list(_lost_reference(time, lost)))
+            [remark] if places else [])
 
 
 def where_lost(known: Mask) -> Mask:
@@ -93,13 +96,6 @@ def output_of(log: Log) -> Array:
         raise DataRefused('the log holds no gyro output in rad/s; with gyro_counts alone, say how '
                           'many deg/s a count is')
     return log.output
-
-
-def _lost_reference(time: Array, lost: Mask) -> Iterator[str]:
-    places = [f'{time[run.start]:.2f} s' for run in runs(lost)]
-    if places:
-        yield (f'the reference was lost {times(len(places))}, for {lost.sum()} samples, '
-               f'at {listed(places)}; they are left out')
 
 
 def missing(log: Log, samples: Samples, dwells: Sequence[Numbers]) -> Iterator[str]:

@@ -85,7 +85,11 @@ def find_stretches(log: Log, limits: Steadiness) -> Stretches:
         found = found if found.duration > 0.9 * other.duration else other
     if found.share < limits.share:
         raise DataRefused(_not_steady(found, limits))
-    return found._replace(remarks=(*found.remarks, *_little(found.share)))
+    if found.share > 0.25:
+        return found
+    return found._replace(remarks=(
+        *found.remarks, f'only {100.0 * found.share:.0f} % of the time is in dwells; --method '
+        'likelihood uses all of it, where there is a heading'))
 
 
 def _known(reference: Array | None) -> bool:
@@ -99,12 +103,6 @@ def _not_steady(found: Stretches, limits: Steadiness) -> str:
             f'{limits.duration:g} s at a time without the settling, in '
             f'{100.0 * found.share:.0f} % of the log; hold each rate for longer, or use the '
             'heading itself with --method likelihood')
-
-
-def _little(share: float) -> Iterator[str]:
-    if share <= 0.25:
-        yield (f'only {100.0 * share:.0f} % of the time is in dwells; --method likelihood uses '
-               'all of it, where there is a heading')
 
 
 def _found(log: Log, limits: Steadiness) -> Stretches:
@@ -124,8 +122,10 @@ def _found(log: Log, limits: Steadiness) -> Stretches:
     whole, divided = _divided(samples, whole, limits)
     rows = [part for part in whole
             if len(part) >= FEWEST and duration(samples.time, part) >= limits.duration]
-    short = _short(len(whole) - len(rows), limits.duration)
-    return Stretches(samples, rows, (*lost, *short, cut, *divided,
+    if short := len(whole) - len(rows):
+        lost.append(f'steady stretches shorter than {limits.duration:g} s without the settling, '
+                    f'left out: {short}')
+    return Stretches(samples, rows, (*lost, cut, *divided,
                                      *_left_out(samples, rows, outlying, repeated),
                                      *missing(log, samples, rows)))
 
@@ -185,8 +185,3 @@ def _pieces(time: Array, temperature: Array, limits: Steadiness) -> int:
     change = float(np.ptp([part.mean() for part in np.array_split(temperature, _PARTS)]))
     return max(1, min(math.ceil(change / limits.temperature),
                       int((time[-1] - time[0]) / limits.duration)))
-
-
-def _short(number: int, least: float) -> Iterator[str]:
-    if number:
-        yield f'steady stretches shorter than {least:g} s without the settling, left out: {number}'

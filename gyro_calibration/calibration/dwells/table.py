@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from gyro_calibration.calibration.dwells.averaging import averaged
@@ -132,12 +132,14 @@ def from_table(log: Log) -> Dwells:
     if not good.any():
         raise DataRefused(f'none of the {len(output)} rows holds both a gyro output and '
                           'a reference rate; check the columns')
-    rows = np.flatnonzero(good)
+    rows, lost = np.flatnonzero(good), np.flatnonzero(~good) + 1
+    remark = (f'{len(lost)} rows without output or reference are left out: '
+              f'{listed([str(row) for row in lost])}')
     rate, names = log.reference_rate[rows], log.others.get('sweep')
     sweep = sweeps(rate) if names is None else numbered([names[row] for row in rows])
     return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows],
                   _told_deviation(log)[rows], sweep, tuple(f'row {row + 1}' for row in rows),
-                  tuple(_lost_rows(good)), tuple(np.split(rows, len(rows))))
+                  (remark,) if len(lost) else (), tuple(np.split(rows, len(rows))))
 
 
 def _told_deviation(log: Log) -> Array:
@@ -150,13 +152,6 @@ def _told_deviation(log: Log) -> Array:
         raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
                           'or nan where it is not known') from None
     return np.where(values > 0.0, values, np.nan)
-
-
-def _lost_rows(good: Mask) -> Iterator[str]:
-    lost = np.flatnonzero(~good) + 1
-    if len(lost):
-        yield (f'{len(lost)} rows without output or reference are left out: '
-               f'{listed([str(row) for row in lost])}')
 
 
 def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
