@@ -29,19 +29,19 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 each_source = pytest.mark.parametrize('source', SOURCES)
-#: One source; the others, which take some seconds, as evidence.
+#: One source; the others, which take some seconds, are run as evidence.
 one_source = pytest.mark.parametrize('source', [
     pytest.param(source, marks=[] if source == 'ojeda' else pytest.mark.evidence)
     for source in SOURCES])
 
 
-#: Of the drives; the verb and the documents have 200, which takes half a minute.
+#: Number of simulated drives; the verb and the documents use 200, which takes half a minute.
 FEW, MANY = 25, 200
 
 
 @cache
 def reproduced(source, runs=FEW):
-    """Return what the verb shows of a source."""
+    """Return the output of the verb for a source."""
     return SOURCES[source](np.random.default_rng(0), runs)
 
 

@@ -21,7 +21,7 @@ import pytest
 @pytest.mark.parametrize('sine', [True, False], ids=['open-loop', 'MEMS'])
 @pytest.mark.parametrize('gyros', [4, pytest.param(40, marks=pytest.mark.evidence)])
 def test_the_stated_deviation_is_that_of_another_campaign(sine, gyros):
-    """With 12 sweeps of a gyro that hang together, the scatter of z² is that of few numbers."""
+    """The 12 sweeps of a gyro are correlated, so z² scatters as that of a few numbers."""
     errors, z, peers = [], [], []
     for seed in range(100, 100 + gyros):
         cool, hot = (simulated(np.random.default_rng(seed), sine, each) for each in (False, True))

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Calibration against a course over ground: late, smoothed, lost, and at times far off."""
+"""Calibration against a course over ground: late, smoothed, lost, and with bursts of errors."""
 
 from dataclasses import replace
 import math
@@ -22,7 +22,7 @@ SCALE, BIAS = 1.01, 0.4 * DEGREE
 
 
 def drive(seed, late=0.5, turning=30.0, follows=1.0, burst=0.0):
-    """Return 3 min at 50 Hz of turns at random, with a course that is late and lost for 20 s."""
+    """Return 3 min at 50 Hz of random turns, with a course that is late, and lost for 20 s."""
     generator = np.random.default_rng(seed)
     time = np.arange(9000) / 50.0
     knots = np.arange(0.0, 185.0, 3.0)

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Dwells: what a rate table's file holds, and what is found in a log, on simulated truth."""
+"""Dwells: from the file of a rate table, and found in simulated and recorded logs."""
 
 from dataclasses import replace
 import math
@@ -343,7 +343,7 @@ def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
 
 def test_variances_that_differ_by_chance_become_one(generator):
     found = [moderated(generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)]
-    # Alone, each would err by 43 %.
+    # Without shrinkage, each would have an error of 43 %.
     assert np.sqrt(np.mean((np.array(found) - 1.0) ** 2)) < 0.15
     assert np.mean(found) == pytest.approx(1.0, abs=0.02)
 

@@ -221,7 +221,7 @@ def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says
     assert 'no time offset' in by_rate.remarks[1]
 
 
-#: Which way round the gyro was; what the encoder's own scale makes of s is not known to 0.2 %.
+#: Orientation of the gyro; the scale of the encoder, and so s, is known to 0.2 % only.
 MEASURED = {'yaw_slow': (-1.0, 0.006), 'yaw_fast': (-1.0, 0.006), 'pitch_slow': (1.0, -0.0149)}
 
 
@@ -275,7 +275,7 @@ def shaken(bias, generator):
 
 
 def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
-    """Least squares is off by 0.15 deg/s on such logs, five times more than nothing."""
+    """The error of least squares is 0.15 deg/s on such logs, five times that of no correction."""
     errors, refused = [], 0
     for seed in range(20):
         generator = np.random.default_rng(seed)

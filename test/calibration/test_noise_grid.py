@@ -107,7 +107,7 @@ def test_a_size_far_from_the_points_of_the_first_grid_is_found():
 
 
 def test_noise_of_the_reference_does_not_make_the_scale_smaller():
-    """Where a third of the variance of its increments is noise, plain least squares is off."""
+    """A third of the variance of its increments is noise, which biases plain least squares."""
     errors = []
     for seed in range(10):
         time, _, turned, _ = headings(np.random.default_rng(seed), walk=0.02 * DEGREE)

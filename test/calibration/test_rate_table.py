@@ -48,7 +48,7 @@ from recovery import CUBIC, gyros, LINEAR, run, SINE, Table
 from scipy.stats import binom, chi2
 from scipy.stats import t as student
 
-#: A test of an estimator fails by chance as rarely as this.
+#: Probability that a test of an estimator fails by chance.
 RARE = 1e-4
 
 
@@ -94,7 +94,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs)
         held = (np.abs(errors) <= 1.96).sum(axis=0)
         # Wandering sweeps take up to 3 % off (docs/benchmarks.md); all columns share RARE.
         assert held.min() >= binom.ppf(RARE / errors.shape[1], runs, 0.92)
-        # Nor are they too wide: the values of a run hang together, so a run counts once.
+        # Nor are they too wide: the values of a run are correlated, so a run counts once.
         assert chi2.ppf(RARE, runs) / runs < np.mean(errors ** 2) < chi2.ppf(1 - RARE, runs) / runs
 
 
@@ -194,7 +194,7 @@ def test_as_many_values_as_dwells_have_no_covariance():
 def test_the_scatter_of_sweeps_is_found():
     wander = 0.05 * DEGREE
     found = find_scatter(measured(SINE, sweeps=24, sweep_bias=wander)).sweep_bias / wander
-    # One value is fitted to the biases of the sweeps, three to what they share with temperature.
+    # One value is fitted to the biases of the sweeps, three to their change with temperature.
     assert math.sqrt(chi2.ppf(RARE, 20) / 20) < found < math.sqrt(chi2.ppf(1 - RARE, 20) / 20)
 
 
@@ -354,6 +354,6 @@ def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
         off = model.error(at) - (output - table.rate)
         held.append(
             np.abs(off) < 1.96 * np.sqrt(np.einsum('ik,ij,jk->k', rows, model.covariance, rows)))
-    # errors at the rates of one table go together: 10 tables of 12 values each show the share to
-    # 0.02
+    # errors at the rates of one table are correlated: 10 tables of 12 values each determine the
+    # share to 0.02
     assert np.mean(held) > 0.95 - 4.0 * 0.02

@@ -66,7 +66,7 @@ def test_good_runs_are_accepted_and_their_intervals_hold_the_truth(level, runs):
 
 
 def output(seed=0, motion=CALIBRATION, time=TIME, level=1.0):
-    """Return what an XV3500 with so many times its noise says of a motion."""
+    """Return the output of an XV3500 with a multiple of its noise in a motion."""
     noise = Noise(level * XV3500.noise.angle_random_walk, level * XV3500.noise.bias_instability)
     return ((1 + S) * motion.rate_at(time) + B
             + simulate_noise(noise, len(time), 0.01, np.random.default_rng(seed)))
@@ -104,7 +104,7 @@ def test_a_robot_that_begins_too_late_is_reported_by_how_much():
 
 
 def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_length():
-    """Nothing else is served meanwhile; short pieces throughout would take 10 times as long."""
+    """The node serves nothing else meanwhile; short pieces only would take 10 times as long."""
     time, work = np.arange(30000) / 100.0, []
     motion = from_rates(time, 0.5 * np.sin(0.5 * time))
     rate = ((1.0 + S) * motion.rate_at(time) + B + 0.3 * ((time > 9.0) & (time < 9.7))
@@ -201,7 +201,7 @@ def test_the_rest_after_a_run_is_found_and_a_drive_is_none():
 
 @pytest.mark.parametrize('yaw', [0.5, 2.0, -5.0])
 def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
-    """The fit takes it for one, and sees a turn of the other sign in the rest after it."""
+    """The fit takes it for a bias, and the rest after it then has a rate of opposite sign."""
     time = np.arange(2600) / 100.0
     rate = output(0, time=time) + np.where(time < 20.5, yaw * DEGREE, 0.0)
     fit = self_calibrate(time[:2001], rate[:2001], CALIBRATION, noise=XV3500.noise)
@@ -213,7 +213,7 @@ def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
 
 @pytest.mark.parametrize('off', [0.0, 3.0, -10.0])
 def test_the_rest_after_a_run_draws_the_bias_of_a_run_that_is_off(off):
-    """The run states 0.01 deg/s and is off by a multiple of it; the rest knows a fifth of it."""
+    """The run states 0.01 deg/s, its error is a multiple; the rest has a fifth of it."""
     time, generator = np.arange(201) / 100.0, np.random.default_rng(7)
     run, errors = (0.01 * DEGREE) ** 2, []
     for _ in range(50):
@@ -287,7 +287,7 @@ def test_the_start_heading_is_found_with_its_deviation(runs):
 
 
 def turned(number, seed=0, s=S, before=3.0, after=3.0, speed=45.0):
-    """Return time and output of whole turns that are closed to a degree or so."""
+    """Return time and output of whole turns that are closed to about a degree."""
     generator = np.random.default_rng([seed, 5])
     angle = 360.0 * number + generator.standard_normal()
     motion = turns([(before, 0), (abs(angle) / speed, math.copysign(speed, angle)),

@@ -36,7 +36,7 @@ from scipy.stats import binom
 
 #: Every gyro has these, and these tables determine them better than a data sheet.
 SLOPES = ('bias_temperature', 'scale_factor_temperature')
-#: A test of the choice fails by chance as rarely as this.
+#: Probability that a test of the choice fails by chance.
 RARE = 1e-4
 WANDERING = Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)
 
@@ -148,7 +148,7 @@ def test_rests_show_a_bias_alone():
 
 
 def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
-    """Dwells that scatter by 10 deg/s leave a slope of 0.07 deg/s/K open."""
+    """Dwells that scatter by 10 deg/s do not determine a slope of 0.07 deg/s/K."""
     assert names(select_effects(measured(Table(dwell=10.0 * DEGREE), LINEAR))).isdisjoint(SLOPES)
 
 

@@ -81,7 +81,7 @@ def test_the_likelihood_needs_no_common_rate_and_no_common_start(gyro, reference
     time = np.arange(21 * gyro) / gyro - 0.5
     rate = (1 + S) * CALIBRATION.rate_at(time - offset) + B
     fit = fit_likelihood(time, rate, sampled(CALIBRATION, reference) if reference else CALIBRATION)
-    # at 20 Hz it is the trapezoid rule between the samples about a corner that errs
+    # at 20 Hz the error is that of the trapezoid rule between the samples about a corner
     assert (fit.scale_factor_error, fit.bias) == pytest.approx(
         (S, B), abs=1e-6 if gyro == 100 else 1e-5)
     assert fit.time_offset == pytest.approx(offset, abs=1e-5)
@@ -148,7 +148,7 @@ def test_the_95_percent_intervals_cover_the_truth(reference, runs):
 
 @each_reference
 def test_the_likelihood_comes_near_the_cramer_rao_bound(reference, runs):
-    """Measured: 1.0 to 1.1 times the bound, in standard deviations; 300 runs tell it to 4 %."""
+    """Measured: 1.0 to 1.1 times the bound, in standard deviations, to 4 % in 300 runs."""
     errors, _, _ = honest(reference, runs)
     ratios = errors.std(axis=0, ddof=1) / bound(reference)
     assert (ratios < 1.1 * rms_bounds(len(errors) - 1)[1]).all(), ratios
@@ -199,7 +199,7 @@ def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
 @pytest.mark.parametrize('kind', ['ramps softer than commanded', 'second order',
                                   'slip up to 1 % of each turn'])
 def test_a_robot_that_follows_each_turn_otherwise_is_calibrated_within_its_interval(kind):
-    """Before, soft ramps were refused, and such a slip was held by half of the intervals."""
+    """Earlier, soft ramps were refused, and half of the intervals contained such a slip."""
     found = [tried(kind, GYROS['XV-3500'], (4, seed))
              for seed in range(6)]
     assert not [each for each in found if isinstance(each, str)]
@@ -223,7 +223,7 @@ def bumped(seed, degrees):
     (2.0, 7), *(pytest.param(degrees, 20, marks=pytest.mark.evidence)
                 for degrees in (5.0, 3.0, 2.0))])
 def test_a_slip_or_bump_is_refused(degrees, runs):
-    """Measured: all of 40 runs for 5, 3 and 2 deg; 1 deg is let through, as the limit says."""
+    """Measured: all of 40 runs for 5, 3 and 2 deg; 1 deg is accepted, as the limit states."""
     refused = 0
     for seed in range(runs):
         try:
@@ -241,7 +241,7 @@ def test_a_bump_below_the_limit_does_little_harm():
 
 ONE_SPEED = from_rates(np.array([0.0, 20.0]), np.array([0.5, 0.5]))
 GAP = (TIME < 8.0) | (TIME > 9.0)
-#: What benchmarks/fooled.py does not try, which test_run_faults.py runs.
+#: Cases that are not in benchmarks/fooled.py, which test_run_faults.py runs.
 REFUSED = {
     'too few samples': (TIME[:40], run()[:40], CALIBRATION, 'only 40 samples came; at least 50'),
     'a gap': (TIME[GAP], run()[GAP], CALIBRATION, 'no samples came for 1.0'),

@@ -113,7 +113,7 @@ def test_a_gyro_that_is_upside_down_is_refused_with_the_way_out():
 NOISE = Noise(angle_random_walk=5e-5)
 GYRO = GyroModel((Term(BIAS, (0.004,)), Term(SCALE_FACTOR_ERROR, (0.01,)),
                   Term(SINE_RESPONSE, (0.3, 1.0))), noise=NOISE)
-#: Its calibration is not quite right.
+#: Its calibration has an error.
 MODEL = GyroModel((Term(BIAS, (0.003,)), Term(SCALE_FACTOR_ERROR, (0.014,)),
                    Term(SINE_RESPONSE, (0.25, 1.0))))
 
@@ -318,7 +318,7 @@ def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model,
 
 
 def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(run, tmp_path):
-    """By means of dwells alone, a supply that follows the direction passes for an error of it."""
+    """By means of dwells alone, a supply that depends on the direction acts as an asymmetry."""
     (tmp_path / 'model.yaml').write_text(
         'effects: {supply_sensitivity: {supply_sensitivity: 0.01}}')
     time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])

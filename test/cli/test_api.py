@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The public names: what they give is what the command line gives, and importing them is cheap."""
+"""The public names: same results as the command line, and a cheap import."""
 
 import json
 from pathlib import Path

@@ -110,7 +110,7 @@ def test_compensate_claims_no_deviation_where_the_model_has_none(run, model, log
 
 
 def test_rows_of_others_between_the_samples_make_no_rate_noisier(run, tmp_path):
-    """As where a table writes a row at 100 Hz, and the gyro one in ten of them."""
+    """A table writes a row at 100 Hz, and the gyro has a value in one of ten."""
     (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
     time = np.arange(2000) / 100.0
     output = np.where(np.arange(2000) % 10 == 0, 0.0, np.nan)
@@ -188,7 +188,7 @@ def test_a_new_model_names_its_log_and_a_given_one_keeps_its_origin(
 @pytest.mark.parametrize('words', [(), ('--turns', 'nearest')], ids=['profile', 'turns'])
 def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate(
         run, tmp_path, words):
-    """A gyro that is as its model says: what its specific force adds is no bias."""
+    """A gyro that agrees with its model: the effect of its specific force is no bias."""
     (tmp_path / 'model.yaml').write_text(
         'effects: {acceleration_sensitivity: {acceleration_sensitivity: 0.001}}')
     rate = (np.concatenate([np.zeros(500), np.full(2000, TURN / 20.0), np.zeros(500)])
@@ -201,7 +201,7 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
     assert abs(json.loads(text)['bias']) < 1e-5
 
 
-#: An unset variable of the shell leaves an empty argument, which is not no argument.
+#: An unset variable of the shell leaves an empty argument.
 EMPTY = 'is empty; give a value or omit it'
 WRONG = {
     'compensate missing.csv --model MODEL --out x.csv': 'missing.csv: cannot be read',
@@ -344,7 +344,7 @@ def test_a_reference_that_is_lost_at_the_beginning_does_not_shift_the_motion(run
 
 
 def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
-    """Its sum would be waited for without end: whoever wrote it has gone."""
+    """Its checksum would block for ever, since the writer has ended."""
     rows = ''.join(f'{rate * 0.95 + 0.1 + 0.001 * (k % 3)},{rate}\n'
                    for rate in range(-60, 61, 10) for k in range(3))
     os.mkfifo(tmp_path / 'log.csv')

@@ -37,7 +37,7 @@ def hidden():
 
 @pytest.fixture(scope='module')
 def diagnosed(hidden, tmp_path_factory):
-    """Return the folder with that log, what was found in it, and what the program printed."""
+    """Return the folder with that log, the findings, and the output of the program."""
     folder = tmp_path_factory.mktemp('diagnosed')
     write_log(folder / 'drive.csv', log_of(hidden))
     with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as errors:
@@ -68,7 +68,7 @@ def answer_of(answer):
     return json.loads(text)
 
 
-# what is written and said
+# files and output
 
 def is_interval(values):
     return len(values) == 2 and values[0] <= values[1]
@@ -146,10 +146,10 @@ def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
     assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
 
 
-# what allows no answer
+# data that allow no answer
 
 def one_sentence(errors):
-    """Tell whether the program said one thing, in one line, and no traceback."""
+    """Tell whether the program printed one message, in one line, and no traceback."""
     return (len(errors.strip().splitlines()) == 1 and 'Traceback' not in errors
             and len(errors.strip()) > 20)
 
@@ -191,7 +191,7 @@ def test_where_the_folder_or_one_file_cannot_be_written_nothing_is(taken, log, r
     assert taken != 'found' or (tmp_path / taken).read_text() == 'mine'
 
 
-# what allows an answer, and not every one
+# data that allow an answer only in part
 
 @pytest.fixture
 def say(diagnose):

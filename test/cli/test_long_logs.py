@@ -29,7 +29,7 @@ MODEL = (
     'self_calibration: {scale_factor_error: 0.01, bias: 0.001, '
     'covariance: [[1.0e-6, 0.0], [0.0, 1.0e-8]]}\n')
 
-#: Runs the program and then says how much memory the process had at most, KiB.
+#: Runs the program and then prints the peak memory of the process, KiB.
 _MEASURED = """
 import resource, sys
 from gyro_calibration.cli.main import main

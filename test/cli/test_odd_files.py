@@ -50,7 +50,7 @@ LONG = 300 * 'x'
 
 @pytest.fixture(autouse=True)
 def _within_seconds():
-    """Let a test that waits for ever fail instead."""
+    """Let a test that blocks fail after a timeout."""
     def fail(*_):
         raise TimeoutError('it waits')
     before = signal.signal(signal.SIGALRM, fail)
@@ -77,7 +77,7 @@ KINDS = {'a pipe': os.mkfifo, 'a socket': make_socket, 'a folder': os.mkdir,
 each_kind = pytest.mark.parametrize('kind', KINDS)
 
 
-# What is no file
+# Paths that are no files
 
 
 @each_kind
@@ -131,7 +131,7 @@ def test_a_pipe_that_is_written_to_late_is_read(tmp_path):
     raise AssertionError('it was never read')
 
 
-# What cannot be opened
+# Files that cannot be opened
 
 
 @pytest.mark.parametrize('path, words', [
@@ -240,7 +240,7 @@ def test_a_file_keeps_its_owner(tmp_path):
     assert (status.st_uid, status.st_gid) == (1234, 4321)
 
 
-# What a terminal would obey
+# Control characters
 
 
 ESCAPES = '\x1b[31m\x9b2J\u202e\u2066\x07\r'
@@ -306,7 +306,7 @@ def test_a_calibration_that_is_not_used_is_reported(model, calibration, hint, tm
 @pytest.mark.parametrize('ahead, known',
                          [(-7200.0, True), (60.0, True), (3.0e7, False), (2.0e9, False)])
 def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
-    """Until the clock is right: a robot without a battery for it begins in the past."""
+    """Until the clock is set: a robot without a battery for it starts in the past."""
     from gyro_calibration.heading.assumptions import Assumptions
     now, variance = 1.7e9, (1e-5) ** 2
     date = str(np.datetime64(round(now + ahead), 's')) + '+00:00'
@@ -323,7 +323,7 @@ def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
             and live.age(now + ahead + 60.0) == pytest.approx(60.0))
 
 
-# What grows
+# Files that need much memory
 
 
 @pytest.mark.parametrize('count', [1600, 30_000])
@@ -413,7 +413,7 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
     assert len(list(read_messages(tmp_path / 'a.db3', contents))) == 98 and contents.left_out == 2
 
 
-# Numbers and letters that nobody meant
+# Damaged numbers and text
 
 
 ODD = {
@@ -492,7 +492,7 @@ def no_constant(name):
 
 @pytest.mark.parametrize('verb', VERBS)
 def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
-    """What is finite is answered in finite numbers, and what is refused leaves no file."""
+    """Finite data give finite numbers, and a refusal leaves no file."""
     model = tmp_path / 'model.yaml'
     model.write_text(
         'effects: {bias: {bias: 0.1}, cubic_nonlinearity: {cubic_nonlinearity: 1.0e-3}}\n'

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What is under way is shown on a terminal, with the time it takes, and nowhere else."""
+"""Progress is shown on a terminal, with the elapsed time, and nowhere else."""
 
 import io
 import re

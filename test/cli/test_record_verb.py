@@ -124,7 +124,7 @@ def holds(path, count):
 
 
 def is_unbroken(log):
-    """Return whether no sample is missing in the middle, by what the samples say themselves."""
+    """Return whether no sample is missing in the middle, by the numbers in the samples."""
     steps = np.diff(np.round(1e4 * np.asarray(log.output)))
     return bool(np.isin(steps, (1, -9999)).all())
 
@@ -333,7 +333,7 @@ def test_where_nothing_can_be_written_no_file_is_left(record, tmp_path, name):
 
 
 class Robot:
-    """Publishes what a robot has, with stamps of its own, at many times the pace of them."""
+    """Publishes the topics of a robot, with stamps of its own, many times faster than them."""
 
     def __init__(self, ros):
         from geometry_msgs.msg import PoseStamped
@@ -389,7 +389,7 @@ class Robot:
 
 
 def reliable(**how):
-    """Return a quality that loses nothing."""
+    """Return a reliable quality of service."""
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     return QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, **how)
 

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A fleet: which log is of which unit, workers that die, and the verb on good and bad input."""
+"""A fleet: the unit of each log, workers that are killed, the verb on good and bad input."""
 
 import csv
 from dataclasses import replace
@@ -47,7 +47,7 @@ DEGREE = np.pi / 180.0
 
 
 def drive(bias, seed, seconds=90.0):
-    """Return a log of a gyro of that bias, rad/s, beside an encoder."""
+    """Return a log of a gyro of that bias, rad/s, with an encoder as reference."""
     generator = np.random.default_rng(seed)
     time = np.arange(0.0, seconds, 0.05)
     heading = 2.0 * np.sin(2.0 * np.pi * time / 15.0)
@@ -60,7 +60,7 @@ def run(*arguments):
     return main(['fleet', *map(str, arguments), '--no-diagnosis', '--workers', '1', '--json'])
 
 
-# which log is of which unit
+# the unit of each log
 
 def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     (tmp_path / 'fleet.csv').write_text('log,unit,drive,date,temperature\n'
@@ -304,7 +304,7 @@ def test_the_interval_of_one_more_unit_is_that_of_student():
 
 
 def test_what_the_units_of_a_drive_share_does_not_move_a_unit():
-    """A reference that is off in one drive by far more than units differ."""
+    """The error of the reference of one drive is many times the difference between units."""
     values = np.array([[1.0, 1.1, 1.0, 0.9], [2.0, 1.9, 2.0, 2.1], [3.1, 3.0, 3.0, 2.9],
                        [4.0, 4.0, 4.1, 4.0]]) + np.array([0.0, 0.0, 0.0, 40.0])
     pooled = Pooled(crossed(values))
@@ -327,7 +327,7 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
 
 
 def test_units_that_drift_apart_have_slopes_of_their_own():
-    """Over age, beside references that are off by far more on each drive."""
+    """Over age, with references whose errors on each drive are many times larger."""
     generator = np.random.default_rng(10)
     unit, drive = np.indices((8, 6)).reshape(2, -1)
     age, slopes = np.linspace(-1.5, 1.5, 6)[drive], np.linspace(-2.0, 4.0, 8)
@@ -339,7 +339,7 @@ def test_units_that_drift_apart_have_slopes_of_their_own():
     assert apart.value - apart.value.mean() == pytest.approx(slopes - 1.0, abs=0.2)
     whole = pooled.estimate(pooled.wanted(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)),
                                           part=1))
-    # the mean slope is that of the references as well, what units differ by is not
+    # the mean slope contains that of the references, the differences between units do not
     assert (whole.high - whole.low).min() > 2.0 * (apart.high - apart.low).max()
 
 
@@ -400,7 +400,7 @@ def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
         write_model(tmp_path / 'model.yaml', said[name])
         model = read_model(tmp_path / 'model.yaml')
         values = {term.effect.name: term.values[0] for term in model.terms}
-        assert np.isinf(model.prior[0])  # the logs do not show the scale
+        assert np.isinf(model.prior[0])  # the logs do not determine the scale
         spread = model.prior[1]
         assert set(values) == {'bias'} and model.gyro['name'] == 'DOT'
         assert values['bias'] - 1.96 * spread == pytest.approx(interval.low[place])
@@ -422,7 +422,7 @@ def test_a_run_of_20_s_is_drawn_to_the_prior_as_far_as_it_leaves_the_values_open
 
 
 def test_a_diagnosis_by_a_course_takes_what_is_usual_of_a_fleet_as_its_prior():
-    """20 s by a course that is off by 2 deg leave the bias open by more than a unit varies."""
+    """20 s with a course error of 2 deg determine the bias less well than the type does."""
     generator = np.random.default_rng(4)
     time = np.arange(0.0, 20.1, 0.05)
     course = np.sin(2.0 * np.pi * time / 10.0)
