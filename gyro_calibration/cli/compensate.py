@@ -141,23 +141,22 @@ class Piece:
 def _compensated(given: argparse.Namespace, model: GyroModel,
                  found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and update the counts."""
-    for piece in _chosen(given, model):
+    if given.rest or given.hindsight:
+        log = verb.read(given)
+        blocks = followed(replace(log, output=verb.output_of(given, log)), model, given.hindsight,
+                          given.log)
+    else:
+        threshold = Threshold(given.threshold * DEGREE, given.window,
+                              model.noise.angle_random_walk)
+        blocks = pieces((replace(log, output=verb.output_of(given, log))
+                         for log in verb.read_blocks(given)), model, threshold, given.log)
+    for piece in blocks:
         found.add(piece)
         yield piece.log, piece.rows()
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no gyro output is finite; record again')
     if found.rows == found.rows_without_output + found.refused_samples:
         raise DataRefused(f'{given.log}: {none_plausible(model)}')
-
-
-def _chosen(given: argparse.Namespace, model: GyroModel) -> Iterator[Piece]:
-    if given.rest or given.hindsight:
-        log = verb.read(given)
-        return followed(replace(log, output=verb.output_of(given, log)), model, given.hindsight,
-                        given.log)
-    threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
-    return pieces((replace(log, output=verb.output_of(given, log))
-                   for log in verb.read_blocks(given)), model, threshold, given.log)
 
 
 def _checked(pieces: Iterator[Piece], model: GyroModel, file: str) -> Iterator[Piece]:
