@@ -9,11 +9,11 @@
 # under the License.
 
 """
-The columns of each cause on a replayed log, for the shapes that are tried first.
+Candidate causes and their columns on a replayed log, for the shapes that are tried first.
 
-Also those of structure without a name: families of functions of each variable, of two of them, and
-of time. They compete with the causes. Where one of them is clearly better than every cause, the
-cause is none that is known here.
+Also generic terms, which are structure without a name: families of functions of each variable, of
+two variables, and of time. They compete with the causes. If a generic term is clearly better than
+every cause, the structure is reported as unexplained.
 
 """
 
@@ -30,14 +30,14 @@ from gyro_calibration.model.effects import ADDED, CATALOGUE
 import numpy as np
 from scipy.interpolate import BSpline
 
-#: A dead zone is looked for where an encoder makes so many steps a second or more.
+#: Least step rate of an encoder, 1/s, at which a dead zone is searched for.
 STEPS_A_SECOND = 20.0
-#: Places of a step that are tried in all logs together.
+#: Times of a bias step that are tried in all logs together.
 STEPS = 64
-#: A channel that changes by less than this in each log shows nothing.
+#: Least change of a channel in a log, K, V and m/s²; with less it counts as missing.
 LEAST_CHANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
 
-#: A thermal lag shorter than this, s, is nothing but the rate of the temperature.
+#: Shortest thermal lag, s; a shorter one equals a sensitivity to the temperature rate.
 FASTEST_LAG = 12.0
 
 #: Columns of one log: (replay) -> arrays of shape (n,).
@@ -54,8 +54,8 @@ class Candidate:
     cause : its name
     shapes : their values, in the order of the effect
     columns : of a log
-    run : the log that it is in, where it happens once; None where it is in all
-    amplitude : the value that its column must have, where only shapes are fitted; None if free
+    run : number of the log for a single event; None for a cause in all logs
+    amplitude : fixed coefficient of its column if only shapes are fitted; None if it is free
 
     """
 
@@ -84,7 +84,7 @@ def effect(name: str, *shapes: float, run: int | None = None) -> Candidate:
         return Candidate(name, shapes, lambda each: columns(each, *shapes), run)
     known = CATALOGUE[name]
     if (distortion := known.distortion) is not None:
-        # what it changes of the rate: a delay, a lag, another clock, a limit
+        # change of the rate by a delay, a lag, a clock rate or a limit
         return Candidate(name, shapes, lambda each: (
             distortion(each.channels.rate, each.channels.time, *shapes) - each.channels.rate,),
             run, 1.0)
@@ -94,7 +94,7 @@ def effect(name: str, *shapes: float, run: int | None = None) -> Candidate:
 
 
 def pulse(time: Array, middle: float, width: float) -> Array:
-    """Return the rate of a reference that jumps by 1 rad in its heading, within about a width."""
+    """Return the rate of a reference whose heading jumps by 1 rad within about a width."""
     return np.exp(-0.5 * ((time - middle) / width) ** 2) / (width * math.sqrt(2.0 * math.pi))
 
 
@@ -108,7 +108,7 @@ _OF_THE_REFERENCE: Mapping[str, tuple[Callable[..., Sequence[Array]], list[int]]
 
 
 def fitted_shapes(candidate: Candidate) -> list[int]:
-    """Return the places of the shapes that are no conventions."""
+    """Return the indices of the shapes that are fitted, not set by convention."""
     if candidate.cause not in CATALOGUE:
         return _OF_THE_REFERENCE[candidate.cause][1] if is_named(candidate) else []
     parameters = CATALOGUE[candidate.cause].parameters[:len(candidate.shapes)]
@@ -124,7 +124,7 @@ def with_shape(candidate: Candidate, place: int, value: float) -> Candidate:
 
 
 def constant(replays: Sequence[Replay]) -> frozenset[str]:
-    """Return the channels that hardly change in any log that has them: as good as none."""
+    """Return the channels that are nearly constant in each log that has them."""
     known = {name: [getattr(each.channels, name) for each in replays if name in each.has]
              for name in LEAST_CHANGE}
     return frozenset(
@@ -133,21 +133,21 @@ def constant(replays: Sequence[Replay]) -> frozenset[str]:
 
 
 def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
-    """Return the numbers of experiments like these logs, in deg/s, degC and min."""
+    """Return rate, temperature and duration of proposed experiments, deg/s, degC and min."""
     numbers = {'long': 4.0 * math.ceil(max(each.duration for each in replays) / 60.0)}
     top = max(float(np.quantile(np.abs(each.channels.rate), 0.999)) for each in replays) / DEGREE
     if top > 0.0:
         numbers |= {'top': top, 'faster': 3.0 * top}
     if all('temperature' in each.has for each in replays):
         degc = np.concatenate([each.channels.temperature for each in replays])
-        # a range that shows something
+        # at least 20 K
         middle, half = 0.5 * (degc.max() + degc.min()), max(0.5 * float(np.ptp(degc)), 10.0)
         numbers |= {'low': float(middle - half), 'high': float(middle + half)}
     return numbers
 
 
 def candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
-    """Give all causes that these logs may show, each with the shapes to begin with."""
+    """Give all causes that these logs may show, each with its first shapes."""
     has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
     duration, interval = max(each.duration for each in replays), replays[0].interval
     fastest = max(float(np.abs(each.channels.rate).max()) for each in replays)
@@ -188,7 +188,7 @@ def candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     yield effect('reference_once_per_rev')
     if 'temperature' in has:
         yield effect('scale_factor_temperature', middle)
-    # Slower than so many steps a second, it is the encoder that stands still.
+    # At a lower step rate the quantization of the encoder passes for a dead zone.
     slowest = max(1e-5 * fastest, STEPS_A_SECOND * max(each.rounded for each in replays))
     for zone in np.geomspace(slowest, 0.5 * fastest, 14):
         yield effect('dead_zone', zone)
@@ -203,7 +203,7 @@ def candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
 
 
 def added_effects(has: Collection[str], moves: bool) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Give the effects of the user's own that logs can show, with the shapes to begin with."""
+    """Give the user-defined effects that logs can show, with their first shapes."""
     for name, own in ADDED.items():
         turned = own.looks_at & {'rate', 'output', 'heading'}
         if own.looks_at & LEAST_CHANGE.keys() <= set(has) and (moves or not turned):
@@ -212,42 +212,37 @@ def added_effects(has: Collection[str], moves: bool) -> Iterator[tuple[str, tupl
 
 
 def _steps(logs: int) -> int:
-    """Return how many places of a step are tried in each of so many logs."""
+    """Return how many times of a bias step are tried in each of so many logs."""
     return max(STEPS // logs, 1)
 
 
 def spacing_of_steps(each: Replay, logs: int) -> float:
-    """Return how far apart the places of a step are that are tried in one of so many logs, s."""
+    """Return the interval between the times of a bias step that are tried in a log, s."""
     return each.duration / (_steps(logs) + 1)
 
 
 def reference_temperatures(replays: Sequence[Replay]) -> list[float]:
-    """Return the temperatures that a parabola may count from: the usual, the first, the mean."""
+    """Return the trial reference temperatures of a parabola: usual, mean and first."""
     known = np.concatenate([each.channels.temperature for each in replays])
     return [25.0, 20.0, float(known.mean()), float(known[0])]
 
 
 def by_cause(found: Sequence[Candidate]) -> Mapping[str, list[int]]:
-    """Return the places of the candidates of each cause."""
+    """Return the indices of the candidates of each cause."""
     places: dict[str, list[int]] = {}
     for place, candidate in enumerate(found):
         places.setdefault(candidate.cause, []).append(place)
     return places
 
 
-def phase(sine: float, cosine: float) -> tuple[float, float]:
-    """Return amplitude and phase of ``sine sin + cosine cos``."""
-    return math.hypot(sine, cosine), math.atan2(cosine, sine)
-
-
-#: Begins the name of what has none; the variable follows along which it lies.
+#: Prefix of the name of structure without a name; its variable follows.
 UNNAMED = '~'
-#: Knots of splines over a variable: few for what is smooth, many for what is not.
+#: Numbers of knots of splines over a variable.
 KNOTS = {'rate': (8, 24), 'temperature': (8, 24)}
 _OTHER_KNOTS = (8,)
-#: Moments and widths of a bump in a log, as parts of it.
+#: Largest number of times of a bump in a log, and its widths as shares of the duration.
 MOMENTS, BUMPS = 40, (0.007, 0.02, 0.05)
-#: Waves over the range of a variable, so dense that none falls between two.
+#: Numbers of waves over the range of a variable.
 WAVES = {'rate': tuple(np.arange(1.0, 12.5, 0.5)), 'temperature': tuple(np.arange(1.0, 8.5, 0.5))}
 _OTHER_WAVES = (1.0, 1.5, 2.0, 3.0, 4.0)
 HARMONICS = range(2, 11)
@@ -256,7 +251,7 @@ Of = Callable[[Replay], Array]
 
 
 def is_named(candidate: Candidate) -> bool:
-    """Tell a cause from a structure without a name."""
+    """Tell whether a candidate is a cause, not structure without a name."""
     return not candidate.cause.startswith(UNNAMED)
 
 
@@ -266,13 +261,13 @@ def along(candidate: Candidate) -> str:
 
 
 def generic_terms(replays: Sequence[Replay]) -> list[Candidate]:
-    """Return what may be in these logs without a name."""
+    """Return the generic terms that these logs may show."""
     variables = dict(_variables(replays))
     found = [each for name, of in variables.items() for each in _of_one(name, of)]
     if 'rate' in variables:
         found += _of_turning(variables)
     for (first, one), (second, other) in combinations(variables.items(), 2):
-        if (first, second) != ('rate', 'temperature'):  # their product has a name
+        if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
             found.append(_term(f'{first} and {second}', _product(one, other)))
     for run, each in enumerate(replays):
         begin = float(each.channels.time[each.kept][0])
@@ -289,7 +284,7 @@ def _term(name: str, columns: Columns, run: int | None = None,
 
 
 def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Of]]:
-    """Give the variables that these logs have and that change in them, each scaled to -1 to 1."""
+    """Give the variables that change in these logs, each scaled to -1 to 1."""
     has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
     known: dict[str, Of] = {'rate': lambda each: each.channels.rate}
     if 'temperature' in has:
@@ -334,13 +329,13 @@ def _of_one(name: str, of: Of) -> Iterator[Candidate]:
         yield _term(name, _of(of, lambda x, steep: (np.exp(steep * x - abs(steep)),), steep))
     for count in KNOTS.get(name, _OTHER_KNOTS):
         knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
-        # together they are constant, which is the bias
+        # their sum is constant, as the bias is
         yield _term(name, _of(of, lambda x, knots: tuple(
             BSpline.design_matrix(x, knots, 3).toarray().T[1:]), knots))
 
 
 def _of_turning(variables: Mapping[str, Of]) -> Iterator[Candidate]:
-    """Give roots of the rate, and harmonics of the heading, alone and times a variable."""
+    """Give powers of the rate, and harmonics of the heading, alone and times a variable."""
     rate = variables['rate']
     for power in (0.25, 0.5, 0.75, 1.5):
         yield _term('rate', _of(rate, lambda x, power: (np.abs(x) ** power,), power))

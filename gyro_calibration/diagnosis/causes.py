@@ -11,8 +11,8 @@
 """
 Every cause that a diagnosis can name: effects of the gyro, faults of reference or record, noise.
 
-What an effect is, and in which units, stands in `effects`. Here stands along which variable it
-shows, and which experiment distinguishes it from what looks alike.
+The formulas and units of effects are in `effects`. This module holds the variable along which each
+cause shows, and the experiment that distinguishes it from similar causes.
 
 """
 
@@ -38,13 +38,13 @@ class Cause:
 
     Attributes
     ----------
-    name : as the catalogue of effects has it; files hold it
-    sentence : what it is, for people
-    units : parameter -> SI unit, for those that a diagnosis estimates
-    needs : columns of a log without which it cannot be shown; 'reference' is one of `REFERENCES`
+    name : as in the catalogue of effects and in files
+    sentence : description for people
+    units : estimated parameter -> SI unit
+    needs : columns of a log that are required to show it; 'reference' is one of `REFERENCES`
     along : the variable along which it shows
-    separate_by : the experiment that distinguishes it from what looks alike; '' where it has none
-    of : 'gyro', 'reference', 'record' or 'noise': what is to be mended
+    separate_by : the experiment that distinguishes it from similar causes; '' without one
+    of : what is to be corrected: 'gyro', 'reference', 'record' or 'noise'
 
     """
 
@@ -62,11 +62,12 @@ class Cause:
         return next(iter(self.units.values()))
 
 
-_ACCELERATIONS = ('swing fast with quick reversals: a delay keeps the size of what it delays, '
-                  'a lag does not')
-_CORNERS = 'heat and cool with corners, at two speeds, while the gyro rests'
+_ACCELERATIONS = ('swing fast with quick reversals: a lag reduces the amplitude of fast motion, '
+                  'a delay does not')
+_CORNERS = ('heat and cool the resting gyro at two temperature rates, with abrupt changes from '
+            'heating to cooling')
 _FULL_SCALE = 'turn at many speeds up to full scale'
-_MARK = 'close whole turns on a mark, or take a second reference'
+_MARK = 'make whole turns between marks, or use a second reference'
 _HEADINGS = 'turn at several speeds, and stop at eight headings'
 
 #: Effect of the gyro -> the variable along which it shows, and its experiment.
@@ -84,12 +85,12 @@ _OF_THE_GYRO: Mapping[str, tuple[str, str]] = {
     'scale_factor_temperature': ('temperature', ''),
     'bias_temperature_rate': ('temperature_rate', _CORNERS),
     'thermal_lag': ('temperature_rate', _CORNERS),
-    'thermal_hysteresis': ('temperature_rate', 'go through the same cycle of temperature twice, '
-                           'at two speeds'),
+    'thermal_hysteresis': ('temperature_rate', 'repeat the same temperature cycle at two '
+                           'temperature rates'),
     'warm_up': ('time', 'start the gyro both cold and warm, and let it rest'),
-    'rate_ramp': ('time', 'record it again, from a power-on at another temperature: what is no '
-                  'ramp does not repeat'),
-    'bias_step': ('time', 'record it again: a step happens once'),
+    'rate_ramp': ('time', 'record again, from a power-on at another temperature: only a ramp '
+                  'repeats'),
+    'bias_step': ('time', 'record again: a step does not repeat'),
     'heading_sensitivity': ('heading', _HEADINGS),
     'acceleration_sensitivity': ('specific_force', 'rest in several poses within one power-on'),
     'vibration_rectification': ('vibration', 'rest with the motor on and off'),
@@ -99,34 +100,35 @@ _OF_THE_GYRO: Mapping[str, tuple[str, str]] = {
     'time_offset': ('rate_change', _ACCELERATIONS),
     'clock_rate': ('time', 'record long, with sharp reversals at both ends'),
     'dead_zone': ('rate', 'sweep slowly through zero'),
-    'saturation': ('rate', 'turn faster than the limit: its code is repeated there'),
-    'quantization': ('output', 'turn slowly: the set of codes shows it'),
+    'saturation': ('rate', 'turn faster than the limit: the output stays at its extreme code'),
+    'quantization': ('output', 'turn slowly, and check the spacing of the output codes'),
 }
 
-#: Name, sentence, unit, whose it is, what it needs, variable along which it shows, experiment.
+#: Name, sentence, unit, origin, required channels, variable along which it shows, experiment.
 _OTHERS = (
     ('outliers', 'Single samples are outliers, as from a disturbed line or a corrected checksum.',
      '1', 'record', 'time', 'time', ''),
-    ('stuck_samples', 'The last value is repeated where a new one was due.', '1', 'record', 'time',
-     'time', 'turn without rest: the code of a gyro that works changes then'),
+    ('stuck_samples', 'The last value is repeated instead of a new one.', '1', 'record', 'time',
+     'time', 'turn without rest: the output of a working gyro then changes in each sample'),
     ('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time', 'time', ''),
     ('reference_once_per_rev', 'The reference errs once in a revolution, as an eccentric encoder '
      'or a wobbling table does.', '1', 'reference', 'time reference', 'heading', _HEADINGS),
     ('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference',
      'time reference', 'rate', _MARK),
-    ('reference_slip', 'The motion slipped: the reference shows a turn that the gyro did not '
-     'make.', 'rad', 'reference', 'time reference', 'rate_change', ''),
-    ('reference_quantization', 'The reference counts in steps, and its rate between samples is as '
-     'coarse.', 'rad', 'reference', 'time reference_heading', 'heading', ''),
-    ('unit_error', 'The output is in another unit, or of the other sign, than its name states.',
+    ('reference_slip', 'The reference slipped: it shows a rotation that the gyro did not make.',
+     'rad', 'reference', 'time reference', 'rate_change', ''),
+    ('reference_quantization', 'The reference heading is quantized, so that its rate between '
+     'samples is coarse.', 'rad', 'reference', 'time reference_heading', 'heading', ''),
+    ('unit_error', 'The output has another unit, or the other sign, than its name states.',
      '1', 'record', 'reference', 'rate',
-     'look up what the wire carries: the number itself is the evidence'),
+     'compare the raw values of the gyro with its data sheet'),
     ('angle_random_walk', 'The angle random walk differs from the simulated one.', 'rad/√s',
      'noise', 'time', 'frequency', ''),
     ('bias_instability', 'The bias instability differs from the simulated one.', 'rad/s', 'noise',
      'time', 'frequency', 'record at rest for hours'),
     ('rate_random_walk', 'The rate random walk differs from the simulated one.', 'rad/s/√s',
-     'noise', 'time', 'frequency', 'record at rest for hours, and again: a walk does not repeat'),
+     'noise', 'time', 'frequency',
+     'record at rest for hours, twice: a random walk does not repeat'),
 )
 
 
@@ -147,14 +149,14 @@ CAUSES: dict[str, Cause] = {
 
 
 def add_causes(effects: Iterable[Effect]) -> None:
-    """Add effects of one's own, which are in the catalogue, to what a diagnosis looks for."""
+    """Add user-defined effects of the catalogue to the causes that a diagnosis searches for."""
     for effect in effects:
         CAUSES[effect.name] = _of_an_effect(effect.name, effect.along, effect.shown_by)
 
 
 def finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
             confounders: Sequence[str] = (), **known: Any) -> Finding:
-    """Return a finding of a cause, with what is known of the cause where nothing else is given."""
+    """Return a finding of a cause, with the fields of the cause as defaults."""
     cause = CAUSES[name]
     usual = {'cause': cause.sentence, 'along': cause.along,
              'separate_by': cause.separate_by if confounders else ''}
@@ -163,7 +165,7 @@ def finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
 
 
 def as_suspected(found: Finding) -> Finding:
-    """Return a finding that is not established, and what would show whether it is."""
+    """Return a finding as suspected, with the experiment that would establish it as remedy."""
     separate_by = CAUSES[found.effect].separate_by
     return replace(found, status='suspected', remedy=(
         f'record again: {separate_by}' if separate_by
@@ -174,24 +176,24 @@ _REMEDIES = {
     'gyro': 'add it to the model of the gyro',
     'reference': 'repair or replace the reference, or keep it out of calibrations',
     'record': 'repair the recording',
-    'noise': 'use the figures of the extended model'}
+    'noise': 'use the noise figures of the extended model'}
 
 
 def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
                   model: GyroModel) -> list[Finding]:
-    """Return findings with their share of the heading error, and what to do about them."""
+    """Return findings with their shares of the heading error and their remedies."""
     inside = {term.effect.name for term in model.terms}
     return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy or (
         '' if CAUSES[each.effect].of == 'gyro' and each.effect not in inside
         else _REMEDIES[CAUSES[each.effect].of])) for each in findings]
 
 
-#: What to record next, in the numbers of the logs -> the pairs of causes that it distinguishes.
+#: Next experiment, with numbers of `observed_range` -> pairs of causes that it distinguishes.
 _EXPERIMENTS: Mapping[str, str] = {
     'heat and cool it twice between {low:.0f} and {high:.0f} °C within one log, at rest, from a '
     'power-on at {high:.0f} °C': 'bias_temperature rate_ramp, bias_temperature warm_up',
-    'heat and cool it twice between {low:.0f} and {high:.0f} °C at rest, at two speeds, with '
-    'corners and pauses of 2 min':
+    'heat and cool it twice between {low:.0f} and {high:.0f} °C at rest, at two temperature '
+    'rates, with abrupt changes and pauses of 2 min':
         'bias_temperature_rate thermal_lag, bias_temperature_rate thermal_hysteresis, '
         'thermal_lag thermal_hysteresis, bias_temperature thermal_lag',
     'let it rest for {long:.0f} min at one temperature, from power-on': 'warm_up rate_ramp',
@@ -214,12 +216,12 @@ _EXPERIMENTS: Mapping[str, str] = {
         'time_offset bandwidth',
     'record {long:.0f} min with quick reversals at up to {top:.3g} deg/s at both ends':
         'time_offset clock_rate, clock_rate scale_factor_error',
-    'record the same again, from another power-on: what happens once does not repeat':
+    'record the same again, from another power-on: a single event does not repeat':
         'bias_step thermal_hysteresis, bias_step bias_temperature_rate, bias_step warm_up',
     'step the supply by 5 % each minute at one temperature and at rest':
         'bias_temperature supply_sensitivity',
 }
-#: More logs than this are not proposed.
+#: Largest number of logs that is proposed.
 _MOST_LOGS = 10
 _OF_PAIRS = {frozenset(pair.split()): words
              for words, pairs in _EXPERIMENTS.items() for pair in pairs.split(', ')}
@@ -228,17 +230,18 @@ _OF_PAIRS = {frozenset(pair.split()): words
 def experiment(name: str, others: Sequence[tuple[str, float]],
                numbers: Mapping[str, float]) -> str:
     """
-    Return what to record next to distinguish a cause from others, in words.
+    Return the next experiment that distinguishes a cause from others, in words.
 
-    With that are the sigmas that the data at hand bring, and what like logs given together would:
-    the information of independent logs adds up, so that sigmas grow with the root of their number.
+    The text states by how many sigma these logs distinguish the causes, and how many similar logs
+    together would: the information of independent logs adds, so that sigmas grow with the square
+    root of their number.
 
     Parameters
     ----------
     name : of the cause
-    others : names of those that may be in its place, with what each lacks in logarithm of the
-        likelihood, half the square of the sigmas by which the logs distinguish them already
-    numbers : of the logs, as of `candidates.observed_range`
+    others : names of the alternatives, with their deficits in log-likelihood, which are half the
+        square of the sigmas
+    numbers : of the logs, from `candidates.observed_range`
 
     """
     found: dict[str, list[str]] = {}

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Gain of the extended model, on parts of the logs left out of the choice and the fit."""
+"""Gain of the extended model on parts of the logs that are held out of selection and fit."""
 
 from __future__ import annotations
 
@@ -24,34 +24,35 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
-#: The heading is compared over so long, s.
+#: Window over which heading errors are counted, s.
 WINDOW = 60.0
-#: A window is no longer than this part of what is held out.
+#: Longest window as a share of a held-out part.
 WITHIN = 0.75
-#: Of so many blocks one is held out.
+#: One of so many blocks is held out.
 EVERY = 3
-#: A log with fewer samples than this without what is held out is not fitted.
+#: Least number of samples of a log that remain for the fit.
 _FEWEST = 20
-#: Chance at which a cause is chosen again without what is held out; the whole logs have shown it.
+#: False-alarm rate of a cause, found in the whole logs, when it is selected without the held-out
+#: blocks.
 _RATE = 0.01
-#: One part alone says nothing of how much the gain differs from part to part.
+#: Least number of parts for an interval of the gain.
 _FEWEST_PARTS = 2
 
 
 def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     """
-    Hold out every third block, fit causes chosen anew without it, and predict it.
+    Hold out every third block, select and fit causes without them, and predict them.
 
     Parameters
     ----------
-    search : in the whole logs
-    causes : those that were named, and their confounders
-    given : tells whether there is a model; before is then what it leaves as it is, otherwise what
-        the best bias and scale leave
+    search : of the whole logs
+    causes : the named causes and their confounders
+    given : whether there is a model; the error before is then that of the model, otherwise that of
+        the best bias and scale factor
 
     Returns
     -------
-    None where the logs are too short to hold anything out, or too little of them is known
+    the gain; None if the logs are too short, or too few of their samples are used
 
     """
     replays = search.problem.replays
@@ -85,16 +86,16 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
 def gain_of(held_out: str, squares: Mapping[str, ArrayLike], counts: ArrayLike, before: str,
             window: float | None) -> Gain:
     """
-    Return what was won on parts that were held out.
+    Return the gain on held-out parts.
 
     Parameters
     ----------
-    held_out : which parts, in words
-    squares : model -> sums of the squares of each part: of the rate error, and of the heading
-        error over windows, shape (parts, 2)
-    counts : how many were summed, shape (parts, 2)
+    held_out : description of the parts
+    squares : model -> sums of squares of each part: of the rate error, and of the heading error
+        over windows, shape (parts, 2)
+    counts : numbers of squares in the sums, shape (parts, 2)
     before : the model that the extended one is compared with
-    window : s; None where the parts are shorter than it
+    window : s; None if the parts are shorter
 
     """
     rate, heading = (change_over(np.array([squares[before], squares['extended']])[:, :, k].T,
@@ -126,14 +127,14 @@ def _without(each: Replay, out: Mask) -> Replay:
 
 
 def _left(each: Replay, run: int, found: FittedValues | None) -> tuple[Array, Array]:
-    """Return the residuals of rate and of heading increments in a whole log; all without a fit."""
+    """Return the residuals of a log against smooth and measured reference, after a fit if any."""
     added = 0.0 if found is None else found.explains(each, run) + found.biases[run]
     return (each.channels.output - each.channels.rate - added,
             each.channels.output - each.reference - added)
 
 
 def over_windows(change: Array, time: Array, window: float) -> Array:
-    """Return changes over windows from changes between times: shapes (m,), (n,) and (n + 1,)."""
+    """Return changes over windows, (m,), from changes, (n,), between times, (n + 1,)."""
     whole = np.concatenate([[0.0], np.cumsum(change)])
     later = np.searchsorted(time, time + window - 0.5 * float(np.median(np.diff(time))))
     inside = np.flatnonzero(later < len(time))
@@ -143,16 +144,16 @@ def over_windows(change: Array, time: Array, window: float) -> Array:
 def shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
            own: float = 0.0) -> dict[str, float]:
     """
-    Return which part of the mean square of the heading error over a minute each cause explains.
+    Return the share of each cause in the mean square of the heading error over a minute.
 
-    What a cause adds like a bias or a scale factor error is of these: they are refitted in any
-    case, and take it up without the cause.
+    The part of a cause that is proportional to a bias or a scale factor error is counted as these,
+    because their refit would absorb it.
 
     Parameters
     ----------
-    logs : of each, what causes add to the change of heading between times, with what is 'left',
-        rad, shape (n,), and the times, s, shape (n + 1,)
-    own : mean square that is of the reference, rad²
+    logs : for each log, the contributions of causes and of what is 'left' to the change of heading
+        between times, rad, shape (n,), and the times, s, shape (n + 1,)
+    own : mean square of the errors of the reference, rad²
 
     """
     over: dict[str, list[Array]] = {name: [] for parts, _ in logs for name in parts}
@@ -181,7 +182,7 @@ def shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
 
 
 def heading_curve(parts: Mapping[str, Array], time: Array) -> HeadingCurve:
-    """Return the heading error over a log, of all parts and of what is left (see `shares`)."""
+    """Return the heading error over a log, of all contributions and of the rest (see `shares`)."""
     total = sum(parts.values(), 0.0 * parts['left'])
     before, after = (np.concatenate([[0.0], np.cumsum(each)]) for each in (total, parts['left']))
     return HeadingCurve(time, before, after)
@@ -191,13 +192,13 @@ def change_over(squares: Array, count: Array) -> Change:
     """
     Return root mean squares before and after, and the interval of their difference.
 
-    Bootstrap intervals are too narrow where there are few parts. So it is that of the jackknife
-    (Tukey 1958): each part is left out in turn, and the change has Student's distribution.
+    Bootstrap intervals are too narrow for few parts, so the jackknife is used (Tukey 1958): each
+    part is left out in turn, and the change has Student's distribution.
 
     Parameters
     ----------
     squares : sums of squares of each part, before and after, shape (parts, 2)
-    count : how many were summed in each, shape (parts,)
+    count : numbers of squares in the sums, shape (parts,)
 
     """
     before, after = np.sqrt(squares.sum(axis=0) / count.sum())

@@ -9,14 +9,13 @@
 # under the License.
 
 """
-DataQuality: what is wrong with a record before any gyro is blamed.
+Checks of a record for faults that are not errors of the gyro.
 
-It is reported, and what it touches is not used; nothing of it is fitted.
+Faults are reported, and the samples concerned are not used; no fault is fitted.
 
-A log without any of it brings a finding here in at most one case of a thousand: each of the five
-that chance could make (lost and repeated samples, outliers, a limit on two sides) has a level of
-2e-4.
-Steps of codes and units need no chance, but a size that matters.
+The false-alarm rate for a log without faults is at most 1e-3: each of the five tests (lost
+samples, repeated samples, outliers, a limit on either side) has a level of 2e-4. Quantization and
+units are reported if they are large enough to matter.
 
 """
 
@@ -62,34 +61,34 @@ import numpy as np
 from scipy import stats
 from scipy.ndimage import binary_dilation, uniform_filter1d
 
-#: Chance of a false alarm of each check.
+#: False-alarm probability of each check.
 LEVEL = 2e-4
-#: A step of codes matters from this part of the white noise on; a step of the reference from this
-#: part of its variance on.
+#: Least step of codes that matters, as a share of the white noise; the same for a step of the
+#: reference, as a share of the variance.
 STEP, REFERENCE_STEP = 0.2, 0.02
-#: Near a limit the noise decides whether a sample is cut; within so many standard deviations of it
-#: none is used.
+#: Samples whose expected output is within so many standard deviations of a limit are not used,
+#: because noise determines whether they are clipped.
 _NEAR_LIMIT = 4.0
-#: Share of the changes of a heading that are not on a line with the two before, above which its
-#: steps are those of an encoder; in a calculated motion, rates are held or grow evenly.
+#: Least share of the changes of an encoder heading that are not collinear with the two before; in
+#: a calculated motion, rates are constant or change evenly.
 _DISORDER = 0.1
 
 
 @dataclass(frozen=True)
 class DataQuality:
     """
-    What is wrong with a record, and what of it is to be used.
+    Faults of a record, and the samples to use.
 
     Attributes
     ----------
     findings : one for each cause
-    remarks : what a person should know, one sentence each
+    remarks : for people, one sentence each
     trusted : the samples to use, shape (n,)
-    factor : what the output is multiplied by to be in rad/s; 1 where the unit is right
-    limit : beyond which the output does not go, rad/s after the factor; None where it shows none
-    step : between codes of the output, rad/s after the factor; 0 where it does not matter
-    heading_step : between codes of the reference heading, rad; 0 where it has none
-    update_interval : of a reference that is held in between, s; None where each sample renews it
+    factor : by which the output is multiplied to be in rad/s; 1 if the unit is right
+    limit : largest absolute output, rad/s after the factor; None without a limit
+    step : quantization step of the output, rad/s after the factor; 0 if it does not matter
+    heading_step : quantization step of the reference heading, rad; 0 without one
+    update_interval : of a reference that is held in between, s; None if it is new in each sample
 
     """
 
@@ -105,12 +104,12 @@ class DataQuality:
 
 def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
     """
-    Look for what is wrong with a record.
+    Check a record.
 
     Parameters
     ----------
-    log : with output; a rate table without time is looked at for its unit alone
-    model : what the simulation knows already: its steps and its limit are no findings
+    log : with output; of a rate table without time only the unit is checked
+    model : of the simulation; its quantization and saturation are no findings
 
     """
     log, notes = prepared(log)
@@ -119,7 +118,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
     line = None if rate is None else line_between(log.time, rate, output)
     factor, units = 1.0, []
     if rate is not None and line is not None:
-        # a factor in addition to the scale that a model has
+        # a factor in addition to the scale factor of the model
         own = 1.0 if model is None else scale_of(model, rate)
         ratio, deviation = line.factor / own, line.deviation / abs(own)
         name = unit_of_scale(ratio, deviation)
@@ -142,16 +141,16 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
 
 
 def decided(clean: DataQuality) -> DataQuality:
-    """Say what is done about the unit; a factor that may be of the gyro is a scale error."""
+    """Return the treatment of the unit; a factor that a gyro may have is a scale factor error."""
     if clean.factor == 1.0:
         return clean
     if is_far(clean.factor):
-        note = (f'The output was multiplied by {clean.factor:.6g} first, and a new model is for '
-                'an output so corrected: correct the unit or the sign of the log (its column, '
+        note = (f'The output was multiplied by {clean.factor:.6g} first, and a new model applies '
+                'to the corrected output: correct the unit or the sign of the log (its column, '
                 '--sensitivity, --invert) before it is compensated.')
         return replace(clean, remarks=(*clean.remarks, note))
-    note = (f'The output was not multiplied by {clean.factor:.6g}, for that may be of the gyro: '
-            'a new model has it as a scale factor error.')
+    note = (f'The output was not multiplied by {clean.factor:.6g}, as this factor may belong to '
+            'the gyro: a new model contains it as a scale factor error.')
     return replace(clean, factor=1.0, step=clean.step / clean.factor,
                    limit=None if clean.limit is None else clean.limit / clean.factor,
                    remarks=(*clean.remarks, note))
@@ -164,7 +163,7 @@ def _sized(name: str, value: float, half: float, p_value: float, evidence: str,
 
 
 def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
-    """Look at the clock: lost samples are a finding; jitter, bursts and pace are remarks."""
+    """Check the stamps: lost samples are a finding; bursts and clock drift are remarks."""
     assert log.time is not None
     without = np.count_nonzero(~known)
     remarks = [f'{without} samples have no output, and are left out.'] if without else []
@@ -186,7 +185,7 @@ def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
 
 
 def _remarks_of_pace(stamps: Stamps) -> Iterator[str]:
-    """Say if the interval differs between the ends of the log beyond what jitter makes of it."""
+    """Give a remark if the interval differs between the ends of the log by more than jitter."""
     number = np.arange(len(stamps.time)) + np.concatenate([[0], np.cumsum(stamps.lost)])
     third = len(number) // 3
     if third < 30:
@@ -204,7 +203,7 @@ def _remarks_of_pace(stamps: Stamps) -> Iterator[str]:
 
 
 def _of_reference(found: DataQuality, log: Log) -> DataQuality:
-    """Look at the reference: steps of its heading, and values that are held."""
+    """Check the reference for quantization of its heading and for held values."""
     assert log.time is not None
     heading = log.reference_rate is None and log.reference_heading is not None
     values = log.reference_heading if heading else log.reference_rate
@@ -212,14 +211,14 @@ def _of_reference(found: DataQuality, log: Log) -> DataQuality:
         return found
     step = encoder_step(values) if heading else 0.0
     update = update_interval(log.time, values, step)
-    note = [f'The reference is renewed every {1000.0 * update:.4g} ms only, and held in between; '
+    note = [f'The reference is updated every {1000.0 * update:.4g} ms, and held in between; '
             'it is interpolated.'] if update else []
     return replace(found, heading_step=step, update_interval=update,
                    remarks=(*found.remarks, *note))
 
 
 def encoder_step(heading: Array) -> float:
-    """Return the step of a reference heading, rad; 0 without one or with a calculated motion."""
+    """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
     known = heading[np.isfinite(heading)]
     step = codes_of(known).step
     change = np.diff(known)
@@ -229,10 +228,10 @@ def encoder_step(heading: Array) -> float:
 
 
 def update_interval(time: Array, values: Array, step: float) -> float | None:
-    """Return the interval at which a held reference is renewed, s; None if by each sample."""
+    """Return the interval between updates of a held reference, s; None if each sample is new."""
     change = np.diff(values)
     renewed = np.flatnonzero(np.isfinite(change) & (change != 0.0))
-    # Small changes may hide in a step.
+    # Changes of less than a step may be lost.
     fast = np.abs(change[renewed[1:]]) > 2.5 * step
     gaps = np.diff(renewed)[fast]
     if len(gaps) < 20 or np.quantile(gaps, 0.1) < 2.0:
@@ -244,7 +243,7 @@ def update_interval(time: Array, values: Array, step: float) -> float | None:
 
 def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Line | None,
                 model: GyroModel | None, known: Mask, log: Log) -> DataQuality:
-    """Look at the samples of the gyro: codes, limit, repeats and outliers."""
+    """Check the samples of the gyro for quantization, limits, repeats and outliers."""
     codes, seen = codes_of(output[known]), compare(output, rate, line)
     limit = limit_of(codes, seen, LEVEL)
     at_limit = np.zeros(len(output), dtype=bool) if limit is None else limit.reached(seen.output)
@@ -254,13 +253,13 @@ def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Lin
         limit, at_limit, good = None, np.zeros_like(at_limit), known
         repeated = repeated_samples(seen, codes, band, good, LEVEL)
     good = good if repeated is None else good & ~repeated.repeats
-    # Samples next to those that a dead band holds are the tail of the noise that gets out of it.
+    # Samples next to a dead band are the tail of the noise outside it.
     outlying = outlying_samples(seen, good if band is None else good & ~binary_dilation(
         band.holds(seen.output), iterations=SIDE), 0.5 * codes.step, LEVEL)
     good = good if outlying is None else good & ~outlying.samples
     free = np.ones(len(output), dtype=bool)
     if limit is not None and seen.expected is not None:
-        # what no limit cuts, by what is expected, for the noise of the samples would bias it
+        # by the expected output: a selection by the measured output would be biased by its noise
         near = _NEAR_LIMIT * max(seen.white, seen.scatter)
         free = ~((seen.expected > limit.high - near) | (seen.expected < limit.low + near))
     findings = (*found.findings, *_of_codes(codes, seen, limit, at_limit, model),
@@ -280,7 +279,7 @@ def _knows(model: GyroModel | None, name: str, value: float) -> bool:
 
 def _of_codes(codes: Codes, seen: Compared, limit: Limit | None, at_limit: Mask,
               model: GyroModel | None) -> Iterator[Finding]:
-    """Give steps and limit of the output, unless a model has them."""
+    """Give quantization and saturation of the output, unless they are in the model."""
     if (codes.step >= STEP * seen.white and codes.step
             and not _knows(model, 'quantization', codes.step)):
         chance = float(np.exp(-min(codes.counts.sum() * codes.aligned ** 2, 700.0)))
@@ -297,7 +296,7 @@ def _of_codes(codes: Codes, seen: Compared, limit: Limit | None, at_limit: Mask,
 
 def _of_single_samples(repeated: RepeatedSamples | None, outlying: Outliers | None, log: Log,
                        step: float, white: float) -> Iterator[Finding]:
-    """Give repeated samples and outliers, and the step of the reference if it adds variance."""
+    """Give repeated samples, outliers, and the step of the reference if it adds much variance."""
     assert log.time is not None
     if repeated is not None:
         count = int(np.count_nonzero(repeated.repeats))
@@ -310,8 +309,8 @@ def _of_single_samples(repeated: RepeatedSamples | None, outlying: Outliers | No
         count = int(np.count_nonzero(outlying.samples))
         first = log.time[int(np.argmax(outlying.samples))]
         yield _sized('outliers', count, 0.0, outlying.p_value,
-                     f'{count} single samples are up to {outlying.largest:.0f} standard '
-                     f'deviations off their neighbours, the first at {first:.3f} s')
+                     f'{count} single samples differ from their neighbours by up to '
+                     f'{outlying.largest:.0f} sigma, the first at {first:.3f} s')
     interval = float(np.median(np.diff(log.time)))
     if step and (not white or step ** 2 / 6.0 / (interval * white) ** 2 > REFERENCE_STEP):
         yield _sized('reference_quantization', step, 0.0, 0.0,
@@ -324,37 +323,39 @@ def _of_single_samples(repeated: RepeatedSamples | None, outlying: Outliers | No
 # the kind of the reference
 
 KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro', 'rest')
-#: Span over which the errors of gyro and reference are compared, s, and by what factor those of a
-#: course are larger than the noise of the gyro (measured in drives: 4.6 to 920, all below 8 on
-#: straight lines between fixes; simulated odometry with noise up to 0.02 deg: up to 5).
+#: Span over which the errors of gyro and reference are compared, s, and least ratio of the errors
+#: of a course to the noise of the gyro, also for a course that is straight between fixes (measured
+#: in drives: 4.6 to 920, all below 8 on straight lines between fixes; simulated odometry with
+#: noise up to 0.02 deg: up to 5).
 _SPAN, _LARGER, _LARGER_OF_FIXES = 1.0, 8.0, 2.0
-#: A reference rate with more noise than this part of that of the gyro is not exact: less adds 1e-4
-#: to the variance, which logs of up to 2e8 samples do not show. Nor is a heading whose error is
-#: larger than this part of what both walk apart in a second: less is a fifth of its variance.
+#: Largest noise of an exact reference rate as a share of that of the gyro: it adds 1e-4 to the
+#: variance, which logs of up to 2e8 samples do not show. Largest error of an exact reference
+#: heading as a share of the difference of the headings over a second: a fifth of its variance.
 _NOISY, _BLURRED = 0.01, 0.25
-#: Rounding explains the error of a heading by an encoder up to this factor. Exact references know
-#: it as noise that is new in each sample; but during a rest it stands, and jumps by up to a step
-#: as the motion goes on. Up to this step, rad, that makes no slips (bench: 0.0055 deg, 50 Hz).
+#: Largest ratio of the error of an encoder heading to its rounding error. The treatment of exact
+#: references takes rounding for white noise; but it is constant at rest, and jumps by up to a step
+#: when the motion resumes. Largest step, rad, at which this causes no false slips (bench: 0.0055
+#: deg, 50 Hz).
 _EXPLAINED, _FINE = 1.5, 0.01 * DEGREE
-#: From this part of a log on, in which a shaft moves evenly or rests, its encoder is not exact.
+#: Largest `_evenness` of a motion for which an encoder is taken as exact.
 _EVEN = 0.5
-#: So many tones are looked for, each of which noise alone shows with this chance.
+#: Largest number of tones, and the probability of each in noise alone.
 _TONES, _BY_CHANCE = 10, 1e-6
-#: An error of a heading that is none but of numbers, rad.
+#: Numerical error of a heading, rad.
 _NUMERICAL = 1e-9
-#: Third differences have a correlation of -0.75 from one to the next for white noise, of -0.67 for
-#: a random walk, and of -0.5 for its integral; a motion is as smooth as that.
+#: Neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
+#: random walk, and of -0.5 for its integral, which is as smooth as a motion.
 _WHITE = -0.5
-#: Other noise of a reference rate is seen from so many standard deviations on, in this part of the
-#: log, in blocks of so many samples.
+#: Noise of a reference rate that is not white is detected from so many standard deviations on, in
+#: this quietest share of the log, in blocks of so many samples.
 _SEEN, _QUIETEST, _BLOCK = 3.0, 0.03, 25
-#: A heading between fixes is straight: nine in ten of its second differences are below this part
-#: of the largest ones.
+#: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
+#: straight between fixes.
 _STRAIGHT = 0.1
 
 
 def reference_of(log: Log, given: str | None = None) -> Reference:
-    """Return the kind of the reference of a log: as given, or as the log shows it."""
+    """Return the kind of the reference of a log: as stated, or found from the log."""
     if given is not None:
         return Reference(given, 'as given')
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
@@ -365,14 +366,14 @@ def reference_of(log: Log, given: str | None = None) -> Reference:
     lost = float(where_lost(np.isfinite(heading)).mean())
     if lost > LOST and _errs_more(log):
         return Reference('course', f'the heading is lost for {100.0 * lost:.2g} % of the log, as '
-                         'a course is at low speed, and errs by more than the gyro')
+                         'for a course at low speed, and its errors exceed those of the gyro')
     if step := encoder_step(heading):
         return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
     return Reference('motion_capture', 'the heading has no steps')
 
 
 def _errs_more(log: Log) -> bool:
-    """Tell whether a heading errs as a course does, beyond delay and scale of the gyro."""
+    """Tell whether the errors of a heading are as large as those of a course over ground."""
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     walk = white_noise(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))
@@ -383,7 +384,7 @@ def _errs_more(log: Log) -> bool:
 
 
 def limits(log: Log, reference: Reference) -> bool:
-    """Tell whether the errors of a reference, not those of the gyro, limit what a log shows."""
+    """Tell whether the errors of the reference, not those of the gyro, limit a diagnosis."""
     if log.time is None or log.output is None or reference.kind == 'rest':
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
@@ -392,7 +393,7 @@ def limits(log: Log, reference: Reference) -> bool:
     if reference.kind == 'course' or reference.known == 'as given':
         return True
     found, step = heading_errors(log), encoder_step(log.reference_heading)
-    # while a shaft rests, which may be most of a log, the error of its encoder does not show
+    # the rounding error of an encoder does not show while its shaft rests
     rounding = step / math.sqrt(12.0)
     interval = float(np.median(np.diff(log.time)))
     of_rate = math.sqrt(2.0) * rounding / interval
@@ -408,13 +409,13 @@ def _evenness(log: Log, step: float) -> float:
     """
     Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
 
-    Rounding errors are independent from sample to sample where the rate varies. At a constant rate
-    they are a saw, which exact references take for tones, and at rest they stand.
+    Rounding errors are independent from sample to sample if the rate varies. At a constant rate
+    they are a sawtooth, which passes for tones, and at rest they are constant.
 
     """
     assert log.time is not None and log.output is not None
     interval = float(np.median(np.diff(log.time)))
-    # means over a fifth of a second: the noise of single samples hides how even they are
+    # means over a fifth of a second, as the noise of single samples is too large
     rate = uniform_filter1d(bridged(log.output), max(round(0.2 * _SPAN / interval), 5))
     count = max(round(2.0 * _SPAN / interval), _BLOCK)
     blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
@@ -425,14 +426,14 @@ def _evenness(log: Log, step: float) -> float:
 @dataclass(frozen=True)
 class HeadingErrors:
     """
-    What headings of gyro and reference differ by over a second.
+    Difference of the headings of gyro and reference over a second.
 
     Attributes
     ----------
-    error : standard deviation of what does not grow with time, rad: of the reference, by stamps or
-        by vibration of the gyro
-    walk : of the gyro without that, no more than its white noise comes to, rad/√s
-    both : a walk that comes to as much as both in a second, rad/√s
+    error : standard deviation of the part that does not grow with time, rad: errors of the
+        reference, of stamps, or by vibration of the gyro
+    walk : angle random walk of the rest, at most that of the white noise of the gyro, rad/√s
+    both : angle random walk that is equivalent to the whole difference in a second, rad/√s
 
     """
 
@@ -442,17 +443,17 @@ class HeadingErrors:
 
     @property
     def larger(self) -> bool:
-        """Tell whether the error is no small part of what both walk apart in a second."""
+        """Tell whether the error is a significant part of the difference over a second."""
         return self.error > max(_BLURRED * self.both, _NUMERICAL)
 
 
 def heading_errors(log: Log) -> HeadingErrors:
     """
-    Divide the difference of the headings of gyro and reference by how it grows.
+    Separate the difference of the headings of gyro and reference by its growth over time.
 
-    Its second differences over a lag have the variance ``6 error² + 2 walk² lag``, motion that is
-    seen late, slowly or with another scale taken out. An error that was smoothed is seen from its
-    time constant on.
+    Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
+    a lag and a scale factor of the motion are fitted. An error that was smoothed shows at lags
+    beyond its time constant.
 
     """
     assert log.time is not None and log.output is not None
@@ -485,7 +486,7 @@ def heading_errors(log: Log) -> HeadingErrors:
 
 
 def _tones(difference: Array, motion: Array) -> Array:
-    """Return the tones of a gyro in what it and a rate differ by, shape (n,): no noise is one."""
+    """Return the tones in the difference of gyro and reference rate, shape (n,)."""
     left = difference - motion @ np.linalg.lstsq(motion, difference, rcond=None)[0]
     count, whole = len(left), np.zeros(len(left))
     for _ in range(_TONES):
@@ -505,10 +506,10 @@ def _tones(difference: Array, motion: Array) -> Array:
 
 def rate_noise_share(log: Log) -> float:
     """
-    Return the noise of a reference rate over that of the gyro; 0 where none is seen.
+    Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
 
-    It is looked for where the reference is most quiet. White noise has third differences of
-    alternating sign; other noise is what the gyro does not follow from sample to sample.
+    It is estimated where the reference is quietest. White noise is detected by third differences
+    of alternating sign, other noise by changes from sample to sample that the gyro does not show.
 
     """
     assert log.output is not None and log.reference_rate is not None
@@ -520,8 +521,8 @@ def rate_noise_share(log: Log) -> float:
     fast, left = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
     blocks = len(fast) // _BLOCK
     energy = np.sum(fast[: blocks * _BLOCK].reshape(blocks, _BLOCK) ** 2, axis=1)
-    # by the blocks on both sides, for those that are quiet themselves are so by chance; one with
-    # far more energy than these is a motion between two rests
+    # selected by the blocks on both sides, as a block that is quiet itself may be so by chance;
+    # one with far more energy than these is a motion between two rests
     sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
     most = np.quantile(sides, min(max(_QUIETEST, 8.0 / blocks), 1.0))
     quiet = np.repeat((sides <= most) & (energy <= 3.0 * most), _BLOCK)

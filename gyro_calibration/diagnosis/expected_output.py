@@ -9,9 +9,10 @@
 # under the License.
 
 """
-The output compared with what a straight line over the reference expects of it, sample by sample.
+The output compared with the output expected from the reference, sample by sample.
 
-Also factors and delays that a unit taken for another explains.
+The expected output is a straight line over the reference rate. Also factors and delays that result
+from confused units.
 
 """
 
@@ -28,44 +29,45 @@ import numpy as np
 from scipy import stats
 from scipy.signal import savgol_filter
 
-#: What people confuse: degrees and radians, the sense of rotation, two ranges of a gyro.
+#: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
 _CONFUSED: Mapping[str, float] = {
     'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi,
     '-pi/180': -math.pi / 180.0, '-180/pi': -180.0 / math.pi,
     '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
-#: Powers of two taken for powers of ten, and the other way round.
+#: Powers of two instead of powers of ten, and vice versa.
 _BINARY: Mapping[str, float] = {
     **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)},
     '1000/1024': 1000.0 / 1024.0,
     '1048576/1000000': 1.048576, '1000000/1048576': 1.0 / 1.048576}
 FACTORS: Mapping[str, float] = {**_CONFUSED, **_BINARY}
-#: The largest ratio of a gyro's factor to 1 in the right unit, or to the factor of another unit.
+#: Largest ratio of the factor of a gyro to 1 in the right unit, or to the factor of another unit.
 _OF_A_GYRO = 1.1
-#: Of its own, a factor is no unit unless it is as close as this.
+#: Largest relative difference between a factor and that of a unit.
 _CLOSE = 0.005
-#: The most that the standard deviation may be of the distance to 1, or of an interval for a delay.
+#: Largest standard deviation of a factor as a share of its distance to 1, and of a delay as a
+#: share of the sample interval.
 _KNOWN = 0.1
-#: The same for a factor near 1, where a factor that is so by chance would come close too often.
+#: The same for a factor near 1, where a coincidence is more frequent.
 _WELL_KNOWN = 0.02
 
 
 def unit_of_scale(factor: float, deviation: float) -> str | None:
     """
-    Return which confusion of units a factor of output over rate is, such as 'pi/180', or None.
+    Return the confusion of units, such as 'pi/180', that explains a factor, or None.
 
-    Far from 1, no gyro has such a scale factor, and its own error of up to a tenth may come on top
-    of a confusion. Near 1, the factor must be close, within two standard deviations, and known to
-    a fiftieth of its distance from 1.
+    Far from 1, no gyro has such a scale factor, and a scale factor error of up to a tenth is
+    allowed in addition to a confusion. Near 1, the factor must agree within two standard
+    deviations, and its standard deviation must be below a fiftieth of its distance from 1.
 
     Parameters
     ----------
-    factor : of the output over the rate, or over what a model makes of it
+    factor : ratio of the output to the reference rate, or to the output of a model
     deviation : its standard deviation
 
     """
     close = []
     for name, value in FACTORS.items():
-        # far from 1 there is nothing else that it could be
+        # far from 1 a confusion is the only explanation
         least, known = (_CLOSE, _KNOWN) if is_far(value) else (1e-4, _WELL_KNOWN)
         if (abs(factor - value) < max(2.0 * deviation, least * abs(value))
                 and abs(factor / value - 1.0) < _CLOSE
@@ -78,12 +80,12 @@ def unit_of_scale(factor: float, deviation: float) -> str | None:
 
 
 def is_far(factor: float) -> bool:
-    """Tell whether no gyro of the right unit has such a factor."""
+    """Tell whether a factor is not plausible for a gyro with the right unit."""
     return _ratio(factor, 1.0) > 1.4
 
 
 def _ratio(factor: float, value: float) -> float:
-    """Return by what ratio two factors differ, above 1; infinite where their signs do."""
+    """Return the ratio of two factors, above 1; infinite if their signs differ."""
     return math.inf if factor * value <= 0.0 else max(factor / value, value / factor)
 
 
@@ -105,19 +107,20 @@ def unit_of_offset(estimate: float, deviation: float, interval: float) -> str | 
     return None
 
 
-#: Length of the parabolas that give a rate from a heading, s: over one sample its steps hide it.
+#: Length of the parabolas by which a heading is differentiated, s; shorter ones would show its
+#: quantization.
 _SMOOTHING = 0.15
-#: Lengths of the blocks in which output and reference are compared, s; the shorter one where the
-#: motion averages out in the longer one.
+#: Lengths of the blocks in which output and reference are compared, s; the shorter one is used if
+#: the motion averages out in the longer one.
 _BLOCKS = (0.5, 0.1)
-#: Part of the range of the output at each end that a first line leaves out, and the number of
-#: times that a line is fitted to what is near the one before.
+#: Share of the range of the output at each end that is left out of the first fit of a line, and
+#: number of robust fits.
 _ENDS, _FITS = 0.05, 4
 
 
 @dataclass(frozen=True)
 class Line:
-    """Output = factor * rate + offset, with the deviation of the factor by scatter of parts."""
+    """Output = factor * rate + offset; standard deviation of the factor by scatter of parts."""
 
     factor: float
     offset: float
@@ -131,10 +134,11 @@ class Compared:
 
     Attributes
     ----------
-    output : without nan; what was lost is bridged
-    expected : by the reference, nan where that was lost; None without reference
+    output : without nan; gaps are interpolated
+    expected : from the reference, nan in its gaps; None without a reference
     white : standard deviation of the white noise of a sample
-    scatter : robust standard deviation of the output about the expectation; infinite without one
+    scatter : robust standard deviation of output less expected output; infinite without a
+        reference
 
     """
 
@@ -145,7 +149,7 @@ class Compared:
 
 
 def compare(output: Array, rate: Array | None, line: Line | None) -> Compared:
-    """Compare an output with what a line expects of it by the rate."""
+    """Compare an output with the line over the reference rate."""
     whole = bridged(output)
     if rate is None or line is None:
         return Compared(whole, None, white_noise(output))
@@ -156,7 +160,7 @@ def compare(output: Array, rate: Array | None, line: Line | None) -> Compared:
 
 
 def bridged(values: Array) -> Array:
-    """Return values with nan bridged by straight lines."""
+    """Return values with nan interpolated linearly."""
     known = np.isfinite(values)
     if known.all():
         return values
@@ -170,14 +174,14 @@ def integral_of(time: Array, rate: Array) -> Array:
 
 
 def angle_of(time: Array, rate: Array) -> Array:
-    """Return the integral of a rate, its curvature between samples included, shape (n,)."""
+    """Return the integral of a rate, corrected for its curvature between samples, shape (n,)."""
     slope = np.gradient(rate, time)
     step = float(np.median(np.diff(time)))
     return integral_of(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
 
 
 def reference_rate(log: Log) -> Array | None:
-    """Return the rate by the reference, rad/s, nan where it was lost; None without reference."""
+    """Return the reference rate, rad/s, nan in gaps; None without a reference."""
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         return log.reference_rate
     if (log.reference_heading is None or log.time is None
@@ -210,7 +214,7 @@ def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
 
 
 def scale_of(model: GyroModel, rate: Array) -> float:
-    """Return the slope of a model's output over the rate, between both senses of a usual speed."""
+    """Return the slope of a model's output between the 90 % quantiles of the speed, both ways."""
     speeds = np.abs(rate[np.isfinite(rate)])
     speed = float(np.quantile(speeds, 0.9)) if speeds.size else 0.0
     if speed == 0.0:
@@ -222,7 +226,7 @@ def scale_of(model: GyroModel, rate: Array) -> float:
 
 def _line(rate: Array, output: Array) -> Line | None:
     low, high = output.min(), output.max()
-    # away from the ends, where they may be cut; all if nearly all are there
+    # without the ends, which may be clipped, unless most samples are there
     good = (output > low + _ENDS * (high - low)) & (output < high - _ENDS * (high - low))
     if np.count_nonzero(good) < 8 or not np.ptp(rate[good]) > 0.3 * np.ptp(rate):
         good = np.ones(len(rate), dtype=bool)
@@ -233,7 +237,7 @@ def _line(rate: Array, output: Array) -> Line | None:
         solution = np.linalg.lstsq(columns[good], output[good], rcond=None)[0]
         off = output - columns @ solution
         good = np.abs(off) <= 5.0 * robust_deviation(off) + 1e-15
-    # the standard deviation by up to 20 parts, for the noise has colour
+    # the standard deviation by the scatter of up to 20 parts, as the noise is coloured
     columns, off = columns[good], off[good]
     pieces = np.minimum(np.arange(len(off)) * min(20, len(off) // 2) // len(off), 19)
     scores = np.array([np.bincount(pieces, column * off) for column in columns.T])

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The model with what was found: effects, limit, steps, values, covariance, noise and origin."""
+"""The model extended by the findings: effects, limits, values, covariance, noise and origin."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from gyro_calibration.model.gyro_model import GyroModel, same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: What must be known of a scale factor error for it to be believed.
+#: Limits of a plausible scale factor error and its standard deviation.
 LIMITS = Limits()
-#: Effects that count from somewhere -> what comes of it with them to count from elsewhere.
+#: Effects with a reference value -> the effect that compensates a change of that value.
 _MADE_UP_BY: Mapping[str, Effect] = {
     'bias_temperature': BIAS, 'supply_sensitivity': BIAS,
     'scale_factor_temperature': SCALE_FACTOR_ERROR, 'bias_temperature_quadratic': BIAS_TEMPERATURE}
@@ -44,15 +44,15 @@ _MADE_UP_BY: Mapping[str, Effect] = {
 def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequence[DataQuality],
                   findings: Sequence[Finding], noise: Noise, bias_deviation: float) -> GyroModel:
     """
-    Return the extended model: the one that was given, where no finding is of the gyro.
+    Return the extended model; the given one if no finding concerns the gyro.
 
     Parameters
     ----------
-    model : of the simulation, `calibrated`; None where that was an ideal gyro
+    model : of the simulation, `calibrated`; None for an ideal gyro
     found : the causes and their values, none of them `left_out`
     quality : of each log
-    findings : all of them; of a noise that is given, only the figures among them become others
-    noise : of what the causes leave
+    findings : all; of the noise of a given model, only the figures with a finding are replaced
+    noise : of the residual
     bias_deviation : standard deviation of the bias, rad/s
 
     """
@@ -62,7 +62,7 @@ def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequenc
               or any(each.candidate.cause in CATALOGUE and found.explaining(place)
                      for place, each in enumerate(found.named)))
     new = extended(given, found, bias_deviation) if fitted else given
-    # limit and steps of the output, if they are findings, of the first log with them; exact
+    # limit and quantization of the output, if they are findings, from the first log; exact
     exact: dict[str, Term] = {}
     for clean in quality:
         sizes = {'saturation': clean.limit, 'quantization': clean.step}
@@ -84,7 +84,7 @@ def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequenc
 
 
 def extended(model: GyroModel, found: FittedValues, bias_deviation: float) -> GyroModel:
-    """Return a model with all named effects of the gyro, bias and scale factor put right."""
+    """Return a model with all named effects of the gyro, and with corrected bias and scale."""
     new, spread = _values(found, bias_deviation)
     moves = _moves(found) and not implausible_scale(found)
     return with_terms(model, new, spread, [each.channels.output[each.kept] + each.added[each.kept]
@@ -95,7 +95,7 @@ def extended(model: GyroModel, found: FittedValues, bias_deviation: float) -> Gy
 
 def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Sequence[Array],
                temperatures: Sequence[Array]) -> GyroModel:
-    """Return a model with more terms of covariance `spread`, and ranges that hold the logs."""
+    """Return a model with more terms of covariance `spread`, and ranges that include the logs."""
     was = bool(model.terms)
     return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
                    rate_range=wider(model.rate_range, outputs, was),
@@ -104,7 +104,7 @@ def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Se
 
 def noted(new: GyroModel, given: GyroModel, quality: Sequence[DataQuality],
           findings: Sequence[Finding] = ()) -> GyroModel:
-    """Return a new model whose origin names its ambiguities, output factors and predecessor."""
+    """Return a new model with its ambiguities, output factors and predecessor in its origin."""
     used = {term.effect.name for term in new.terms if term not in given.terms}
     notes = notes_of([each for each in findings if each.effect in used],
                      [clean.factor for clean in quality])
@@ -112,7 +112,7 @@ def noted(new: GyroModel, given: GyroModel, quality: Sequence[DataQuality],
 
 
 def notes_of(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str, object]:
-    """Return what a model's file says of ambiguous findings and of factors of the output."""
+    """Return the notes on ambiguous findings and on factors of the output for a model file."""
     sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
             for each in findings if each.ambiguous_with]
     mended = list(factors) if any(factor != 1.0 for factor in factors) else []
@@ -121,14 +121,14 @@ def notes_of(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str,
 
 
 def origins_before(model: GyroModel) -> dict[str, object]:
-    """Return the origins of a model side by side, for its file may have only few levels."""
+    """Return the origins of a model as a list, because its file has a limited nesting depth."""
     earlier = model.origin.get('before', [])
     own = {name: value for name, value in model.origin.items() if name != 'before'}
     return {'before': [own, *(earlier if isinstance(earlier, list) else [earlier])]} if own else {}
 
 
 def calibrated(model: GyroModel) -> GyroModel:
-    """Return the same gyro with a self-calibration put into its terms, to the first order."""
+    """Return a model with its self-calibration merged into its terms, to first order."""
     known = model.self_calibration
     if known is None:
         return model
@@ -142,7 +142,7 @@ def calibrated(model: GyroModel) -> GyroModel:
 
 
 def left_out(model: GyroModel, found: FittedValues) -> tuple[Named, ...]:
-    """Return the gyro's lasting causes that do not merge with its model's, for one of each."""
+    """Return the lasting causes of the gyro that cannot be merged with terms of its model."""
     terms, out = model.terms, []
     for place, known in enumerate(found.named):
         if known.candidate.cause in CATALOGUE and not happens_once(known):
@@ -154,10 +154,10 @@ def left_out(model: GyroModel, found: FittedValues) -> tuple[Named, ...]:
 
 def implausible_scale(found: FittedValues) -> bool:
     """
-    Tell whether the scale factor error that was found is implausible.
+    Tell whether the fitted scale factor error is implausible.
 
-    Where the gyro hardly turns, the noise of the reference passes for motion that the gyro does
-    not see: an error of up to -100 %.
+    If the gyro hardly turns, the noise of the reference passes for motion that the gyro does not
+    measure, which gives a scale factor error of up to -100 %.
 
     """
     scale = found.scale_factor_error
@@ -172,7 +172,7 @@ def _moves(found: FittedValues) -> bool:
 # values
 
 def _values(found: FittedValues, bias_deviation: float) -> tuple[list[Term], Array]:
-    """Return what was found as terms, and the covariance of all values in a row, 0 if exact."""
+    """Return the fitted terms, and the covariance of all their values, 0 for exact ones."""
     implausible = implausible_scale(found)
     scale = 0.0 if implausible else found.scale_factor_error.value
     # the mean bias of the logs given that scale factor error
@@ -212,7 +212,7 @@ def _all(terms: tuple[Term, ...], new: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def _with(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
-    """Return terms with one more, merged with that of its effect; None if they do not merge."""
+    """Return terms with one more, merged with that of its effect; None if not possible."""
     old = next((term for term in terms if term.effect.name == new.effect.name), None)
     if old is None:
         return (*terms, new)
@@ -223,7 +223,7 @@ def _with(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
 
 
 def _counted_like(old: Term, new: Term) -> list[Term]:
-    """Return a term that counts from another's reference, and the terms that make up for it."""
+    """Return a term with the reference value of another, and the terms that compensate this."""
     if new.effect.name not in _MADE_UP_BY or new.values[0] == old.values[0]:
         return [new]
     begin, value = old.values[0], new.values[1]
@@ -235,12 +235,12 @@ def _counted_like(old: Term, new: Term) -> list[Term]:
 
 
 def _one(old: Term, new: Term) -> Term | None:
-    """Return the term that does what two of one effect do; None where there is none."""
+    """Return the term that is equivalent to two terms of one effect; None without one."""
     effect, shapes = new.effect, len(new.effect.shapes)
     if effect.stage == 'output':
-        # Logs are compared before limits and steps, so that those of a model are not simulated.
+        # Logs are compared without limits and quantization of the model.
         return new
-    # Delays add up, and so do the paces of clocks, as they hardly differ from 1.
+    # Delays add up, and so do clock rate errors, to first order.
     first = 0 if effect.moved is not None else shapes
     if new.values[:first] != old.values[:first] or (first and not effect.coefficients) or any(
             each.default is not None for each in effect.coefficients):
@@ -251,12 +251,12 @@ def _one(old: Term, new: Term) -> Term | None:
 
 
 def _is_within(term: Term) -> bool:
-    """Tell whether the values of a term are within the bounds that a file has for them."""
+    """Tell whether the values of a term are within the bounds of its effect."""
     return all(parameter.bounds[0] <= value <= parameter.bounds[1]
                for parameter, value in zip(term.effect.parameters, term.values))
 
 
-# how well known
+# covariance
 
 def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array | None:
     """
@@ -264,9 +264,9 @@ def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array |
 
     Parameters
     ----------
-    model : whose values come first, new ones being independent of them
-    new : the terms that it is given
-    spread : covariance of all their values in a row
+    model : whose values come first; new ones are independent of them
+    new : the added terms
+    spread : covariance of all their values
 
     """
     if model.terms and model.covariance is None:
@@ -287,7 +287,7 @@ def _fitted(terms: Sequence[Term]) -> Array:
 
 
 def _moved(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
-    """Give terms of which one value, by its place in a row, is another one."""
+    """Give terms of which one value, by its index among all values, is changed."""
     for term in terms:
         here = 0 <= place < len(term.values)
         yield replace(term, values=(*term.values[:place], term.values[place] + change,
@@ -296,7 +296,7 @@ def _moved(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
 
 
 def wider(known: tuple[float, float], parts: Sequence[Array], was: bool) -> tuple[float, float]:
-    """Return a range that holds the logs, too: the old one without logs, theirs if it is new."""
+    """Return a range that includes the logs; only theirs if the model had none before."""
     if not parts:
         return known
     low, high = min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What a diagnosis finds, as records, and the same as data for files."""
+"""The results of a diagnosis as records, and as data for files."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 
 SCHEMA = 'gyro_calibration/diagnosis/2'
-#: Smaller probabilities are not stated: the assumptions on the noise do not carry them.
+#: Least probability that is stated; the assumptions on the noise do not justify smaller ones.
 LEAST_PROBABILITY = 1e-4
-#: A lasting cause is suspected where it shows more than chance does at so many times the level.
+#: Ratio of the level at which a lasting cause is suspected to that at which it is established.
 SUSPECTED = 5.0
-#: A cause that explains the data less well than the best by more than this, in logarithms of the
-#: likelihood (2.5 sigma), is ruled out.
+#: Least deficit in log-likelihood, relative to the best cause, of a cause that is ruled out (2.5
+#: sigma).
 RULED_OUT = 3.2
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its interval of 95 %, in SI."""
+    """A value with its 95 % interval, in SI."""
 
     estimate: float
     interval: tuple[float, float]
@@ -41,17 +41,17 @@ class Estimate:
 
     @classmethod
     def about(cls, value: float, half: float, unit: str) -> Estimate:
-        """Return a value with an interval of half a length on each side."""
+        """Return a value with an interval of a half-width on each side."""
         return cls(value, (value - half, value + half), unit)
 
     @property
     def deviation(self) -> float:
-        """Return the standard deviation of which the interval has 1.96 each way."""
+        """Return the standard deviation: the half-width of the interval over 1.96."""
         return (self.interval[1] - self.interval[0]) / (2.0 * 1.96)
 
     @property
     def holds_zero(self) -> bool:
-        """Return whether the interval holds zero."""
+        """Return whether the interval includes zero."""
         return self.interval[0] <= 0.0 <= self.interval[1]
 
     def figures(self) -> dict[str, Any]:
@@ -60,7 +60,7 @@ class Estimate:
 
 
 def probabilities(lacks: Mapping[str, float]) -> dict[str, float]:
-    """Return how probable causes are by what each lacks in log-likelihood, likeliest first."""
+    """Return the probabilities of causes by their deficits in log-likelihood, largest first."""
     weights = {name: math.exp(-min(max(lack, 0.0), 700.0)) for name, lack in lacks.items()}
     return {name: max(weight / sum(weights.values()), LEAST_PROBABILITY)
             for name, weight in sorted(weights.items(), key=lambda each: -each[1])}
@@ -69,15 +69,15 @@ def probabilities(lacks: Mapping[str, float]) -> dict[str, float]:
 @dataclass(frozen=True)
 class Gate:
     """
-    What was checked before anything is named.
+    A check before causes are named.
 
     Attributes
     ----------
     name : wrapped_heading, motion, tilt, sense, unit, time_unit or model
-    passed : None where the log does not show it
-    said : what was seen, in numbers
-    remedy : what to do where it failed
-    factor : of the output over the reference and its interval of 95 %, where it failed by that
+    passed : None if the log does not show it
+    said : the measured numbers, in words
+    remedy : what to do if it failed
+    factor : ratio of the output to the reference and its 95 % interval, if it failed by that
 
     """
 
@@ -101,21 +101,20 @@ class Finding:
     ----------
     effect : its name in the catalogue
     cause : one sentence for people
-    parameters : name -> estimate; of what a model has too, what comes on top of its value, but for
-        figures of the noise
-    p_value : the chance that a log without it shows as much
+    parameters : name -> estimate; for an effect of the model the change of its value, except for
+        noise figures
+    p_value : the probability that a log without it shows as much
     minimum_detectable : the smallest detectable value of its first parameter, in its unit; None
         where that has no meaning
-    ambiguous_with : the names of those that the data at hand cannot rule out instead
-    separate_by : the experiment that would part them; '' where there is nothing to part
-    evidence : what in the data shows it, one sentence with numbers in units of people
-    along : the variable along which it shows, a key of `Diagnosis.curves`; '' where there is none
-    status : 'established', or 'suspected' where it is not confirmed on stretches that took no part
-        in choice and fit
-    probability : of it and of those that may be in its place, by name; empty where not computed
-    share_of_heading_error : part of the mean square of the heading error over 60 s that it
-        explains; None where not computed
-    where : from and to, s, of an effect in part of the log; None of the whole log
+    ambiguous_with : the names of causes that these data cannot rule out instead
+    separate_by : the experiment that would distinguish them; '' without any
+    evidence : one sentence with numbers in units of people
+    along : the variable along which it shows, a key of `Diagnosis.curves`; '' without one
+    status : 'established', or 'suspected' if it is not confirmed on held-out stretches
+    probability : of the cause and of its alternatives, by name; empty if not computed
+    share_of_heading_error : share of the cause in the mean square of the heading error over 60 s;
+        None if not computed
+    where : begin and end, s, of an effect in part of the log; None for the whole log
     remedy : what to do about it
 
     """
@@ -150,7 +149,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Structure without a name: its variable, its share of the residual's variance, its chance."""
+    """Structure without a name: variable, share of the residual's variance, and p-value."""
 
     along: str
     share_of_variance: float
@@ -170,7 +169,7 @@ class Change:
     Attributes
     ----------
     before, after : the errors
-    interval : of 95 % of what is won, before less after; None where a single part was held out
+    interval : 95 % interval of before less after; None if a single part was held out
 
     """
 
@@ -180,7 +179,7 @@ class Change:
 
     @property
     def worse(self) -> bool:
-        """Tell whether the error grew beyond chance."""
+        """Tell whether the error increased significantly."""
         return self.interval is not None and self.interval[1] < 0.0
 
     def figures(self) -> dict[str, Any]:
@@ -192,14 +191,14 @@ class Change:
 @dataclass(frozen=True)
 class Gain:
     """
-    What the extension wins on parts that took no part in the choice or the fit.
+    Reduction of errors by the extended model on parts held out of selection and fit.
 
     Attributes
     ----------
-    held_out : which parts, in words
-    rate : of the simulated against the measured rate, rad/s
-    heading : of the simulated against the measured change of heading over windows, rad; None where
-        no window is as long
+    held_out : description of the parts
+    rate : errors of the simulated rate, rad/s
+    heading : errors of the simulated change of heading over windows, rad; None if the parts are
+        shorter than a window
     window : s
     models : name -> root mean square of the heading error of given, plain (bias, scale factor and
         delay alone) and extended model, rad
@@ -214,7 +213,7 @@ class Gain:
 
     @property
     def worse(self) -> bool:
-        """Tell whether the extension is worse than nothing, beyond chance."""
+        """Tell whether the extended model has significantly larger errors."""
         return any(change is not None and change.worse for change in (self.rate, self.heading))
 
     def figures(self) -> dict[str, Any]:
@@ -228,7 +227,7 @@ class Gain:
 @dataclass(frozen=True)
 class Curve:
     """
-    The residual along one variable, in bins, for pictures: arrays of shape (bins,), in SI.
+    The residual along one variable, in bins, for charts: arrays of shape (bins,), in SI.
 
     Attributes
     ----------
@@ -237,10 +236,10 @@ class Curve:
     at : middle of each bin
     before, after : mean of the residual there, against the model that was given and against the
         extended one, rad/s
-    deviation : standard deviation of these means by the noise alone, slow noise too, rad/s; along
-        the frequency, where amplitudes stand in place of means, the usual one
-    simulated : mean error, output less true rate, that the simulation with the given model has
-        there, rad/s; the measured one is the sum of this and `before`
+    deviation : standard deviation of these means by noise alone, slow noise included, rad/s; along
+        frequency, where amplitudes replace means, the root mean square amplitude
+    simulated : mean error, output less true rate, of the simulation with the given model there,
+        rad/s; the measured one is the sum of this and `before`
 
     """
 
@@ -256,14 +255,14 @@ class Curve:
 @dataclass(frozen=True)
 class Trace:
     """
-    A stretch where simulation and measurement differ most: arrays of shape (n,), s and rad/s.
+    Measured and simulated output over time: arrays of shape (n,), s and rad/s.
 
     Attributes
     ----------
     time : s, as in the log
     measured : output of the gyro
-    simulated, extended : output that the given model and the extended one have for the same
-        motion, without noise
+    simulated, extended : output of the given and of the extended model for the same motion,
+        without noise
 
     """
 
@@ -275,7 +274,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class HeadingCurve:
-    """Heading error over the log, if the simulation is believed: arrays of shape (n,), s, rad."""
+    """Heading error of the simulation over the log: arrays of shape (n,), s, rad."""
 
     time: Array
     before: Array
@@ -295,13 +294,13 @@ class NoiseCurve:
 @dataclass(frozen=True)
 class Reference:
     """
-    What a log is compared with.
+    The reference of a log.
 
     Attributes
     ----------
     kind : rate_command, encoder, motion_capture, course, odometry, gyro or rest
-    known : how the kind is known, in words
-    noise : name -> size in SI of the reference's own errors; empty where it is taken as exact
+    known : how the kind was found, in words
+    noise : name -> size of the errors of the reference, SI; empty if it is taken as exact
 
     """
 
@@ -317,28 +316,27 @@ class Reference:
 @dataclass(frozen=True)
 class Diagnosis:
     """
-    All that was found.
+    The results of a diagnosis.
 
     Attributes
     ----------
     findings : named causes, the strongest first
     unexplained : structure without a name
     noise : of the residual
-    simulated : noise of the model that was given; all 0 where none was
-    gain : None where nothing is offered that could win
-    before, model : the simulation that was put to the test, and the extended one (the same where
-        nothing is offered)
+    simulated : noise of the given model; all 0 without one
+    gain : of the extended model; None if there is nothing to compare
+    before, model : the tested simulation, and the extended one (the same if none is offered)
     cannot_show : cause -> why these logs cannot show it
     curves : the residual along each variable
-    heading, noise_curve, trace : for pictures
-    remarks : what a person should know, one sentence each (what was filled, held back, chosen)
-    false_alarm_rate : of the whole diagnosis, a log
+    heading, noise_curve, trace : for charts
+    remarks : for people, one sentence each
+    false_alarm_rate : per diagnosis
     logs : names of the files
-    method : how it was computed, for people; where it is empty, as a log in time is
-    gates : what was checked before anything was named
-    reference : what the log was compared with; None where several logs or a rate table were given
-    heading_shares : cause, 'reference' or 'left' -> part of the mean square of the heading error
-        over 60 s; empty where not computed
+    method : how it was computed, for people; empty for the method of logs in time
+    gates : checks before causes were named
+    reference : of the log; None for several logs or a rate table
+    heading_shares : cause, 'reference' or 'left' -> share in the mean square of the heading error
+        over 60 s; empty if not computed
 
     """
 

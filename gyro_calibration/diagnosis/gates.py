@@ -9,12 +9,12 @@
 # under the License.
 
 """
-Which logs and models are refused, and whether gyro and reference belong together.
+Conditions for a diagnosis: usable logs and models, and a reference of the motion of the gyro.
 
-Gates: do gyro and reference show the same motion, in the same units, time and sense? Headings are
-compared as headings. Over spans, the change of the reference is regressed on the integral of the
-output and on time, at the lag at which they agree best. A factor far from 1 is a unit, a sign or a
-unit of time; a low coherence over every length of span is another motion, or an axis that tilts. A
+The gates check whether gyro and reference show the same motion, in the same units, time and sense.
+Over spans, the change of the reference heading is regressed on the integral of the output and on
+time, at the lag of the best agreement. A factor far from 1 indicates a unit, a sign or a unit of
+time; a low coherence over all lengths of span indicates another motion, or an axis that tilts. A
 gate that fails is the only finding.
 
 """
@@ -42,33 +42,35 @@ from gyro_calibration.logs.quality import codes_of, white_noise
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
-#: Least samples and seconds of a log in time, rows of a rate table, and part of a log with values.
+#: Least number of samples and least duration, s, of a log in time, least number of rows of a rate
+#: table, and least share of samples with values.
 FEWEST, SHORTEST, FEWEST_ROWS, LEAST = 100, 20.0, 8, 0.1
-#: Rows that a rate table has at most; more are samples whose time is missing.
+#: Largest number of rows of a rate table; more are samples whose time is missing.
 MOST_ROWS = 5000
-#: Of a log, s: three years, or stamps in another unit.
+#: Longest log, s: three years; a longer one has stamps in another unit.
 LONGEST = 1e8
-#: Without a reference, a gyro is at rest while its means over 1 s stay this close together, rad/s.
+#: Largest deviation of means over 1 s from their median at rest, without a reference, rad/s.
 REST = 3.0 * DEGREE
-#: A reference that turns by less than this, rad, on top of what its noise adds up to in so many
-#: standard deviations, may stand still; it does where the output follows it by no more than so
-#: many standard deviations.
+#: A reference may be at rest if it turns by less than this, rad, plus so many standard deviations
+#: of its integrated noise; it is if the output depends on it by less than so many standard
+#: deviations.
 _STILL, _ADDED, _FOLLOWED = 1.0 * DEGREE, 4.0, 4.0
-#: An output within this part of its spread of a line over the reference was made from it.
+#: Largest residual, as a share of the spread of the output, of an output that was computed from
+#: the reference.
 _COPY = 1e-6
-#: Steps of print up to this part of the spread hide in a copy.
+#: Largest rounding step of such an output in the file, as a share of the spread.
 _PRINT = 1e-5
-#: A model in deg/s is off by 57.3; with errors of its own it is off by something near it.
+#: Largest deviation, as a factor, of a confusion of deg and rad from 57.3.
 _NEAR = 1.3
-#: No gyro is noisier or quieter than its model by more than this.
+#: Largest plausible ratio of the noise of a log to that of the model, and its inverse.
 _ABSURD = 1000.0
-#: Nor turns it faster than its model was made for by more than this.
+#: Largest plausible ratio of the rates of a log to those of the model.
 _TOO_FAST = 20.0
 
 
 def refuse(log: Log, model: GyroModel | None = None) -> None:
     """
-    Refuse a log, or a model for it, that allows no diagnosis.
+    Raise for a log, or a model of it, that cannot be diagnosed.
 
     Raises
     ------
@@ -91,21 +93,21 @@ def refuse(log: Log, model: GyroModel | None = None) -> None:
 
 
 def model_gate(log: Log, model: GyroModel) -> Gate:
-    """Tell whether a model is of the units of a log."""
+    """Check whether model and log have the same units."""
     try:
         _refuse_units(prepared(log)[0], output_of(log), model)
     except DataRefused as refusal:
         evidence, _, remedy = str(refusal).partition('; ')
         return Gate('model', False, evidence, remedy)
-    return Gate('model', True, 'the model is of the units of the log')
+    return Gate('model', True, 'model and log have the same units')
 
 
 def prepared(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
-    Return a log with the reference that is used, and the remarks on that.
+    Return a log with the reference that is used, and remarks on it.
 
-    The rate is dropped if it is known in less than half as many samples as the heading. A rate
-    that is nothing but noise becomes that of a rest.
+    The reference rate is dropped if it has less than half as many samples as the heading. A rate
+    that consists of noise alone is replaced by that of a rest.
 
     """
     if log.time is None:
@@ -122,12 +124,12 @@ def prepared(log: Log) -> tuple[Log, tuple[str, ...]]:
     if rate is None or not np.nanmax(np.abs(rate)) > 0.0 or not rests(log):
         return log, notes
     return replace(log, reference_rate=0.0 * rate, reference_heading=None), (
-        *notes, 'What the reference shows is its noise, which the gyro does not see; '
-        'it is taken to be at rest.')
+        *notes, 'The reference shows noise alone, which the gyro does not measure; '
+        'the gyro is taken to be at rest.')
 
 
 def evened(log: Log) -> Log:
-    """Return a log with references interpolated where they come more slowly than the output."""
+    """Return a log with references interpolated if they have a lower rate than the output."""
     if log.time is None:
         return log
     rate, heading = (None if values is None else between_values(log.time, values)
@@ -136,7 +138,7 @@ def evened(log: Log) -> Log:
 
 
 def rests(log: Log) -> bool:
-    """Tell whether a gyro rests all the time: by reference, moving flag, or its own output."""
+    """Tell whether a gyro is at rest in the whole log: by reference, moving flag, or output."""
     rate = reference_rate(log)
     if rate is not None:
         return not np.nanmax(np.abs(rate)) > 0.0 or _stands(log, rate)
@@ -151,14 +153,14 @@ def rests(log: Log) -> bool:
 
 
 def _stands(log: Log, rate: Array) -> bool:
-    """Tell whether a reference is noise at rest: it turns nowhere, and no output follows it."""
+    """Tell whether a reference rate is noise at rest: no rotation, and no output follows it."""
     if log.time is None or log.output is None or log.moving is not None and log.moving.any():
         return False
     steps, whole = np.diff(log.time), bridged(rate)
     noise = white_noise(whole) * math.sqrt(float(np.median(steps) * steps.sum()))
     if np.ptp(np.cumsum(whole[1:] * steps)) > _STILL + _ADDED * noise:
         return False
-    # In units of its own, for a rate of next to nothing would be lost against the line's constant.
+    # Scaled, as a very small rate would be numerically zero next to the constant of the line.
     line = line_between(log.time, rate / np.nanmax(np.abs(rate)), log.output)
     return line is None or abs(line.factor) < _FOLLOWED * line.deviation
 
@@ -185,7 +187,7 @@ def _refuse_few(time: Array, output: Array) -> None:
             'tenth are needed: record again, and repair the line if it loses samples')
     if time[-1] - time[0] < SHORTEST:
         raise DataRefused(f'the log lasts {time[-1] - time[0]:.1f} s; '
-                          f'a diagnosis wants at least {SHORTEST:g} s: record longer')
+                          f'a diagnosis needs at least {SHORTEST:g} s: record longer')
     if time[-1] - time[0] > LONGEST:
         raise DataRefused(f'the log lasts {time[-1] - time[0]:.3g} s by its stamps; '
                           'check that time_s is in s, or give --rate')
@@ -214,12 +216,12 @@ def _refuse_constant(output: Array) -> None:
     if share > 0.99:
         raise DataRefused(
             f'the gyro gives {values[counts.argmax()] / DEGREE:.6g} deg/s in '
-            f'{100.0 * share:.4g} % of the samples: it is dead, or its steps are coarser than all '
-            'that it measures; check it, and record again')
+            f'{100.0 * share:.4g} % of the samples: it is dead, or its quantization step exceeds '
+            'all rates of the log; check it, and record again')
 
 
 def _refuse_copy(log: Log, output: Array) -> None:
-    """Refuse a reference that was made from the output, or an output made from the reference."""
+    """Refuse a reference computed from the output, or an output computed from the reference."""
     for rate in _made_of(log):
         known = np.isfinite(rate) & np.isfinite(output)
         if np.count_nonzero(known) < FEWEST_ROWS or not np.ptp(rate[known]) > 0.0:
@@ -231,12 +233,12 @@ def _refuse_copy(log: Log, output: Array) -> None:
         if off < _COPY * spread or off < 0.5 * printed < _PRINT * spread:
             raise DataRefused(
                 f'the output is {slope:.6g} times the reference plus {offset / DEGREE:.4g} deg/s, '
-                'to the last digit: one is made of the other, without noise; give a reference of '
-                'its own, or a simulation with noise')
+                'to the last digit: one was computed from the other, without noise; give an '
+                'independent reference, or a simulation with noise')
 
 
 def _made_of(log: Log) -> list[Array]:
-    """Return the rates that an output made from the reference has: its rate, or heading steps."""
+    """Return the rates of the reference: as recorded, and by differences of the heading."""
     rates = [] if log.reference_rate is None else [log.reference_rate]
     if log.reference_heading is None or log.time is None:
         return rates
@@ -246,22 +248,22 @@ def _made_of(log: Log) -> list[Array]:
 
 
 def _refuse_units(log: Log, output: Array, model: GyroModel) -> None:
-    """Refuse a model that is absurd for the log: most likely it was written in deg/s."""
+    """Refuse a model whose values are implausible for the log, as of one written in deg/s."""
     rate = reference_rate(log)
     line = None if rate is None else line_between(log.time, rate, output)
     if rate is not None and line is not None:
         scale = scale_of(model, rate)
         if not 0.1 < abs(scale) < 10.0:
             raise DataRefused(
-                f'the model makes {scale:.4g} rad/s of each rad/s, which no gyro does: it is of '
+                f'the scale factor of the model is {scale:.4g}, which is not plausible: it has '
                 'other units; write it in rad/s, or fit it again')
-    # By the reference, for the unit of the output may be wrong itself, which is a finding.
+    # By the reference, as the unit of the output may be wrong, which is a finding.
     fastest = float(np.nanquantile(np.abs(output if rate is None else rate), 0.99))
     widest = max(abs(limit) for limit in model.rate_range)
     if fastest > _TOO_FAST * widest:
         raise DataRefused(
             f'the model is for rates up to {widest / DEGREE:.4g} deg/s, and the log goes to '
-            f'{fastest / DEGREE:.4g} deg/s: it is of other units, or of another gyro; '
+            f'{fastest / DEGREE:.4g} deg/s: it has other units, or belongs to another gyro; '
             'write it in rad/s, or fit it again')
     if log.time is not None and model.noise.angle_random_walk > 0.0:
         _refuse_noise(white_noise(output) * math.sqrt(float(np.median(np.diff(log.time)))),
@@ -269,50 +271,50 @@ def _refuse_units(log: Log, output: Array, model: GyroModel) -> None:
 
 
 def _refuse_noise(measured: float, simulated: float, resting: bool) -> None:
-    """Refuse an angle random walk that is absurd, or, at rest, off by the ratio of deg and rad."""
+    """Refuse an angle random walk that is implausible, or, at rest, in deg instead of rad."""
     ratio = measured / simulated
     if resting and is_confused(ratio) or not 1.0 / _ABSURD < ratio < _ABSURD:
         raise DataRefused(
             f'the log has {ratio:.3g} times the angle random walk of the model, {simulated:.3g} '
-            'rad/√s: the model is of other units, or of another gyro; write its noise in rad/√s, '
-            'or take it from `allan`')
+            'rad/√s: the model has other units, or belongs to another gyro; write its noise in '
+            'rad/√s, or take it from `allan`')
 
 
 def is_confused(ratio: float) -> bool:
-    """Tell whether a ratio of noises at rest is that of deg and rad."""
+    """Tell whether a ratio of noises is near that of deg and rad."""
     return any(1.0 / _NEAR < ratio * factor < _NEAR for factor in (DEGREE, 1.0 / DEGREE))
 
 
-#: Spans that a log is cut into, and the lags that are tried, in spans, either way.
+#: Number of spans of a log, and largest lag in either direction, in spans.
 _SPANS, _LAGS = 1000, 25
-#: Spans that are put together, for the noise of a reference fades over longer ones.
+#: Numbers of spans that are combined to longer ones, which reduce the noise of the reference.
 _TOGETHER = (1, 4, 16)
-#: The least spans; how far a reference must turn in all, and how far gyro and reference must be
-#: apart over the longest spans, rad, for a gyro that does not follow to be detected.
+#: Least number of spans; least rotation of the reference, and least residual over the longest
+#: spans, rad, for which another motion is detected.
 _FEWEST, _TURNED, _APART = 12, 30.0 * DEGREE, 10.0 * DEGREE
-#: Shares of the variance in common: above the first the factor between both is known; below the
-#: second they are different motions.
+#: Common share of the variance above which the factor between gyro and reference is tested, and
+#: below which they show different motions.
 _KNOWN, _DIFFERENT = 0.8, 0.4
-#: What an axis that tilts leaves over longer spans, rad, and next to shorter ones.
+#: Least residual of a tilting axis over the longest spans, rad, and its least ratio to that over
+#: the shortest.
 _WANDERED, _GROWN = 5.0 * DEGREE, 3.0
-#: A power of ten between both is taken for a unit of time where the interval of the samples is
-#: one that gyros have, s.
+#: Plausible sample intervals, s, for which a power of ten is taken for a unit of time.
 _INTERVALS = (2e-5, 0.25)
 
 
 @dataclass(frozen=True)
 class Agreement:
     """
-    How the heading of the reference and the integral of the output agree.
+    Agreement of the heading of the reference with the integral of the output.
 
     Attributes
     ----------
-    factor : change of the reference over that of the integral
+    factor : ratio of the change of the reference to that of the integral
     deviation : its standard deviation
-    coherence : share of the variance in common, at the length of span at which it is largest
+    coherence : common share of the variance, at the length of span at which it is largest
     short, long : the same over the shortest and the longest spans
-    grown : what is left over the longest spans, rad, and its ratio to that over the shortest
-    range : over which the reference turned in all, rad
+    grown : residual over the longest spans, rad, and its ratio to that over the shortest
+    range : largest less smallest heading of the reference, rad
 
     """
 
@@ -326,7 +328,7 @@ class Agreement:
 
 
 def gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
-    """Return what was checked of a log with a reference, up to the first that failed."""
+    """Return the gates of a log with a reference, up to the first that failed."""
     if (log.time is None or log.output is None
             or log.reference_heading is None and log.reference_rate is None):
         return ()
@@ -354,7 +356,7 @@ def _checked(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     yield _same_motion(found, log)
     if found.coherence > _KNOWN:
         own = 1.0 if model is None else scale_of(model, np.gradient(integral(log), log.time))
-        # a model of other units is refused as such
+        # a model with other units is refused by `model_gate`
         yield from _units(found, own if 0.1 < abs(own) < 10.0 else 1.0, log)
 
 
@@ -367,10 +369,10 @@ def _same_motion(found: Agreement, log: Log) -> Gate:
         return Gate('motion', True, seen)
     if not wanders and (found.grown[0] < _APART or found.range < _TURNED):
         return Gate('motion', None,
-                    f'{seen}; what differs is as small as the errors of a reference')
+                    f'{seen}; the difference is within the errors of a reference')
     others = [name for name in log.others if 'gyro' in name.lower()]
     axis = f'; or take another axis of the gyro ({", ".join(others[:3])})' if others else ''
-    turned = 'turn the rates of all three axes into the frame of the reference first'
+    turned = 'transform the rates of all three axes into the frame of the reference first'
     if wanders:
         return Gate('tilt', False, f'{seen} over short spans, and {100.0 * found.long:.2g} % over '
                     f'longer ones, where {found.grown[0] / DEGREE:.3g} deg are left: the axis of '
@@ -413,11 +415,11 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
         remedy = ('correct the unit of the column of the gyro (gyro_dps or gyro_rad_s)'
                   + (', or that of the reference heading (deg or rad)' if either else ''))
     yield Gate('unit', False, f'{seen}, and {name} is {FACTORS[name]:.5g}' if name
-               else f'{seen}, which is the factor of no gyro', remedy, size)
+               else f'{seen}, which is not plausible for a gyro', remedy, size)
 
 
 def integral(log: Log) -> Array:
-    """Return the heading of the reference at each sample, bridged by straight lines, rad."""
+    """Return the heading of the reference at each sample, gaps interpolated, rad."""
     assert log.time is not None
     if log.reference_rate is None:
         assert log.reference_heading is not None
@@ -426,7 +428,7 @@ def integral(log: Log) -> Array:
 
 
 def agreement(log: Log) -> Agreement | None:
-    """Compare the changes of heading over spans; None where too little is known."""
+    """Compare the changes of heading over spans; None if there are too few values."""
     assert log.time is not None and log.output is not None
     values = log.reference_heading if log.reference_rate is None else log.reference_rate
     assert values is not None
@@ -450,7 +452,7 @@ def agreement(log: Log) -> Agreement | None:
 
 def _at_best_lag(time: Array, turned: Array, at: Array, heading: Array,
                  span: float) -> tuple[float, float, float, float]:
-    """Return factor, its deviation, coherence and what is left, rad, at the lag that is best."""
+    """Return factor, its deviation, coherence and residual, rad, at the best lag."""
     change, steps = np.diff(heading), np.diff(at)
     lags = span * np.arange(-_LAGS, _LAGS + 1)
     found = [_regressed(np.diff(np.interp(at - lag, time, turned)), steps, change) for lag in lags]
@@ -461,7 +463,7 @@ def _at_best_lag(time: Array, turned: Array, at: Array, heading: Array,
 
 
 def _regressed(gyro: Array, steps: Array, change: Array) -> tuple[float, float, float, float]:
-    """Return factor, its deviation, coherence and what is left, without spans far off, rad."""
+    """Return factor, its deviation, coherence and residual, rad, without outlying spans."""
     scale = math.sqrt(float(np.mean(gyro ** 2))) or 1.0
     columns = np.column_stack([gyro / scale, steps / steps.mean()])
     kept = np.ones(len(change), dtype=bool)
@@ -478,15 +480,15 @@ def _regressed(gyro: Array, steps: Array, change: Array) -> tuple[float, float, 
     return float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left)
 
 
-#: Gate that failed -> what it means, for people.
+#: Gate that failed -> its meaning, for people.
 _SENTENCES = {
     'sense': 'Gyro and reference count in opposite senses.',
-    'unit': 'Gyro and reference are of different units.',
+    'unit': 'Gyro and reference have different units.',
     'time_unit': 'The stamps are in another unit of time.',
     'wrapped_heading': 'The reference heading is wrapped.',
-    'tilt': 'The axis of the gyro tilts, so that its integral is no heading.',
+    'tilt': 'The axis of the gyro tilts, so that the integral of its rate is not the heading.',
     'motion': 'The reference shows another motion than the gyro.',
-    'model': 'The model is of other units than the log, or of another gyro.'}
+    'model': 'The model has other units than the log, or belongs to another gyro.'}
 
 
 def mismatch(checked: Sequence[Gate]) -> Finding | None:

@@ -9,14 +9,14 @@
 # under the License.
 
 """
-How much a residual speaks for a cause, whatever its noise.
+The evidence of causes in a residual whose noise is unknown.
 
-The transformed residual z and the columns X of all causes are summed once, band by band. For any
-noise the likelihood is then a little linear algebra on these sums, so that every cause is tested
-under every noise of a grid, and a slow cause cannot hide in a random walk that was fitted before
-it. The evidence of a cause is the likelihood with it over the likelihood without, each averaged
-over the noises, at the most likely value of the cause (a flat prior, scaled so that for a known
-noise it is half the square of its deviations).
+The products of the transformed residual z and the columns X of all causes are summed once, band by
+band. For any noise the likelihood is then linear algebra on these sums, so that every cause is
+tested under every noise of a grid, and a slow cause is not absorbed by a random walk that was
+fitted before it. The evidence of a cause is the likelihood with it over the likelihood without it,
+each averaged over the noises, at the most likely value of the cause (a flat prior, scaled so that
+for a known noise the evidence is n² / 2 for a value of n standard deviations).
 
 """
 
@@ -29,14 +29,14 @@ from gyro_calibration.logs.log import Array
 import numpy as np
 from numpy.typing import NDArray
 
-#: Numbers of coefficients.
+#: Indices of coefficients.
 Places = NDArray[np.intp]
 
-#: A column that the nuisances leave less than this of has no place of its own in the data.
+#: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 LEAST_LEFT = 1e-7
 
 
-#: Columns of one candidate, by their places.
+#: Indices of the columns of one candidate.
 Group = Sequence[int]
 
 
@@ -65,7 +65,7 @@ def drawn(noises: Noises, count: Array, probability: Array, draws: int,
     """
     Draw residuals of noise alone, each by a noise chosen with its probability, shape (draws, m).
 
-    In single precision, which is enough for what chance shows, and twice as fast.
+    In single precision, which is sufficient here and twice as fast.
 
     """
     which = generator.choice(len(probability), draws, p=probability)
@@ -77,16 +77,16 @@ def drawn(noises: Noises, count: Array, probability: Array, draws: int,
 @dataclass(frozen=True)
 class Marginalized:
     """
-    What nuisances leave of the candidates under each noise.
+    Information on the candidates given the nuisances under each noise.
 
     Attributes
     ----------
     own : information of the nuisances, shape (g, q, q)
-    towards : the nuisances that each column looks like, shape (g, q, p)
-    left : of each candidate, the information of its columns given the nuisances, shape (g, k, k)
+    towards : coefficients of the projection of each column on the nuisances, shape (g, q, p)
+    left : for each candidate the information of its columns given the nuisances, shape (g, k, k)
     log_determinant : of `own` and of the noise, shape (g,)
-    unidentifiable : candidates that the nuisances leave nothing of
-    freedom : coefficients less nuisances
+    unidentifiable : whether a candidate is a combination of the nuisances
+    freedom : number of coefficients less nuisances
 
     """
 
@@ -105,13 +105,13 @@ def _parts(starts: Places, size: int) -> list[slice]:
 def marginalized(nuisances: Array, columns: Array, groups: Sequence[Group], starts: Places,
                  noises: Noises) -> Marginalized:
     """
-    Take the nuisances out of all candidates.
+    Marginalize all candidates over the nuisances.
 
     Parameters
     ----------
-    nuisances : over the standard deviation that a first noise gives them, shape (q, m)
+    nuisances : columns whitened by the first noise, shape (q, m)
     columns : of the candidates, likewise, shape (p, m)
-    groups : the places of the columns of each candidate
+    groups : the indices of the columns of each candidate
     starts : first coefficient of each band, shape (b,)
     noises : that are tried
 
@@ -146,14 +146,14 @@ def _diagonal(matrices: Array) -> Array:
 @dataclass(frozen=True)
 class NoiseLikelihood:
     """
-    Residuals given the nuisances, under each noise: d of them, one measured, or many drawn.
+    Likelihood of d residuals, one measured or many drawn, given the nuisances under each noise.
 
     Attributes
     ----------
     likelihood : restricted log likelihood without any candidate, shape (d, g)
-    squares : sum of whitened squares that are left, shape (d, g)
-    towards : of the nuisances, N'z, shape (d, g, q)
-    pull : of the candidates, X'z given the nuisances, shape (d, g, p)
+    squares : sum of whitened squares of the residual, shape (d, g)
+    towards : scores of the nuisances, N'z, shape (d, g, q)
+    pull : scores of the candidates, X'z given the nuisances, shape (d, g, p)
 
     """
 
@@ -164,14 +164,14 @@ class NoiseLikelihood:
 
     @property
     def probability(self) -> Array:
-        """Return how probable each noise is, shape (d, g)."""
+        """Return the probability of each noise, shape (d, g)."""
         top = np.exp(self.likelihood - self.likelihood.max(axis=1, keepdims=True))
         return top / top.sum(axis=1, keepdims=True)
 
 
 def noise_likelihood(residuals: Array, nuisances: Array, columns: Array, starts: Places,
                      noises: Noises, by: Marginalized) -> NoiseLikelihood:
-    """Take the nuisances out of residuals, shape (d, m), in units of the first noise, too."""
+    """Return the likelihood of residuals, (d, m), whitened by the first noise."""
     parts = _parts(starts, nuisances.shape[1])
     towards, crossed = (noises.weights @ np.stack(
         [residuals[:, part] @ each[:, part].T for part in parts], axis=1)
@@ -185,7 +185,7 @@ def noise_likelihood(residuals: Array, nuisances: Array, columns: Array, starts:
 
 
 def evidence(by_noise: NoiseLikelihood, by: Marginalized, groups: Sequence[Group]) -> Array:
-    """Return the evidence of candidates, shape (d, groups), -inf if like nuisances."""
+    """Return the evidence of candidates, shape (d, groups), -inf if unidentifiable."""
     if not groups:
         return np.empty((len(by_noise.squares), 0))
     return np.column_stack([_evidence(by_noise, by, place, list(group))
@@ -206,7 +206,7 @@ def _evidence(by_noise: NoiseLikelihood, by: Marginalized, place: int, group: li
 
 def _summary(by_noise: NoiseLikelihood, gained: Array, logarithm: Array, freedom: float,
              size: int) -> Array:
-    """Average over the noises: see the module."""
+    """Return the evidence averaged over the noises (see the module)."""
     ratio = np.log1p(-np.minimum(gained / by_noise.squares, 1.0 - 1e-9))
     change = 0.5 * (size * np.log(by_noise.squares) - (freedom - size) * ratio - logarithm)
     best = by_noise.likelihood.argmax(axis=1)

@@ -9,7 +9,7 @@
 # under the License.
 
 
-"""The diagnosis of logs in time: its steps in order."""
+"""The diagnosis of time-sampled logs: its steps in order."""
 
 from __future__ import annotations
 
@@ -106,31 +106,32 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.stats import chi2, norm
 
-#: Shares of the false-alarm rate: of the causes that are searched for, of each noise figure, of
-#: bias and of scale factor error.
+#: Shares of the false-alarm rate: for the search for causes, for each noise figure, and for bias
+#: and scale factor error each.
 _OF_SEARCH, _OF_NOISE, _OF_BIAS = 0.6, 0.03, 0.05
-#: An effect along the rate that is larger than this part of it is not named.
+#: Largest effect along the rate that is named, as a share of the largest rate.
 _LARGEST = 0.5
-#: A cause that differs between logs beyond this chance does not repeat.
+#: Probability of the differences between logs below which a cause does not repeat.
 _REPEATS = 1e-3
-#: Causes named from a temperature must repeat.
+#: Variables whose causes are named only if they have the same size in all logs.
 _MUST_REPEAT = frozenset({'temperature', 'temperature_rate'})
-#: Power with which an effect of the minimum detectable size is found; half an interval of 95 %.
+#: Probability that an effect of the minimum detectable size is found; half-width of a 95 %
+#: interval in standard deviations.
 _POWER, _DEVIATIONS = 0.95, 1.96
-#: Names of what has no other.
+#: Names of the shape parameters of causes that are not effects of the catalogue.
 _SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
-_ONCE = 'look for what caused it; it is of this log alone, and in no model for others'
-#: Reasons for a channel that is constant, and the variable that is constant with it.
-_HARDLY = {'temperature': 'the temperature hardly changes',
+_ONCE = 'find its cause; it occurs in this log alone, and is not added to the model'
+#: Why a constant channel shows no cause, and the variable that is derived from the channel.
+_HARDLY = {'temperature': 'the temperature changes by less than 0.2 K',
            'supply': 'the supply voltage does not change',
            'specific_force': 'the specific force does not change'}
 _WITH = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
-#: Steps with an exact reference, % of the time as measured on 25 min of an encoder at 100 Hz.
+#: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
 _SHARES = {CHECKS: 1, 'data quality': 1, 'replay of the model': 1, 'search for causes': 78,
            'alternatives': 11, 'noise figures': 1, 'cross-validation': 3, 'findings': 4}
 
-#: Causes that may stand in the place of one, itself too, with what each lacks in likelihood.
+#: A cause and its alternatives, each with its deficit in log-likelihood.
 Members = Sequence[tuple[Named, float]]
 
 
@@ -139,22 +140,22 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
              on_progress: OnProgress = lambda share, words: None,
              kind: str | None = None) -> Diagnosis:
     """
-    Say what a simulation gets wrong, and why.
+    Find the causes of the difference between a simulation and logs.
 
     Parameters
     ----------
-    logs : of one gyro, with time, and a reference unless it rests
-    generator : source of what is drawn: residuals of noise alone, and blocks for intervals
-    model : of the simulation; an ideal gyro with the bias and scale factor error that fit best
-        where it is None
-    rate : of false alarms a diagnosis
-    names : of the logs, for people
-    on_progress : is given the share of the work that is done, and what begins
-    kind : of the reference, one of `reference.KINDS`; found where it is None
+    logs : of one gyro, with time, and with a reference unless the gyro is at rest
+    generator : source of the random residuals of noise alone, and of the noise that fills gaps
+    model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
+        best
+    rate : false alarms per diagnosis
+    names : file names of the logs, for messages
+    on_progress : is called with the share of the work done and the name of the step that begins
+    kind : of the reference, one of `data_quality.KINDS`; None is found from the log
 
     Raises
     ------
-    DataRefused : the logs allow no diagnosis
+    DataRefused : a diagnosis of these logs is not possible
 
     """
     on_progress(0.0, CHECKS)
@@ -180,15 +181,15 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     if erring and len(logs) > 1:
         where = (list(names) or [f'log {place + 1}' for place in range(len(logs))])[erring[0]]
         raise DataRefused(
-            f'the reference of {where} errs by more than the gyro, and such logs are not compared '
-            'together: diagnose each alone, or give all to `fleet`')
+            f'the errors of the reference of {where} are larger than those of the gyro, and such '
+            'logs cannot be diagnosed together: diagnose each alone, or give all to `fleet`')
     if erring:
         found = diagnose_by_noisy_reference(logs[0], references[0], model, rate, on_progress)
     else:
         found = _by_exact_reference(logs, generator, model, rate, names, on_progress)
         found = replace(found, reference=references[0] if len(logs) == 1 else None)
     if given is not None and found.model is model:
-        found = replace(found, before=given, model=given)  # in the words given
+        found = replace(found, before=given, model=given)  # with its self-calibration separate
     return replace(found, logs=tuple(names), gates=tuple(checked))
 
 
@@ -209,16 +210,16 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     named, unnamed = _withdrawn(search, everything)
     named, unconfirmed = without_weakest(search, named, partial(sureness_of, search), SURELY)
     named, contradicted = without_weakest(search, named, partial(_sigmas, search), 1.96)
-    refuted = {**{each.candidate.cause: 'it does not predict stretches that are held out'
+    refuted = {**{each.candidate.cause: 'it does not predict held-out stretches'
                   for each in unconfirmed if not lasts(each.candidate)},
-               **{each.candidate.cause: 'the interval of its size holds 0'
+               **{each.candidate.cause: 'the interval of its size includes 0'
                   for each in contradicted}}
     steps.begin('alternatives')
     named, sets = _simplest(search, named, unnamed)
     found = FittedValues(fitted(search.problem, named), search.problem.replays)
     out = left_out(model or GyroModel(), found)
     steps.begin('noise figures')
-    # without a model, what rounds the output is a finding or nothing
+    # without a model, rounding of the output counts only if it is a finding
     rounds = (any(each.effect == QUANTIZATION.name for clean in quality for each in clean.findings)
               if model is None else any(term.effect is QUANTIZATION for term in model.terms))
     simulated = Noise() if model is None else model.noise
@@ -242,7 +243,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     if model is not None:
         findings += _of_noise(figures, model, rate, found.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
-    # the causes that the model can hold, without those that would be a second of a kind
+    # without causes that the model has already and that cannot be merged with those
     inside = FittedValues(fitted(search.problem, [each for each in named if each not in out])
                           if out else found.fitted, found.replays, lasting=True)
     plain, deviation = (FittedValues(fitted(search.problem, []), found.replays),
@@ -251,7 +252,8 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                             GyroModel(), quality)
     after = (with_findings(model, inside, quality, findings, noise, deviation) if offered
              else before)
-    # Bias and scale factor error that differ by no more than chance are drawn as they fit best.
+    # Curves before the extension contain the best bias and scale factor error, unless these differ
+    # significantly from those of the model.
     left, shown = (residuals_of_model(found.replays) if changed else what_is_left(plain),
                    inside if offered else plain)
     of_heading = shares([found.heading_changes(run, plain if model is None else None)
@@ -268,7 +270,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
 
 def _of_search(search: Search, found: FittedValues, sets: Sequence[Members],
                unnamed: Sequence[Named], doubtful: Sequence[Named]) -> Iterator[Finding]:
-    """Give the named causes, and those in doubt as suspected, each beside all that is named."""
+    """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
     for place, (known, members) in enumerate(zip(found.named, sets)):
         others = [(each.candidate.cause, lack) for each, lack in members
                   if each.candidate.cause != known.candidate.cause]
@@ -285,7 +287,7 @@ def _of_search(search: Search, found: FittedValues, sets: Sequence[Members],
 
 
 def _of_records(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
-    """Return what is found in records, by the log that shows it best, and other changed values."""
+    """Return the record findings with the smallest p-value of all logs, and changed values."""
     best: dict[str, Finding] = {}
     for each in (each for clean in quality for each in clean.findings):
         if each.effect not in best or each.p_value < best[each.effect].p_value:
@@ -295,13 +297,13 @@ def _of_records(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> l
 
 
 def _chance(search: Search, named: Sequence[Named], place: int) -> float:
-    """Return the chance that noise alone shows as much of a named cause, given the others."""
+    """Return the p-value of a named cause, given the others."""
     return search.chance.p_value(named[place].candidate.cause, evidence_of(search, named, place))
 
 
 def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: float,
               steps: Steps) -> tuple[Search, tuple[Named, ...]]:
-    """Search, and once more where what is left is filtered noise, which passes for causes."""
+    """Search for causes, and repeat it with levels for the noise if the residual is filtered."""
     search = begin(replays, generator, rate, steps.within)
     everything = searched(search)
     as_filtered = filtered(fitted(search.problem, everything))
@@ -314,10 +316,10 @@ def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: f
 def _withdrawn(search: Search,
                everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], tuple[Named, ...]]:
     """
-    Separate what is named from what is not.
+    Separate named causes from structure without a name.
 
-    A name is withdrawn where there is more along its variable than it explains, where tones are
-    many, and where a cause named from a temperature is another one in each log.
+    A name is withdrawn if structure without a name lies along the same variable, if there are many
+    tones, or if a cause along a temperature differs between logs.
 
     """
     beyond = {name for each in everything if not is_named(each.candidate)
@@ -331,7 +333,7 @@ def _withdrawn(search: Search,
     fastest = max(float(np.abs(each.channels.rate).max()) for each in search.problem.replays)
 
     def is_small(known: Named) -> bool:
-        """Tell whether an effect along the rate is small against it, as those of a gyro are."""
+        """Tell whether an effect along the rate is small compared with the rate."""
         return (CAUSES[known.candidate.cause].along != 'rate'
                 or known.candidate.amplitude is not None
                 or all(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)),
@@ -352,11 +354,11 @@ def _withdrawn(search: Search,
 
 
 def _sigmas(search: Search, named: tuple[Named, ...]) -> list[float]:
-    """Return of each cause how far its size is from 0; no evidence names one that may be 0."""
+    """Return the distance of the size of each cause from 0 in standard deviations."""
     found, sigmas = FittedValues(fitted(search.problem, named), search.problem.replays), []
     for place, known in enumerate(named):
         sizes = found.coefficients(place) or list(found.shapes(place).values())
-        # of a wave, sine and cosine alone may be 0
+        # sine or cosine alone may be 0 for a wave that is not
         wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
         sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
                       else abs(sizes[0].value) / sizes[0].deviation)
@@ -364,7 +366,7 @@ def _sigmas(search: Search, named: tuple[Named, ...]) -> list[float]:
 
 
 def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> bool:
-    """Tell whether a cause from a temperature is the same in all logs, but for chance."""
+    """Tell whether a cause along a temperature has the same size in all logs within the noise."""
     candidate, runs = known.candidate, len(search.problem.replays)
     if (runs == 1 or CAUSES[candidate.cause].along not in _MUST_REPEAT or not known.values
             or candidate.amplitude is not None):
@@ -377,9 +379,9 @@ def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> boo
 
 def _simplest(search: Search, named: tuple[Named, ...],
               unnamed: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[Members]]:
-    """Put the simplest member of each set in its place, and return all members of each."""
+    """Replace each cause by its simplest alternative, and return the alternatives of each."""
     def size(known: Named) -> int:
-        """Return how many values a cause has."""
+        """Return the number of fitted values of a cause."""
         candidate = known.candidate
         return len(fitted_shapes(candidate)) + (
             0 if candidate.amplitude is not None
@@ -404,10 +406,10 @@ def _bias_deviation(found: FittedValues, noise: Noise) -> float:
 
 
 def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) -> list[Finding]:
-    """Return bias and scale factor error as findings, where they are not those of the model."""
+    """Return bias and scale factor error as findings if they differ from those of the model."""
     scale, bias = found.scale_factor_error, float(np.mean(found.biases))
     own = [_own_deviation(model, name) for name in ('bias', 'scale_factor_error')]
-    # A bias that a model allows to wander is no other bias; one log hardly says how far.
+    # A bias within the bias instability and random walk of the model is not a finding.
     likely = Noise(noise.angle_random_walk,
                    *(max(getattr(each, name) for each in (noise, model.noise))
                      for name in NAMES[1:]))
@@ -420,8 +422,8 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
         if chance < _OF_BIAS * rate:
             different.append(finding(
                 name, {name: Estimate.about(value, 1.96 * deviation, CAUSES[name].unit)}, chance,
-                confounders, minimum_detectable=5.4 * deviation, evidence='it comes on top of '
-                f'that of the model, {abs(value) / deviation:.3g} standard deviations from zero'))
+                confounders, minimum_detectable=5.4 * deviation, evidence='it adds to the value '
+                f'of the model, {abs(value) / deviation:.3g} sigma from zero'))
     return different
 
 
@@ -436,7 +438,7 @@ def _own_deviation(model: GyroModel, name: str) -> float:
 
 def _of_noise(figures: NoiseParameters, model: GyroModel, rate: float,
               replays: Sequence[Replay]) -> list[Finding]:
-    """Return the noise figures that are not those of the model, nor within its bounds of them."""
+    """Return the noise figures that differ from those of the model and lie outside its bounds."""
     found, expected = [], model.noise
     # The steps of an encoder hide white noise.
     for name in NAMES[1:] if any(each.rounded for each in replays) else NAMES:
@@ -453,7 +455,7 @@ def _of_noise(figures: NoiseParameters, model: GyroModel, rate: float,
 
 
 def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
-    """Say why these logs cannot show each cause that was not searched for or not found."""
+    """Return the reason for each cause that these logs cannot show."""
     replays = search.problem.replays
     has = frozenset.intersection(*(each.has for each in replays)) | {'time', 'output'}
     of_motion = frozenset({'reference', *REFERENCES})
@@ -472,7 +474,7 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     for name, reason in quiet.items():
         reasons.update({cause.name: reason for cause in CAUSES.values()
                         if cause.along == name and cause.name not in reasons})
-    alike = 'in these logs it would look exactly like a bias or a scale factor error'
+    alike = 'in these logs it cannot be distinguished from a bias or a scale factor error'
     hidden = sorted(search.unidentifiable & (CAUSES.keys() - reasons.keys()))
     reasons.update(dict.fromkeys(hidden, alike))
     return reasons
@@ -481,14 +483,14 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: FittedValues,
              unnamed: Sequence[Named], refuted: Mapping[str, str], out: Sequence[Named],
              won: Gain | None, model: GyroModel | None) -> Iterator[str]:
-    """Give what a person should know: of the records, of withdrawn names, and of the model."""
+    """Give remarks on the records, on withdrawn names, and on the model."""
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
     for name in dict.fromkeys(each.candidate.cause for each in unnamed
                               if is_named(each.candidate)):
-        why = ('it is at many frequencies' if name == 'interference_tone'
-               else 'it differs from log to log, or is not alone')
+        why = ('there are tones at many frequencies' if name == 'interference_tone'
+               else 'it differs between logs, or other structure lies along the same variable')
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     for name, why in refuted.items():
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
@@ -496,26 +498,26 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
                   {term.effect.name for term in ([] if model is None else model.terms)})
     if implausible_scale(found):
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
-               f'{100.0 * scale.deviation:.1g} % is in no model: there is too little '
-               'motion for the noise of gyro and reference; turn faster, and both ways.')
+               f'{100.0 * scale.deviation:.1g} % is not added to the model: the motion is too '
+               'small for the noise of gyro and reference; turn faster, in both directions.')
     for name in dict.fromkeys(each.candidate.cause for each in out):
-        remedy = ('; take that out of the model that is given, and diagnose again' if name in own
+        remedy = ('; remove that one from the given model, and diagnose again' if name in own
                   else '')
-        yield (f'A further {name.replace("_", " ")} is not in the extended model, which has '
-               f'one already that cannot be merged with it{remedy}.')
+        yield (f'A second {name.replace("_", " ")} is not added to the extended model, as it '
+               f'cannot be merged with the first one{remedy}.')
     for name in dict.fromkeys(each.candidate.cause for each in found.named if happens_once(each)):
-        yield (f'The {name.replace("_", " ")} happens once: it is not in the extended model, '
+        yield (f'The {name.replace("_", " ")} occurs once: it is not in the extended model, '
                'whose bias is the mean over the logs.')
     if won is not None and won.worse:
-        yield ('On the parts held out, the extended model was worse than the one before; it is '
-               'not offered.')
+        yield ('On the held-out parts, the errors of the extended model are larger than those of '
+               'the model before; it is not offered.')
 
 
 # findings
 
 def named_finding(search: Search, found: FittedValues, place: int, p_value: float,
                   members: Members, separate_by: str) -> Finding:
-    """Return what is known of a named cause, and of those that may be in its place."""
+    """Return the finding of a named cause with its alternatives."""
     known = found.named[place]
     candidate, name = known.candidate, known.candidate.cause
     parameters = _parameters(found, place)
@@ -527,7 +529,7 @@ def named_finding(search: Search, found: FittedValues, place: int, p_value: floa
     if name == 'time_offset' and unit_of_offset(size.estimate, deviation,
                                                 found.replays[0].interval):
         confounders.append('unit_error')
-    # half the square of a size in standard deviations is its evidence
+    # the evidence of a size of n standard deviations is n² / 2
     needed = search.chance.threshold(name, search.rate) + price_of_freedom(known)
     smallest = math.sqrt(2.0 * max(needed, 0.0)) + float(norm.isf(1.0 - _POWER))
     log = ('' if candidate.run is None or len(found.replays) == 1
@@ -547,7 +549,7 @@ def named_finding(search: Search, found: FittedValues, place: int, p_value: floa
 
 
 def _parameters(found: FittedValues, place: int) -> dict[str, Estimate]:
-    """Return the parameters of a cause, the one that is named like it first."""
+    """Return the parameters of a cause, first the one with the name of the cause."""
     candidate = found.named[place].candidate
     coefficients, shapes = found.coefficients(place), found.shapes(place)
     name, effect = candidate.cause, CATALOGUE.get(candidate.cause)
@@ -593,7 +595,7 @@ def _as_phase(found: FittedValues, place: int, name: str, coefficients: Sequence
 
 def unexplained(search: Search, found: FittedValues,
                 unnamed: Sequence[Named]) -> list[Unexplained]:
-    """Return the structures without a name, with the part that each explains of what is left."""
+    """Return the structures without a name with the share of the residual that each explains."""
     everything = (*found.named, *unnamed)
     variables: dict[str, list[int]] = {}
     for place, known in enumerate(unnamed):
@@ -613,7 +615,7 @@ def unexplained(search: Search, found: FittedValues,
 
 
 def _variance(search: Search, found: FittedValues, named: Sequence[Named]) -> float:
-    """Return the variance of what some causes leave, on the points that are searched."""
+    """Return the variance of the residual of some causes at the grid points."""
     left = FittedValues(fitted(search.problem, named), found.replays)
     return float(np.var(np.concatenate([each.on_grid(rest - bias) for each, rest, bias
                                         in zip(found.replays, left.residuals, left.biases)])))

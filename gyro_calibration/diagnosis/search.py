@@ -9,12 +9,12 @@
 # under the License.
 
 """
-Which causes the data support.
+Search for the causes that the data support.
 
-Causes are added one by one, the strongest first. The shapes of those that come into question are
-refined before one is taken, so that a large effect that was only nearly right leaves nothing that
-other causes could take up. In the end each is taken out again, to see whether another explains it
-better, or none is needed.
+Causes are added one by one, the strongest first. The shapes of the candidates are refined before
+one is selected, so that a large effect of a slightly wrong shape leaves no residual that other
+causes would explain. In the end each cause is removed on trial, to find out whether another one
+explains the data better, or none is needed.
 
 """
 
@@ -67,58 +67,62 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
-#: Residuals drawn to learn what chance shows.
+#: Residuals of noise alone that are drawn for the distribution of the evidence.
 DRAWS = 400
-#: Of the noises that are likely, so many are used to learn it.
+#: Most likely noises from which these residuals are drawn, at most.
 MOST_NOISES = 60
-#: What a shape costs at least, for it is known to some part of where it may be.
+#: Least penalty of a fitted shape, in log-likelihood.
 PRICE_OF_SHAPE = 2.0
-#: Causes that have no first shapes, but are scanned for.
+#: Causes without a grid of first shapes: all frequencies or times are scanned.
 SCANNED = frozenset({'interference_tone', 'reference_slip'})
-#: So many of a kind at most in a log: slips are found all at once, and many tones are no tones,
-#: but something that is not even.
+#: Largest number of a kind in one log: all slips form one cause, and more tones indicate a
+#: disturbance that is not periodic.
 MOST_OF = {'interference_tone': 3, 'reference_slip': 1}
-#: A tone has at least so many periods in a log; slower ones are wander.
+#: Least number of periods of a tone in a log; slower variations are bias wander.
 LEAST_PERIODS = 20
-#: Within which times a reference may slip, s.
+#: Durations of a slip of the reference that are tried, s.
 WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
-#: So many slips at most are counted in a log.
+#: Largest number of slips in a log.
 MOST_SLIPS = 20
-#: A noise less likely than the best by more than this, in logarithms of the likelihood, is not
-#: tried again.
+#: Largest deficit in log-likelihood, relative to the best noise, of the noises that are kept.
 UNLIKELY = 12.0
-#: An effect with so much evidence passes for a noise that is none, so that all noises are tried.
+#: Evidence above which an effect distorts the likelihood of the noises, so that all are kept.
 STRONG = 60.0
-#: What each column beyond the first costs, for it fits a little noise.
+#: Penalty of each column beyond the first, in log-likelihood.
 PRICE_OF_COLUMN = 1.2
-#: By so much a structure without a name must be better than every cause.
+#: Additional penalty of a structure without a name, in log-likelihood.
 MARGIN = 4.0
-#: So many causes at most are refined before one is taken.
+#: Largest number of candidates that are refined in each step.
 MOST_CONFOUNDERS = 9
-#: So many causes at most are named.
+#: Largest number of named causes.
 MOST_CAUSES = 6
-#: A cause is established where it wins so many standard deviations on stretches that are held out
-#: (one-sided 5 %). A stretch counts no more than so much log-likelihood, a ratio of 20: no single
-#: stretch establishes a cause. All logs together have so many stretches.
+#: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
+#: standard deviations (one-sided 5 %). The gain of one stretch is limited to a likelihood ratio of
+#: 20, so that no single stretch establishes a cause. Number of stretches of all logs together.
 SURELY, BOUND, STRETCHES = 1.65, 3.0, 64
 
 
 @dataclass(frozen=True)
 class Chance:
-    """Evidence of causes by chance: `share` exceeds `start`, and falls by e every `scale`."""
+    """
+    Distribution of the evidence of causes in noise alone: an exponential tail.
+
+    The evidence exceeds `start` with the probability `share`, and falls by e every `scale`.
+
+    """
 
     start: Mapping[str, float]
     scale: Mapping[str, float]
     share: float
 
     def threshold(self, cause: str, rate: float) -> float:
-        """Return the evidence that chance reaches at a given rate."""
-        if cause not in self.start:  # it is scanned for: its evidence counts the places already
+        """Return the evidence that noise alone exceeds with a given probability."""
+        if cause not in self.start:  # scanned: its evidence contains the number of places already
             return -float(np.log(rate))
         return self.start[cause] + self.scale[cause] * float(np.log(self.share / rate))
 
     def p_value(self, cause: str, found: float) -> float:
-        """Return how often chance reaches an evidence."""
+        """Return the probability that noise alone reaches an evidence."""
         if cause not in self.start:
             return float(np.exp(-max(found, 0.0)))
         return min(1.0, self.share * float(np.exp(
@@ -128,12 +132,12 @@ class Chance:
 @dataclass(frozen=True)
 class Bank:
     """
-    All candidates on the logs, as the gyro sees their rate.
+    All candidates with their columns, for the rate that the gyro senses.
 
     Attributes
     ----------
     candidates : causes with their first shapes
-    groups : of each, the places of its columns
+    groups : indices of the columns of each candidate
     columns : whitened, shape (p, m)
 
     """
@@ -150,7 +154,7 @@ def averaged(found: Array) -> Array:
 
 def bank(whole: RegressionProblem, found: Sequence[Candidate],
          named: Sequence[Named] = ()) -> Bank:
-    """Make the columns of candidates."""
+    """Compute the whitened columns of candidates."""
     if not found:
         return Bank((), (), np.empty((0, len(whole.deviation))))
     replays = [seen(each, named) for each in whole.replays]
@@ -167,18 +171,18 @@ Key: TypeAlias = 'tuple[tuple[Any, ...], ...]'
 @dataclass(frozen=True)
 class Search:
     """
-    A search under way.
+    State of a search.
 
     Attributes
     ----------
     problem : the logs
-    bank : all candidates, where nothing changes the rate
-    chance : what they show where there is nothing
-    rate : false alarms allowed a cause
-    scanned : causes that are scanned for over all frequencies, or all moments
-    unidentifiable : causes that these logs cannot tell from bias and scale factor error
-    banks, found_before : what was made before, by the causes that were named then
-    on_part : is given each part of the work as it begins, in words
+    bank : columns of all candidates without causes that distort the rate
+    chance : distribution of their evidence in noise alone
+    rate : false alarms per cause
+    scanned : causes that are scanned for over all frequencies or times
+    unidentifiable : causes that these logs cannot distinguish from bias and scale factor error
+    banks, found_before : caches of columns and of steps, by the named causes
+    on_part : is called with the name of each part of the work as it begins
 
     """
 
@@ -198,12 +202,12 @@ class Search:
         return self.bank.candidates
 
     def excess(self, cause: str, found: float, times: float = 1.0) -> float:
-        """Return what an evidence is above what chance shows at so many times the rate."""
+        """Return an evidence less its threshold at so many times the false-alarm rate."""
         return found - self.chance.threshold(cause, times * self.rate)
 
 
 def screen(done: Fitted, stock: Bank) -> Array:
-    """Return the evidence of all candidates given what is named, shape (candidates,)."""
+    """Return the evidence of all candidates given the named causes, shape (candidates,)."""
     noises, starts = done.problem.noises, done.problem.starts
     by = marginalized(done.columns, stock.columns, stock.groups, starts, noises)
     shown = noise_likelihood(done.residual[None], done.columns, stock.columns, starts, noises, by)
@@ -211,12 +215,12 @@ def screen(done: Fitted, stock: Bank) -> Array:
 
 
 def _priced(found: Array, stock: Bank) -> Array:
-    """Return evidence, shape (d, candidates), less the price of columns beyond the first."""
+    """Return evidence, shape (d, candidates), less the penalty of columns beyond the first."""
     return found - PRICE_OF_COLUMN * np.array([len(group) - 1.0 for group in stock.groups])
 
 
 def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance:
-    """Draw residuals of noise alone for this log, and see what evidence of causes they show."""
+    """Return the distribution of the evidence of causes in residuals of noise alone."""
     probable = done.by_noise.probability[0]
     kept = np.sort(np.argsort(-probable)[:MOST_NOISES])
     noises = done.problem.noises.take(kept)
@@ -233,7 +237,7 @@ def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance
     start, scale, share = {}, {}, 0.15
     for cause, own in by_cause(stock.candidates).items():
         if not np.isfinite(every[:, own]).any():
-            start[cause], scale[cause] = 0.0, 1.0  # it has no place in these data
+            start[cause], scale[cause] = 0.0, 1.0  # not identifiable in these data
             continue
         most = np.sort(averaged(every[:, own]))[int((1.0 - share) * len(every)):]
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
@@ -242,7 +246,7 @@ def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance
 
 def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006,
           on_part: OnPart = lambda words: None) -> Search:
-    """Lay out logs and learn what chance shows in them."""
+    """Set up a search: candidates, likely noises, and the distribution of evidence in noise."""
     on_part('candidate causes')
     found = [*candidates(replays), *generic_terms(replays)]
     everywhere = regression_problem(replays)
@@ -260,7 +264,7 @@ def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float
 
 def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
            rate: float) -> Search:
-    """Return a search for some causes in other parts of the logs, at a rate of false alarms."""
+    """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
     found = [each for each in search.candidates if each.cause in causes]
     whole = regression_problem(replays)
     return replace(search, problem=whole, bank=bank(whole, found), rate=rate,
@@ -268,7 +272,7 @@ def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
 
 
 def _of_likely_noises(whole: RegressionProblem, found: Sequence[Candidate]) -> RegressionProblem:
-    """Leave out noises that are out of the question, both with no cause and with many."""
+    """Remove noises that are unlikely both without causes and with one column of each cause."""
     middle = [places[len(places) // 2]
               for places in by_cause([each for each in found if is_named(each)]).values()]
     tried = [each.by_noise for each in (fitted(whole, []),
@@ -276,25 +280,25 @@ def _of_likely_noises(whole: RegressionProblem, found: Sequence[Candidate]) -> R
     kept = np.flatnonzero(np.any([each.likelihood[0] > each.likelihood[0].max() - UNLIKELY
                                   for each in tried], axis=0))
     if not len(kept):
-        raise DataRefused('no noise explains what the simulation leaves, it is so large; see '
-                          'whether columns and units are right')
+        raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
+                          'check columns and units')
     return replace(whole, shapes=tuple(whole.shapes[place] for place in kept),
                    noises=whole.noises.take(kept))
 
 
 @dataclass(frozen=True)
 class _First:
-    """A candidate with its first shapes: its evidence, and the mean over those of its cause."""
+    """A candidate: its evidence, and the mean evidence over all first shapes of its cause."""
 
     candidate: Candidate
     most: float
     mean: float
 
 
-# what happens at any frequency, or at any moment
+# scans over all frequencies and times
 
 def _runs(done: Fitted, cause: str) -> list[int]:
-    """Return the logs in which one more of a cause is looked for."""
+    """Return the logs that may contain one more instance of a cause."""
     taken = [known.candidate.run for known in done.named if known.candidate.cause == cause]
     return [run for run in range(len(done.problem.replays)) if taken.count(run) < MOST_OF[cause]]
 
@@ -304,7 +308,7 @@ def tones(done: Fitted) -> list[_First]:
     found, left = [], done.white()
     for run in _runs(done, 'interference_tone'):
         each, white = done.problem.replays[run], left[run]
-        # Twice as long: a tone between two frequencies of the log would lose half of its power.
+        # Zero padding: a tone between two frequencies of the log would lose half of its power.
         power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
         lowest = 2 * LEAST_PERIODS
         if len(power) > 2 * lowest:
@@ -319,7 +323,7 @@ def tones(done: Fitted) -> list[_First]:
 
 
 def _unfolded(each: Replay, frequency: float) -> float:
-    """Return a tone's frequency without averaging: the strongest of those that fold to it."""
+    """Return the frequency of a tone before averaging: the strongest of its aliases."""
     if each.every == 1:
         return frequency
     samples = replace(each, every=1)
@@ -329,7 +333,7 @@ def _unfolded(each: Replay, frequency: float) -> float:
     places = 2.0 * samples.duration * np.concatenate([folds + frequency, folds[1:] - frequency])
 
     def outstanding(at: float) -> float:
-        """Return what the power at a frequency is over that of its neighbours."""
+        """Return the ratio of the power at a frequency to that of its neighbours."""
         place = round(at)
         return float(power[place - 2:place + 3].max()
                      / np.median(power[max(place - 60, 0):place + 61]))
@@ -338,7 +342,7 @@ def _unfolded(each: Replay, frequency: float) -> float:
 
 
 def _of_the_gyro(each: Replay, frequency: float) -> bool:
-    """Tell whether a tone is in the output, not only in the reference: encoders make tones."""
+    """Tell whether a tone is in the output, not only in the reference of an encoder."""
     wave = np.exp(-2.0j * np.pi * frequency * each.channels.time[each.kept])
     output, reference = (np.abs(np.mean(values[each.kept] * wave))
                          for values in (each.channels.output, each.reference))
@@ -359,7 +363,7 @@ def slips(done: Fitted) -> list[_First]:
         if acceleration.max() > 0.0 and len(moments):
             tried = [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step))
                      for width in WIDTHS]
-            # With as many as are looked for, they are no slips, but something that always goes on.
+            # The largest number indicates a continuous disturbance, not slips.
             if max(len(one.candidate.shapes) - 1 for one in tried) < MOST_SLIPS:
                 found += tried
     return [max(found, key=lambda one: one.mean)] if found else []
@@ -367,14 +371,14 @@ def slips(done: Fitted) -> list[_First]:
 
 def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places,
              width: float) -> _First:
-    """Return jumps of one width, at least 1 s apart, with evidence beyond so many moments."""
+    """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
     time = np.arange(each.points) * each.step
     likely = float(np.log(len(moments) * len(WIDTHS)))
     size, deviation = _matched(white, factor, time, width)
     wide, _ = _matched(white, factor, time, 5.0 * width + 0.3)
     value = 0.5 * (size[moments] / deviation) ** 2 - likely - PRICE_OF_COLUMN
-    # A slip stays; an error that comes and goes again has nothing left over a longer time. The
-    # rounding of an encoder stays while it rests, and differs by up to a step between two rests.
+    # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
+    # of an encoder is constant at rest, and differs by up to a step between two rests.
     value[(wide[moments] / size[moments] < 0.3)
           | (np.abs(size[moments]) <= each.rounded)] = -np.inf
     chosen: list[float] = []
@@ -394,14 +398,14 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
 
 
 def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Array, float]:
-    """Return the size of a pulse at each moment, rad, and its standard deviation."""
+    """Return the size of a pulse at each time, rad, and its standard deviation."""
     kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
     return (correlate(white, kernel, 'same') / (kernel @ kernel),
             float(1.0 / np.sqrt(kernel @ kernel)))
 
 
 def _single(each: Replay, at: int, width: float) -> int | None:
-    """Return the one point with most of what is off about a point; None if it is not one."""
+    """Return the point near another that has most of the deviation; None if there are several."""
     left = each.on_grid(each.channels.output - each.channels.rate)
     reach = max(3, round(2.0 * width / each.step))
     begin = max(at - reach, 0)
@@ -412,7 +416,7 @@ def _single(each: Replay, at: int, width: float) -> int | None:
 
 
 def _of_the_reference(each: Replay, moment: float) -> bool:
-    """Tell whether the reference leaps, not the output: it is further off its neighbours."""
+    """Tell whether the reference jumps more than the output at a time."""
     at = int(np.clip(np.searchsorted(each.channels.time[each.kept],
                                      moment + each.channels.time[each.kept][0]),
                      3, each.kept.sum() - 4))
@@ -421,10 +425,10 @@ def _of_the_reference(each: Replay, moment: float) -> bool:
     return bool(off[0] > off[1])
 
 
-# one cause more
+# one more cause
 
 def _stock(search: Search, named: Sequence[Named]) -> Bank:
-    """Return all candidates as the gyro sees its rate, with shapes to two digits."""
+    """Return all candidates for the rate that the gyro senses, with shapes to two digits."""
     changes = [each for each in named if is_of_the_rate(each.candidate.cause)]
     key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes))
                 for each in changes)
@@ -446,13 +450,13 @@ class Step:
 
 def refined(before: Fitted, candidate: Candidate, price: float) -> Step:
     """
-    Add a cause with the best of its shapes near those given.
+    Add a cause with its best shape near the given one.
 
     Parameters
     ----------
-    before : to which it is added
+    before : fit to which the cause is added
     candidate : the cause
-    price : of the choice of its shape among others, in logarithms of the likelihood
+    price : penalty for the choice of its shape, in log-likelihood
 
     """
     if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
@@ -481,7 +485,7 @@ def _shape(at: float, begin: Candidate, place: int) -> float:
 
 
 def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[float, float]:
-    """Return where to look for a shape: between neighbours, in logarithms but for moments."""
+    """Return the bounds of the search for a shape, in logarithms except for times."""
     mine = begin.shapes[place]
     if begin.cause == 'bias_step':
         width = 1.5 * max(spacing_of_steps(each, len(replays)) for each in replays)
@@ -496,12 +500,12 @@ def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[fl
     return max(float(np.log(abs(mine))) - width, low), float(np.log(abs(mine))) + width
 
 
-#: How the effect of a small shape grows with it.
+#: Exponent with which an effect grows with its shape.
 _POWERS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
 
 
 def _unbent(before: Fitted, candidate: Candidate) -> Candidate:
-    """Return a cause of fixed amplitude with the shape that its free amplitude suggests."""
+    """Return a cause of fixed amplitude with the shape that a fit of its amplitude suggests."""
     if candidate.cause not in _POWERS:
         return candidate
     own = columns_of(candidate, before.problem.replays) / before.problem.deviation
@@ -515,12 +519,12 @@ def _unbent(before: Fitted, candidate: Candidate) -> Candidate:
 
 def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
     """
-    Look for one cause more.
+    Search for one more cause.
 
     Returns
     -------
-    the best, None where nothing is beyond chance, and all that were refined, the best first;
-    where nothing is, those that are suspected
+    the best step, None if no cause is significant, and all refined steps, the best first; if no
+    cause is significant, those of suspected causes
 
     """
     key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes)
@@ -541,7 +545,7 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
                                   SUSPECTED if lasts(each.candidate) else 1.0) > 0.0]
         return None, sorted(found, key=lambda step: -step.score)
     top = max(first, key=lambda each: each.most)
-    # Causes that change the rate look alike to first order; large ones need refined shapes.
+    # Causes that distort the rate are equal to first order; large ones need refined shapes.
     alike = is_of_the_rate(top.candidate.cause)
     worth = [each for each in first if each.most > 0.8 * top.most - 8.0
              or (alike and is_of_the_rate(each.candidate.cause))]
@@ -550,8 +554,8 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     worth.sort(key=lambda each: -each.most)
     steps = [refined(done, each.candidate, each.most - each.mean)
              for each in worth[:MOST_CONFOUNDERS]]
-    # The screen takes a column at its first shape and with a free size; refined, it may explain
-    # less than its price.
+    # The screening fits a free size at the first shape; after refinement a cause may explain less
+    # than its penalty.
     steps = sorted((step for step in steps if step.score > done.score),
                    key=lambda step: -step.score)
     beyond = (step for step in steps
@@ -561,16 +565,16 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
 
 def lasts(candidate: Candidate) -> bool:
     """
-    Tell whether a cause acts in all logs with a size of its own: only such are suspected.
+    Tell whether a cause acts in all logs and has a free size: only such causes are suspected.
 
-    A limit or a delay has no size apart from its shape, and refined it explains single peaks.
+    A limit or a delay has no size apart from its shape, and its refinement would fit single peaks.
 
     """
     return is_named(candidate) and candidate.run is None and candidate.amplitude is None
 
 
 def suspected(search: Search, named: Sequence[Named]) -> Step | None:
-    """Return the named causes with one more that chance shows at `SUSPECTED` times the rate."""
+    """Return the named causes and one more that is significant at `SUSPECTED` times the rate."""
     _, steps = strongest(search, named)
     score = fitted(search.problem, named).score if steps else 0.0
     causes = {each.candidate.cause for each in named}
@@ -581,9 +585,9 @@ def suspected(search: Search, named: Sequence[Named]) -> Step | None:
 
 
 def _first(search: Search, done: Fitted, named: Sequence[Named]) -> list[_First]:
-    """Return of each cause the first shape that is the best."""
+    """Return the best first shape of each cause."""
     found = screen(done, _stock(search, named))
-    # What has nothing but shapes is there or not: another one is the first, not well refined.
+    # A second cause without a free size would only correct the shape of the first.
     taken = {each.candidate.cause for each in named if each.candidate.amplitude is not None}
     first = [_First(search.candidates[max(own, key=lambda place: found[place])],
                     float(found[own].max()), float(averaged(found[own])))
@@ -595,7 +599,7 @@ def _first(search: Search, done: Fitted, named: Sequence[Named]) -> list[_First]
 
 
 def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
-    """Refine all shapes together, and find the values, by the method of Gauss and Newton."""
+    """Refine all shapes and values together by Gauss-Newton steps."""
     current = tuple(named)
     for _ in range(3 if named else 0):
         done = fitted(search.problem, current)
@@ -622,8 +626,8 @@ def searched(search: Search) -> tuple[Named, ...]:
     """
     Return the causes that the data support, with values.
 
-    Several causes along one variable together may look like none of them. So where something
-    without a name is found, the search is repeated without them, and the likelier list is taken.
+    The sum of several causes along one variable may resemble none of them. So if structure without
+    a name is found, the search is repeated without generic terms, and the likelier result is used.
 
     """
     everything = _grown(search)
@@ -638,15 +642,15 @@ def searched(search: Search) -> tuple[Named, ...]:
 
 
 def price_of_freedom(known: Named) -> float:
-    """Return the price of place, shapes and columns of a cause, in logarithms of likelihood."""
+    """Return the penalty of shapes and columns of a cause, in log-likelihood."""
     shapes = max(known.price, PRICE_OF_SHAPE * len(fitted_shapes(known.candidate)))
     return shapes + PRICE_OF_COLUMN * max(len(known.values) - 1, 0)
 
 
 def _grown(search: Search) -> tuple[Named, ...]:
-    """Add causes one by one."""
+    """Add causes one by one (forward selection)."""
     named: tuple[Named, ...] = ()
-    for _ in range(2 * MOST_CAUSES):  # some are taken out again
+    for _ in range(2 * MOST_CAUSES):  # some are removed again
         step, _ = strongest(search, named) if len(named) < MOST_CAUSES else (None, [])
         if step is None:
             break
@@ -657,7 +661,7 @@ def _grown(search: Search) -> tuple[Named, ...]:
 
 
 def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
-    """Take out causes that, given the others, are not beyond chance, the weakest first."""
+    """Remove causes that are not significant given the others, the weakest first."""
     return without_weakest(search, named, lambda some: [
         search.excess(each.candidate.cause, evidence_of(search, some, place))
         for place, each in enumerate(some)], 0.0)[0]
@@ -666,7 +670,7 @@ def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
 def without_weakest(search: Search, named: tuple[Named, ...],
                     strengths: Callable[[tuple[Named, ...]], Sequence[float]],
                     least: float) -> tuple[tuple[Named, ...], list[Named]]:
-    """Take out the weakest cause, and refine the others, until all exceed a strength."""
+    """Remove the weakest cause and refine the others until all exceed a strength."""
     out: list[Named] = []
     while named:
         found = strengths(named)
@@ -679,7 +683,7 @@ def without_weakest(search: Search, named: tuple[Named, ...],
 
 
 def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
-    """Take each cause out again: another may be better, or none may be needed."""
+    """Remove each cause on trial, and replace it if another is better or none is needed."""
     for known in named[:-1]:
         others = tuple(each for each in named if each is not known)
         step, _ = strongest(search, others)
@@ -693,7 +697,7 @@ def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
 
 def alternatives(search: Search, named: tuple[Named, ...],
                  place: int) -> list[tuple[Named, float]]:
-    """Return the causes that may stand for a named one, and it, with what they lack in score."""
+    """Return a named cause and its alternatives, with their deficits in log-likelihood."""
     cause = named[place].candidate.cause
     _, steps = strongest(search, named[:place] + named[place + 1:])
     mine = max((step.score for step in steps if step.named[-1].candidate.cause == cause),
@@ -703,14 +707,14 @@ def alternatives(search: Search, named: tuple[Named, ...],
 
 
 def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
-    """Return the evidence of one of the causes given the others."""
+    """Return the evidence for one of the causes given the others."""
     others = tuple(each for number, each in enumerate(named) if number != place)
     return (fitted(search.problem, named).score - fitted(search.problem, others).score
             - price_of_freedom(named[place]))
 
 
 def sureness(won: Array) -> float:
-    """Return what stretches that are held out win in log-likelihood over its deviation."""
+    """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
     bounded = np.clip(won, -BOUND, BOUND)
     scatter = float(np.std(bounded, ddof=1)) * len(won) ** 0.5
     return float(np.sum(bounded)) / max(scatter, 1e-9) if np.sum(won) > 0.0 else 0.0
@@ -718,10 +722,10 @@ def sureness(won: Array) -> float:
 
 def sureness_of(search: Search, named: Sequence[Named]) -> list[float]:
     """
-    Return how surely each of the causes predicts stretches of the logs that are held out.
+    Return the gain of each cause on held-out stretches in standard deviations.
 
-    What it adds, given the others, is scaled by what fits best without each stretch in turn. Slips
-    are of single moments, and need not predict others.
+    The contribution of a cause, given the others, is scaled to fit best without each stretch in
+    turn. Slips are single events, and are not required to predict other stretches.
 
     """
     full, found = fitted(search.problem, named), []

@@ -11,9 +11,9 @@
 """
 Assumptions for uncalibrated values, and for temperatures without data.
 
-A tracker believes what it is given. So it is given all that may be wrong: scale factor error and
-bias where nothing says how well they are known, and the change of the bias from the temperature
-at which it was known to that of now.
+The variance of the tracker contains only the errors that it is given. So it is given standard
+deviations for all: scale factor error and bias of a model without a covariance, and the change of
+the bias from the temperature of the calibration to the present temperature.
 
 """
 
@@ -36,13 +36,13 @@ _STEP = 0.5
 @dataclass(frozen=True)
 class Assumptions:
     """
-    Standard deviations of what is not known.
+    Standard deviations of unknown values.
 
     Attributes
     ----------
     bias : of an uncalibrated gyro, rad/s
-    scale_factor_error : alike, 1
-    bias_temperature_coefficient : rad/s/K; 0 for a gyro that compensates its temperature by itself
+    scale_factor_error : of an uncalibrated gyro, 1
+    bias_temperature_coefficient : rad/s/K; 0 for a gyro with temperature compensation
 
     """
 
@@ -57,7 +57,7 @@ class Assumptions:
 
 
 def assumed(model: GyroModel, assumptions: Assumptions) -> GyroModel:
-    """Return the model with a self-calibration that has a covariance, if nothing else has one."""
+    """Return the model with an assumed covariance in its self-calibration if it has none."""
     calibration = model.self_calibration
     if calibration is None:
         return (model if model.covariance is not None else with_self_calibration(
@@ -71,8 +71,8 @@ def uncertain(model: GyroModel, assumptions: Assumptions) -> Array:
     """
     Return the covariance of all uncertain values of an `assumed` model, shape (m, m).
 
-    The temperature coefficient stands before s and b of a self-calibration, which are the last two
-    where there is one, and is the last where there is none. `sensitive` has the same order.
+    With a self-calibration, the temperature coefficient is before its s and b, which are the last
+    two; without one, it is the last. `sensitive` has the same order.
 
     """
     values = covariance(model)
@@ -84,12 +84,12 @@ def uncertain(model: GyroModel, assumptions: Assumptions) -> Array:
 
 def sensitive(model: GyroModel, sensitivity: Array, distance: Number) -> Array:
     """
-    Return what the rate changes by for each value of `uncertain`, shape (m, ...).
+    Return the sensitivity of the rate to each value of `uncertain`, shape (m, ...).
 
     Parameters
     ----------
     sensitivity : `compensation.rate_sensitivity` of the `assumed` model, shape (m - 1, ...)
-    distance : of the temperature from where the bias is known, K, a number or shape (...)
+    distance : of the temperature from that at which the bias is known, K, a number or shape (...)
 
     """
     place = _place(model, len(sensitivity))
@@ -105,10 +105,10 @@ def _place(model: GyroModel, values: int) -> int:
 
 class TemperatureCorrection:
     """
-    Change of the bias from one temperature to others, by a table as it was when this began.
+    Change of the bias from one temperature to others, by a copy of a bias table.
 
-    What the table learns later comes from rests, which the tracker uses itself. So it does not
-    count here before the tracker begins anew.
+    Later entries of the table come from rests that the tracker has used itself. So they are not
+    used here until the tracker is restarted.
 
     """
 

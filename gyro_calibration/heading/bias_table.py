@@ -9,24 +9,23 @@
 # under the License.
 
 """
-Bias at rest over temperature: kept between runs, aged, and used with its variance.
+Table of the bias at rest over temperature: kept between runs, aged, and used with its variance.
 
 The bias here is the rate at rest *after the model and before the self-calibration*
-(`Compensated.modelled`), which is also what a `SelfCalibration` calls its bias. So it is the same
-quantity whichever self-calibration is in use. What the table says of a change of temperature is
-added to the bias of the last calibration, and the bias that the table says is never added to that
-of a calibration: nothing is compensated twice.
+(`Compensated.modelled`), which is also the bias of a `SelfCalibration`. So it does not depend on
+the self-calibration in use. The change of the bias with temperature from the table is added to the
+bias of the last calibration; the bias from the table is not, which would compensate it twice.
 
-Biases differ by what lies between them: temperature, whose local coefficient is a smooth random
-process over temperature; runs, as a gyro turns on with another bias each time; jumps; and time, by
-flicker, random walk and ageing. Seen from the present, every entry is then an estimate of the
-present bias with an error, and these errors have a known covariance: the answer is their
-generalized least squares mean. How large coefficient and turn-on scatter are is learned too, by
-restricted likelihood over a few sizes.
+Biases differ by temperature, whose local coefficient is a smooth random process over temperature;
+by runs, as a gyro has another bias after each power-on; by jumps; and by time, through flicker,
+random walk and ageing. Each entry is an estimate of the present bias with an error, and the errors
+have a known covariance: the present bias is their generalized least squares mean. The sizes of
+temperature coefficient and turn-on scatter are estimated by restricted likelihood over a few
+values.
 
-The table is frozen while a tracker runs, whose state holds a temperature coefficient of its own in
-units of what the table did not know. What a run has learned counts when the tracker is reset, at a
-rest more than 5 K away; both at once would compensate twice.
+A tracker uses a copy of the table, and has an error of the temperature coefficient in its own
+state, in units of the uncertainty of the table. New entries are used when the tracker is
+restarted, at a rest more than 5 K away; both at once would compensate the bias twice.
 
 """
 
@@ -47,25 +46,25 @@ from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.settings_file import read_settings, settings_text
 import numpy as np
 
-#: Width of a bin of temperature, K; a run has one entry in each.
+#: Width of a temperature bin, K; a run has one entry in each.
 BIN = 1.5
-#: At most so many entries are kept.
+#: Largest number of entries.
 ENTRIES = 80
-#: What a rest is averaged over, s, as far as flicker asks for it.
+#: Averaging time of a rest, s, for its variance by flicker.
 DURATION = 10.0
-#: An estimate further off than so many standard deviations does not belong to the others.
+#: Standard deviations from which on an estimate is an outlier.
 _FAR = 4.5
-#: So many estimates in a row that are off, and agree, are a jump.
+#: Consecutive outliers that agree with each other and are taken for a jump.
 _IN_A_ROW = 3
 #: Shortest time between two writes, s.
 INTERVAL = 600.0
 _YEAR = 365.25 * 86400.0
-#: What was made so near to an entry was made in its run, s.
+#: Largest time between a calibration and an entry of the same run, s.
 _SAME_RUN = 3600.0
-#: No bias is better known, (rad/s)².
+#: Least variance of a bias, (rad/s)².
 _LEAST = 1e-18
-#: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probability.
-#: `benchmarks/bias_table.py --sizes` compares them with more, and with less.
+#: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probabilities.
+#: `benchmarks/bias_table.py --sizes` compares them with more, and with fewer sizes.
 _COEFFICIENTS = {0.1: 0.4, 1.0: 0.6}
 _TURN_ONS = {0.3: 0.3, 1.0: 0.5, 4.0: 0.2}
 _SIZES = np.array([(coefficient, turn_on)
@@ -76,18 +75,19 @@ _MET = np.array([often * also for often in _COEFFICIENTS.values() for also in _T
 @dataclass(frozen=True)
 class Prior:
     """
-    What is known of a gyro before it was seen.
+    Prior knowledge of a gyro.
 
     Attributes
     ----------
     coefficient : standard deviation of the temperature coefficient of the bias, rad/s/K (L3G4200D
         data sheet: 0.03 deg/s/K)
-    length : over which the coefficient stays about the same, K
-    compensated : what a model that looks at temperature leaves of the coefficient inside its
-        range, 1
+    length : correlation length of the coefficient, K
+    compensated : share of the coefficient that remains inside the range of a model with
+        temperature effects, 1
     turn_on : standard deviation of the bias from one run to the next, rad/s
-    ageing : how far the bias at one temperature walks in a year, beyond the model's noise, rad/s
-    unknown : where a temperature is not known, it is taken to be so far away, K
+    ageing : standard deviation of the bias at one temperature in a year, beyond the model's noise,
+        rad/s
+    unknown : assumed distance of an unknown temperature, K
 
     """
 
@@ -102,7 +102,7 @@ class Prior:
 @dataclass(frozen=True)
 class Entry:
     """
-    What rests of one run showed in one bin of temperature.
+    Mean bias at rest in one run and one temperature bin.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Entry:
     bias : rad/s, after the model and before the self-calibration
     variance : of the bias as a mean around `time`, (rad/s)²
     time : of the last of these rests, s since 1970
-    run : counts the runs of the gyro; between whole numbers for what came from elsewhere
+    run : number of the run of the gyro; between whole numbers for a calibration between runs
 
     """
 
@@ -136,15 +136,15 @@ _Dated = TypeVar('_Dated', Entry, Jump)
 @dataclass(frozen=True)
 class Propagated:
     """
-    A stored calibration as it is worth now.
+    A stored calibration propagated to the present.
 
     Attributes
     ----------
-    calibration : with the bias and the covariance of now; to be used, and not to be stored
+    calibration : with the present bias and covariance; to be used, and not to be stored
     change : its bias less the stored one, rad/s
-    variance : what the variance of the bias grew by, (rad/s)²; negative where the table knows
-        better; nan where it was not known
-    sentence : for diagnostics, where age or distance matters; else ''
+    variance : increase of the variance of the bias, (rad/s)²; negative if the table is more
+        precise; nan if it was not known
+    sentence : for diagnostics, if age or temperature matters; else ''
 
     """
 
@@ -161,15 +161,15 @@ class BiasTable:
     Attributes
     ----------
     digest : of the model that it belongs to
-    entries, jumps : what it knows
-    run : number of the run that goes on
-    held_back : how many estimates were not used so far
+    entries, jumps : of all runs
+    run : number of the present run
+    held_back : number of estimates that were not used so far
 
     """
 
     def __init__(self, model: GyroModel, prior: Prior | None = None,
                  entries: Sequence[Entry] = (), jumps: Sequence[Jump] = ()):
-        """Begin a new run behind older entries, if there are any."""
+        """Begin a new run after older entries, if there are any."""
         self.digest = model_digest(model)
         self.entries, self.jumps = list(entries), list(jumps)
         self.run = 1 + max([-1, *(math.floor(each.run) for each in entries),
@@ -198,24 +198,24 @@ class BiasTable:
 
     def add(self, temperature: float, bias: float, variance: float, time: float) -> str:
         """
-        Take what a rest showed.
+        Add the bias of a rest.
 
         Parameters
         ----------
         temperature : degC
         bias : mean of the rate after the model and before the self-calibration, rad/s
-        variance : of that mean by white noise, (rad/s)²; how far a bias wanders is counted here
+        variance : of that mean by white noise, (rad/s)²; the wander of the bias is added here
         time : s since 1970
 
         Returns
         -------
-        '', or in a sentence why it was held back, or that the bias jumped
+        '', or a sentence why the bias is not used, or that it jumped
 
         """
         given = Entry(float(temperature), float(bias), float(variance), float(time), self.run)
         if not _possible(given):
             return (f'a bias of {bias:g} rad/s at {temperature:g} degC with a variance of '
-                    f'{variance:g} at {time:g} s is not used: that is beyond what a gyro has')
+                    f'{variance:g} at {time:g} s is not used: it is not plausible for a gyro')
         before, known = self.predict(temperature, time)
         if abs(bias - before) <= _FAR * math.sqrt(known + variance):
             self._held.clear()
@@ -238,7 +238,7 @@ class BiasTable:
         return abs(given.bias - held.bias) <= _FAR * math.sqrt(variance)
 
     def _jump(self, variance: float) -> None:
-        """Let the curve step, and take what was held back for it."""
+        """Add a jump at all temperatures, and the estimates held back for it."""
         self.held_back -= _IN_A_ROW - 1
         self.run += 1
         self.jumps.append(Jump(self.run, variance, self._held[0].time))
@@ -358,11 +358,11 @@ class BiasTable:
         return self._prior.coefficient ** 2 * (below ** 2 + above ** 2)
 
     def _wander(self, age: Array | float) -> Any:
-        """Return the variance of how far a bias goes by the noise of the gyro, (rad/s)²."""
+        """Return the variance of the wander of the bias by the noise of the gyro, (rad/s)²."""
         return self._model.noise.wander(np.abs(age) + DURATION, DURATION)
 
     def _seen(self, entries: Sequence[Entry], temperature: float, time: float) -> _Seen:
-        """Return what entries say of the bias in this run, now, at a temperature."""
+        """Return the estimates of the bias in this run, now, at a temperature."""
         covariance = self._covariance(entries, temperature, time)
         rests = np.array([each.bias - entries[0].bias for each in entries])
         inverse = np.linalg.inv(covariance)
@@ -400,7 +400,7 @@ class BiasTable:
         return total
 
     def changed(self) -> bool:
-        """Tell whether something worth a write was learned since `kept`, or dates were wrong."""
+        """Tell whether entries changed significantly since `kept`, or dates were corrected."""
         if self._dated_anew:
             return True
         kept = {(each.run, _bin(each)): each for each in self._kept}
@@ -414,26 +414,26 @@ class BiasTable:
         return self.changed() and (ending or abs(now - self._kept_at) >= INTERVAL)
 
     def kept(self, now: float) -> None:
-        """Take note that the table was written."""
+        """Record that the table was written."""
         self._kept, self._kept_at, self._dated_anew = tuple(self.entries), now, False
 
     def not_kept(self, now: float) -> None:
-        """Take note that it could not be written: to be tried again later, and at the end."""
+        """Record that it could not be written; it is tried again later, and at the end."""
         self._kept_at = now
 
 
 @dataclass(frozen=True)
 class _Seen:
     """
-    What entries say of the bias at one temperature, for each of the sizes.
+    Estimates of the bias at one temperature, for each of the sizes.
 
     Attributes
     ----------
-    likely : probability of each, shape (sizes,)
+    likely : probability of each size, shape (sizes,)
     mean : of the biases less that of the first entry, rad/s, shape (sizes,)
     information : 1 over the variance of the mean, shape (sizes,)
-    of_ones, of_rests : the inverse times ones, and times what each entry is off the mean, shape
-        (sizes, n)
+    of_ones, of_rests : the inverse covariance times ones, and times the deviations of the entries
+        from the mean, shape (sizes, n)
     inverse : of the covariance, shape (sizes, n, n)
 
     """
@@ -447,7 +447,7 @@ class _Seen:
 
 
 def _mixture(likely: Array, means: Array, variances: Array) -> tuple[float, float]:
-    """Return mean and variance over what may be."""
+    """Return mean and variance of a mixture."""
     mean = float(likely @ means)
     return mean, float(likely @ (variances + (means - mean) ** 2))
 
@@ -493,12 +493,12 @@ def _bounded(temperature: float, time: float) -> tuple[float, float]:
 def propagated(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
                temperature: float | None = None, this_run: bool = False) -> Propagated:
     """
-    Return a stored calibration as it holds now, moved and weighted by the table.
+    Return a stored calibration propagated to the present by the table.
 
-    It is joined to the table as one more estimate of the bias, at its own temperature and time. It
-    is for the start of a run, or of a tracker that begins anew; within a run an
-    `assumptions.TemperatureCorrection` goes on from there. Its age is counted: whatever it is
-    given to must take it for a calibration of now.
+    It is combined with the table as one more estimate of the bias, at its own temperature and
+    time. It is for the start of a run, or the restart of a tracker; within a run an
+    `assumptions.TemperatureCorrection` continues from there. The result includes the age: it is to
+    be used as a calibration made at present.
 
     Parameters
     ----------
@@ -530,7 +530,7 @@ def _moved(calibration: SelfCalibration, table: BiasTable, time: float,
 
 def _sentence(calibration: SelfCalibration, table: BiasTable, age: float,
               temperature: float | None, variance: float) -> str:
-    """Say that a calibration is no longer as good as it was, and why."""
+    """Return a sentence if the bias of a calibration has become less certain; else ''."""
     own = calibration.standard_deviations[1]
     if variance < 2.0 * own ** 2:
         return ''
@@ -538,9 +538,9 @@ def _sentence(calibration: SelfCalibration, table: BiasTable, age: float,
         why = 'at a temperature that is not known'
     else:
         why = f'at {calibration.temperature:.1f} degC, and now it is {temperature:.1f} degC'
-    return (f'the calibration was made {_age(age)} ago {why}: its bias is now known to '
-            f'{math.sqrt(variance) / DEGREE:.4f} deg/s, then to {own / DEGREE:.4f} deg/s; '
-            'let the robot rest, or calibrate again')
+    return (f'the calibration was made {_age(age)} ago {why}: the standard deviation of its bias '
+            f'is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
+            f'{own / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
 
 
 def _age(age: float) -> str:
@@ -560,7 +560,7 @@ _HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest
 
 
 def model_digest(model: GyroModel) -> str:
-    """Return a name for models with `same_effects` and one serial number: they share biases."""
+    """Return a digest of effects and serial number: models with the same share biases."""
     content = ([[term.effect.name, list(term.values)] for term in model.terms],
                model.gyro.get('serial_number', ''))
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
@@ -569,12 +569,12 @@ def model_digest(model: GyroModel) -> str:
 def read_bias_table(path: str | Path, model: GyroModel,
                     prior: Prior | None = None) -> tuple[BiasTable, str]:
     """
-    Read what earlier runs have learned, for a run that begins.
+    Read the table of earlier runs at the begin of a run.
 
     Returns
     -------
-    the table, and '' or in a sentence why it is empty although there is a file; such a file is
-    kept when a new one is written
+    the table, and '' or a sentence why it is empty although there is a file; such a file is kept
+    under another name when a new one is written
 
     """
     try:
@@ -624,7 +624,7 @@ def _keep_aside(path: Path, digest: str) -> str:
         if not path.exists() or _read(path)[0] == digest:
             return ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError):
-        pass  # whatever it is, it is not ours to overwrite
+        pass  # a file of unknown content is not overwritten
     number = 1
     while (other := path.with_name(f'{path.name}.kept-{number}')).exists():
         number += 1
@@ -652,7 +652,7 @@ def _entry(row: Mapping[str, Any], temperature: float, bias: float) -> Entry:
     entry = Entry(temperature, bias, float(row['standard_deviation']) ** 2,
                   float(np.datetime64(text, 's').astype('int64')), int(row['run']))
     if not _possible(entry):
-        raise ValueError(f'no gyro has {entry}')
+        raise ValueError(f'it has implausible values: {entry}')
     return entry
 
 

@@ -9,16 +9,16 @@
 # under the License.
 
 """
-What is not known of the heading where samples are lost.
+Uncertainty of the heading over gaps, where samples are lost.
 
-Between two samples the rate is taken as a straight line. What it may have been instead is learned
-from how far samples of the last seconds were off the line between their neighbours, over intervals
-from that of the samples to `_LONGEST`: c = r(t) - (r(t - h) + r(t + h)) / 2. A Brownian motion has
-a mean square of q h / 2 there, and after a gap of T = 2 h its integral has the variance
-q T³ / 12 = T² / 3 E(c²). Means over neighbouring blocks of length h have half of that mean square.
+The rate is interpolated linearly over a gap. The uncertainty of this is estimated from the
+deviation of the samples of the last seconds from the line between their neighbours, over intervals
+h up to 0.4 s: c = r(t) - (r(t - h) + r(t + h)) / 2. Its mean square is q h / 2 for a Brownian
+motion, whose integral over a gap of T = 2 h has the variance q T³ / 12 = T² / 3 E(c²). Means over
+neighbouring blocks of length h have half of that mean square.
 
-The two samples at the ends of a gap stand for all of it, and so does their noise: with N² / dt
-for each of them, T² N² / (2 dt) instead of N² T.
+The integral over a gap depends on the two samples at its ends alone, each with the noise N² / dt,
+so that its variance is T² N² / (2 dt) instead of N² T.
 
 """
 
@@ -34,41 +34,41 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: Length of the shortest blocks whose means are compared, s, and the number of lengths, each twice
-#: the one before.
+#: the previous one.
 _BLOCK, _LEVELS = 0.1, 3
-#: What the rate does is remembered for so long, s; of long blocks, for so many of them.
+#: Memory of the statistics, s; for long blocks, in blocks.
 _MEMORY, _BLOCKS = 2.0, 5
-#: Part of T² E(c²) that the variance after a gap of T is, for points and for means over blocks:
-#: between Brownian motion, with 1/3 and 2/3, and a rate that bends evenly, with 4/9 for both.
+#: Ratio of the variance after a gap of T to T² E(c²), for points and for means over blocks:
+#: between Brownian motion, with 1/3 and 2/3, and a rate of constant curvature, with 4/9 for both.
 _OF_POINTS, _OF_MEANS = 0.4, 0.5
-#: A step over a gap that is so many times the usual one is new in these seconds: the robot began
-#: to turn, or stopped.
+#: Ratio of a step over a gap to the usual one, above which it did not occur in the last seconds:
+#: the robot began to turn, or stopped.
 _UNMET = 5.0
-#: Durations are compared to this, s: stamps in seconds since 1970 are not known better.
+#: Tolerance of durations, s: the resolution of stamps in seconds since 1970.
 CLOSE = 1e-6
-#: Largest rate, rad/s, and time without samples, s, so that the variance after a gap is finite.
+#: Largest rate, rad/s, and gap, s, so that the variance after a gap is finite.
 FASTEST, LONGEST = 1e4, 1e9
-#: Intervals that are remembered; so many must be known to tell a gap.
+#: Number of intervals in the memory, and least number for the detection of a gap.
 _REMEMBERED, _NEEDED = 256, 16
-#: An interval of so many times the usual one is a gap; one below such a part of it belongs to a
-#: burst, or follows a late sample.
+#: Least ratio of a gap to the usual interval; largest ratio of an interval in a burst, or after a
+#: late sample.
 _GAP, _SHORT = 1.5, 0.5
-#: The stamps come in bursts from this share of short intervals on, and where the mean interval is
-#: so many times the median.
+#: Stamps in bursts have more than this share of short intervals, or a mean interval of so many
+#: times the median.
 _BURSTS, _TOGETHER = 0.1, 2.0
 
 
 @dataclass(frozen=True)
 class Gap:
     """
-    Samples that are lost.
+    A gap in the samples.
 
     Attributes
     ----------
-    lost : how many
-    duration : of what they stood for, s
-    motion : variance of what may have been turned off the straight line, rad²
-    noise : what the variance of the noise is beyond that of a time with all samples, rad²
+    lost : number of samples
+    duration : of the lost samples, s
+    motion : variance of the heading by deviations of the rate from the straight line, rad²
+    noise : additional variance of the heading by the noise of the samples at the ends, rad²
 
     """
 
@@ -79,7 +79,7 @@ class Gap:
 
     @property
     def variance(self) -> float:
-        """Return that of the heading by both, rad²."""
+        """Return the variance of the heading by motion and noise, rad²."""
         return self.motion + self.noise
 
 
@@ -140,7 +140,7 @@ class Intervals:
         """
         Return how many samples are lost in an interval, s, and count them.
 
-        Alone for one over which nothing is integrated: it says nothing of the usual one.
+        Called alone for an interval that is not integrated, which is excluded from the usual one.
 
         """
         if interval > self._limit:
@@ -148,7 +148,7 @@ class Intervals:
             self.lost += self._late
             self.longest = max(self.longest, interval)
             return self._late
-        if self._late and interval < _SHORT * self.usual:  # of the lost ones, this came only late
+        if self._late and interval < _SHORT * self.usual:  # late, not lost
             self._late -= 1
             self.lost -= 1
         else:
@@ -170,12 +170,13 @@ class Intervals:
 
 class _Level:
     """
-    Means over blocks of one length, and what they are off the line between their neighbours.
+    Means over blocks of one length, and their second and first differences.
 
     Attributes
     ----------
     length : of a block, s
-    curved, stepped : mean squares of that, and of the differences of neighbours, (rad/s)²
+    curved : mean square of the deviation from the line between the neighbours, (rad/s)²
+    stepped : mean square of the differences of neighbours, (rad/s)²
 
     """
 
@@ -185,7 +186,7 @@ class _Level:
         self._last, self._step, self._odd, self._known = 0.0, 0.0, 0.0, 0
 
     def without_noise(self, density: float) -> tuple[float, float]:
-        """Return both mean squares without white noise of a density, rad²/s."""
+        """Return both mean squares less those of white noise of a density, rad²/s."""
         return (max(self.curved - 1.5 * density / self.length, 0.0),
                 max(self.stepped - 2.0 * density / self.length, 0.0))
 
@@ -209,12 +210,12 @@ class _Level:
 
 class Gaps:
     """
-    Follow stamps and rates, and tell what is not known where samples are lost.
+    Uncertainty over gaps, estimated from stamps and rates.
 
     Attributes
     ----------
     intervals : of the stamps
-    noise : of the gyro; how loud its samples are
+    noise : of the gyro
 
     """
 
@@ -223,7 +224,6 @@ class Gaps:
         self.intervals, self.noise = Intervals(), noise
         self._levels = [_Level(_BLOCK * 2 ** level) for level in range(_LEVELS)]
         self._curved = self._stepped = 0.0
-        self._before = 0.0
         self.clear()
 
     def clear(self) -> None:
@@ -250,7 +250,7 @@ class Gaps:
 
         Returns
         -------
-        what is lost between them, if anything is
+        the gap between them, if samples are lost
 
         """
         if lost is None:
@@ -298,7 +298,7 @@ class Gaps:
         self._step, self._surplus = float(steps[-1]), 0.0
 
     def _learn(self) -> None:
-        """Take in a block."""
+        """Update the statistics at the end of a block."""
         mean: float | None = min(max(self._total / self._count, -FASTEST), FASTEST)
         if self._steps and self._squares < FASTEST ** 2:
             weight = self._duration / (_MEMORY + self._duration)
@@ -317,21 +317,21 @@ class Gaps:
         surplus = min(lost * usual, interval)
         ends = self.noise.angle_random_walk ** 2 / usual
         noise = ends * (surplus * (0.5 * surplus + usual) + 0.5 * self._surplus * surplus)
-        # a step that has not been met may have come at any time within the gap
+        # a step larger than those before may have occurred at any time within the gap
         unmet = max(step * step - _UNMET ** 2
                     * (_between(self._steps_seen(), interval, 2.0) + 2.0 * ends), 0.0)
         return Gap(lost, surplus, interval ** 2 * (
             _between(self._curves_seen(), 0.5 * interval, 4.0) + unmet / 12.0), noise)
 
     def _curves_seen(self) -> list[tuple[float, float]]:
-        """Return lengths, s, and the part of the variance by curvature without noise, (rad/s)²."""
+        """Return lengths, s, and the variance by curvature without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual
         points = [(usual, _OF_POINTS * max(self._curved - 1.5 * density / usual, 0.0))]
         return points + [(each.length, _OF_MEANS * each.without_noise(density)[0])
                          for each in self._levels[usual > 0.5 * _BLOCK:]]
 
     def _steps_seen(self) -> list[tuple[float, float]]:
-        """Return lengths, s, and the mean squares of steps there, without noise, (rad/s)²."""
+        """Return lengths, s, and the mean squares of steps without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual
         points = [(usual, max(self._stepped - 2.0 * density / usual, 0.0))]
         return points + [(each.length, each.without_noise(density)[1])
@@ -340,13 +340,13 @@ class Gaps:
 
 def block_ends(intervals: Array, length: float, begun: float = 0.0) -> list[int]:
     """
-    Return behind which samples blocks end that last `length` s or a little longer.
+    Return the numbers of samples up to the ends of blocks of `length` s or slightly longer.
 
     Parameters
     ----------
     intervals : before each sample, s
     length : s
-    begun : what the first block has lasted already, s
+    begun : elapsed duration of the first block, s
 
     """
     until, ends = np.cumsum(intervals).tolist(), list[int]()
@@ -359,8 +359,8 @@ def block_ends(intervals: Array, length: float, begun: float = 0.0) -> list[int]
 
 
 def _between(known: list[tuple[float, float]], length: float, steepest: float) -> float:
-    """Return a quantity at a length, by power laws between those at known, growing lengths."""
-    if len(known) == 1:  # samples are further apart than any length that means were taken over
+    """Return a quantity at a length, by power laws between those at increasing lengths."""
+    if len(known) == 1:  # the sample interval is longer than all blocks
         return known[0][1]
     (near, low), (far, high) = next(((below, above) for below, above in zip(known, known[1:])
                                      if length <= above[0]), known[-2:])

@@ -11,9 +11,9 @@
 """
 The heading on a robot, sample by sample, by model, calibration, temperature and bias at rest.
 
-What is computed is in `compensation`, `tracking` and `bias_table`. Here a calibration is carried
-to the time and temperature of now, the bias follows the temperature while the robot drives, and
-what rests show of it goes into the table for the next run.
+The computations are in `compensation`, `tracker` and `bias_table`. This module propagates a
+calibration to the present time and temperature, corrects the bias for the temperature while the
+robot drives, and adds the bias at rest to the table for the next run.
 
 """
 
@@ -46,30 +46,30 @@ from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
 import numpy as np
 
-#: Means over so long at rest go into the table, s.
+#: Averaging time of an entry of the table at rest, s.
 STRETCH = 10.0
-#: A mean that is so many standard deviations off what the tracker believes in the end was no rest.
+#: Standard deviations from the final bias of the tracker beyond which a mean was not at rest.
 _FAR = 4.5
-#: The tracker begins anew at a rest so far from the temperature at which it began, K: what the
-#: table learned in this run counts from there on.
+#: Distance from the temperature of the last start, K, at which the tracker is restarted at rest,
+#: with the new entries of the table.
 _AWAY = 5.0
-#: A temperature that comes no more is taken to go away so fast, K/s, up to so far, K.
+#: Assumed drift of the temperature after its last message, K/s, and its limit, K.
 _LOST_RATE, _LOST = 1.0 / 60.0, 15.0
-#: What the rate at rest depends on is computed so often, s.
+#: Interval at which the sensitivity at rest is computed, s.
 _STILL = 0.5
-#: In motion it is computed so often, s, and where the rate has changed by more than so much, rad/s
-#: plus a part of it.
+#: Interval at which the sensitivity in motion is computed, s, and change of the rate at which it
+#: is computed earlier, rad/s plus a share of the rate.
 _HELD, _NEAR, _ALIKE = 0.1, 0.5 * DEGREE, 0.02
-#: A temperature that is older is held, and counts as less and less known, s.
+#: Age of a temperature, s, from which on it is held with a growing uncertainty.
 TEMPERATURE_TIMEOUT = 10.0
-#: Samples of a log that are taken at once.
+#: Samples of a log in one chunk.
 _AT_ONCE = 1 << 15
-#: A calibration that turns out to be older or younger by so much is carried anew, s; one from
-#: further ahead has no known age.
+#: Step of the clock, s, after which the age of a calibration is computed again, and largest time
+#: that a calibration may be dated in the future.
 _OLDER = 3600.0
-#: Plausible stamps, s, and specific forces, m/s², are not beyond.
+#: Largest plausible stamp, s, and specific force, m/s².
 _LATEST, _STRONGEST = 1e12, 1e5
-#: A calibration without a date is so old, s.
+#: Assumed age of a calibration without a date, s.
 _YEAR = 365.25 * 86400.0
 
 
@@ -80,11 +80,12 @@ class _Stretch:
 
     Attributes
     ----------
-    begin : from when on, s
-    seen : what the rate changes by for each uncertain value, shape (m,), first at the begin, in
-        the end on the mean
-    count, modelled, temperature : how many, rates after the model, rad/s, and temperatures, degC
-    over : the rest has ended
+    begin : stamp of the first, s
+    seen : sensitivity of the rate to each uncertain value, shape (m,), first at the begin, finally
+        the mean
+    count, modelled, temperature : number, and sums of rates after the model, rad/s, and of
+        temperatures, degC
+    over : whether the rest has ended
 
     """
 
@@ -102,21 +103,21 @@ class _Stretch:
 
 class HeadingEstimator:
     """
-    Follow the heading of a robot.
+    Estimate the heading of a robot.
 
     Attributes
     ----------
-    model : with the calibration as it is stored
-    used : the model with the calibration of now, with which samples are compensated
+    model : with the stored calibration
+    used : the model with the present calibration, by which samples are compensated
     tracker : of the heading
     table : of biases at rest
-    temperature : the last that came, degC; None before
-    rate : the last, rad/s; zero at rest
-    corrected : the same before the tracker
-    last : what the compensation made of the last sample
-    beginnings : how often the tracker began anew
-    refused : samples that were not used, as no such gyro reports them; they count as lost
-    refused_temperatures : alike; the temperature before goes on
+    temperature : last temperature, degC; None before the first
+    rate : last rate, rad/s; zero at rest
+    corrected : last rate before the tracker, rad/s
+    last : result of the compensation of the last sample
+    beginnings : number of starts of the tracker
+    refused : number of implausible samples, which are not used and count as lost
+    refused_temperatures : number of implausible temperatures, which are not used
 
     """
 
@@ -159,7 +160,7 @@ class HeadingEstimator:
         return self._tracker
 
     def use(self, model: GyroModel, now: float) -> None:
-        """Go on with a self-calibration that was made just now; the heading does not jump."""
+        """Use a self-calibration that was made just now; the heading does not jump."""
         self.model, self._this_run = model, True
         self._begin(now, fresh=True)
 
@@ -170,17 +171,17 @@ class HeadingEstimator:
         self._begin(now)
 
     def set(self, settings: Settings) -> None:  # noqa: A003
-        """Go on with other settings of the tracker."""
+        """Use other settings of the tracker."""
         self._settings = settings
         self.tracker.set(settings)
 
     def reset(self) -> None:
-        """Call this direction zero."""
+        """Set the heading to zero."""
         self._turned_before += self.tracker.heading
         self.tracker.reset()
 
     def rewind(self, heading: float, variance: float) -> None:
-        """Go back to a heading, rad, with its variance, rad²."""
+        """Set the heading, rad, and its variance, rad²."""
         self._turned_before += self.tracker.heading - heading
         self.tracker.rewind(heading, variance)
 
@@ -190,7 +191,7 @@ class HeadingEstimator:
         return self._this_run
 
     def clock_was_set(self, step: float) -> None:
-        """Take all dates of this run for those of a clock that was then set by a step, s."""
+        """Correct all dates of this run for a clock that was set by a step, s."""
         self._begun += step
         self.table.clock_was_set(step)
         calibration = self.model.self_calibration
@@ -201,10 +202,10 @@ class HeadingEstimator:
             self.model = with_self_calibration(self.model, replace(
                 calibration, time=then.isoformat(timespec='seconds')))
 
-    # What is known at the begin
+    # The calibration at the start
 
     def _begin(self, now: float, fresh: bool = False) -> None:
-        """Carry the calibration to time and temperature of now, unless fresh, and track on."""
+        """Propagate the calibration to the present, unless it is new, and start the tracker."""
         self._sentence = ''
         self.used, age = ((assumed(self.model, self._assumptions), 0.0) if fresh
                           else self._carried(now))
@@ -231,7 +232,7 @@ class HeadingEstimator:
         self.beginnings += 1
 
     def _anchor(self, now: float) -> None:
-        """Let the bias follow the temperature from that of now on, if it is known."""
+        """Start the temperature correction of the bias at the present temperature, if known."""
         here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
         self._anchored = here is not None
         self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
@@ -239,10 +240,10 @@ class HeadingEstimator:
 
     def _resume_temperature(self, now: float, around: Channels | None) -> None:
         """
-        Go on from the temperature of now with what was calibrated in this run without one.
+        Continue at the first temperature with a calibration of this run made without one.
 
-        It was calibrated behind the model at the temperature that was held up to the last sample.
-        The different output of the model at the temperature of now is no change of the rate.
+        It was made after the model at the temperature that was assumed up to the last sample. The
+        different output of the model at the present temperature is not a change of the rate.
 
         """
         here = compensate(self.used, 0.0, self.temperature, around).modelled
@@ -277,17 +278,17 @@ class HeadingEstimator:
 
     @property
     def sentence(self) -> str:
-        """Return what age and temperature leave of the calibration; '' where it is negligible."""
+        """Return the message on age and temperature of the calibration; '' if negligible."""
         return (self._sentence
                 if self.tracker.bias[1] > 0.5 * math.sqrt(self.covariance[-1, -1]) else '')
 
     def age(self, now: float) -> float:
-        """Return how long ago the bias was calibrated, s; a year where it is unknown."""
+        """Return the age of the calibration of the bias, s; a year if it is unknown."""
         age = self._dated(now)
         return _YEAR if age is None or age < -_OLDER else max(age, 0.0)
 
     def _dated(self, now: float) -> float | None:
-        """Return the age, s, as the date and the clock have it; None without a date."""
+        """Return the age, s, by date and clock; None without a date."""
         calibration = self.model.self_calibration
         written = calibration.time if calibration else str(self.model.origin.get('date', ''))
         try:
@@ -297,7 +298,7 @@ class HeadingEstimator:
         return now - (when if when.tzinfo else when.replace(tzinfo=timezone.utc)).timestamp()
 
     def known_for(self, now: float) -> float:
-        """Return the age of the variance of the bias, s; a carried one includes its own."""
+        """Return the age of the variance of the bias, s, which a propagated one includes."""
         return self.age(now) if self.used.self_calibration is None else max(now - self._begun, 0.0)
 
     @property
@@ -318,7 +319,7 @@ class HeadingEstimator:
     # Samples
 
     def take_temperature(self, time: float, temperature: float) -> None:
-        """Take a temperature, degC, with its stamp, s; one that is not plausible is refused."""
+        """Take a temperature, degC, with its stamp, s; an implausible one is refused."""
         coldest, hottest = self.model.temperature_limits
         if coldest <= temperature <= hottest and abs(time) <= _LATEST:
             self.temperature, self._temperature_time = temperature, time
@@ -337,7 +338,7 @@ class HeadingEstimator:
 
     @property
     def _known_temperature(self) -> float | None:
-        """Return the temperature of now, degC; None where none came, or the last is too old."""
+        """Return the present temperature, degC; None before the first or if it is too old."""
         return None if self.temperature_is_lost else self.temperature
 
     def add(self, time: float, output: float, now: float, force: float | None = None,
@@ -394,14 +395,14 @@ class HeadingEstimator:
         return message
 
     def plausible(self, time: float, output: float, force: float | None = None) -> bool:
-        """Tell whether such a gyro may report that; `add` refuses other samples, and any nan."""
+        """Tell whether a sample is plausible for the gyro; `add` refuses others, and any nan."""
         limit = self.used.rate_limit
         return (-limit <= output <= limit and -_LATEST <= time <= _LATEST
                 and (force is None or -_STRONGEST <= force <= _STRONGEST))
 
     def _look_at(self, time: float, output: float, rate: float, around: Channels | None,
                  distance: float) -> None:
-        """Keep the costly sensitivity at rest, and for a moment at nearly the same rate."""
+        """Update the sensitivity, which is held at rest and for a short time at similar rates."""
         at, looked = self._looked
         if abs(time - at) > _HELD + CLOSE or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
             self._held, self._looked = None, (time, rate)
@@ -415,7 +416,7 @@ class HeadingEstimator:
 
     def _sensitive(self, output: float, rate: float, temperature: Number, around: Channels | None,
                    distance: float) -> Array:
-        """Return what the rate changes by for each uncertain value, shape (m,)."""
+        """Return the sensitivity of the rate to each uncertain value, shape (m,)."""
         return sensitive(self.used, rate_sensitivity(
             self.used, output, rate, temperature, around), distance)
 
@@ -433,10 +434,10 @@ class HeadingEstimator:
     def _look_around(self, interval: float, force: float | None,
                      supply: float | None) -> Channels:
         """
-        Return what effects look at apart from rate, output and temperature.
+        Return the channels of effects other than rate, output and temperature.
 
-        Time goes on with the stamps, also over gaps, and stands while they jump back. The heading
-        is that of the tracker without its resets, and goes on at the last rate up to this sample.
+        Time increases with the stamps, also over gaps, and is constant when they jump back. The
+        heading is that of the tracker without its resets, extrapolated to this sample.
 
         """
         interval = max(interval, 0.0) if interval < math.inf else 0.0
@@ -495,12 +496,12 @@ class HeadingEstimator:
         return found
 
     def _even(self, time: Array, output: Array, temperature: Array | None, place: int) -> int:
-        """Return up to which sample model, table and temperature correction stay as they are."""
+        """Return the end of the samples with the same model, table and temperature correction."""
         if (self.used.looks_around or self._time == -math.inf or self._other_age
                 or self._anchored == (temperature is None)
                 or temperature is None and self.temperature is not None):
             return place
-        # a stretch of rest that is complete may let the tracker begin anew
+        # a complete stretch of rest may restart the tracker
         begin = self._stretch.begin if self._stretch else float(time[place])
         end = int(np.searchsorted(time[place:], begin + STRETCH - CLOSE)) + place
         end = min(end + (self._stretch is not None), len(time), place + _AT_ONCE)
@@ -551,7 +552,7 @@ class HeadingEstimator:
                          float(temperature[first:].sum()), (still[first], still[-1]))
 
     def _stills(self, time: Array, output: Array, result: Compensated, distance: Array) -> Array:
-        """Return the sensitivities at rest, which are computed every `_STILL` s, shape (n, m)."""
+        """Return the sensitivities at rest, computed every `_STILL` s, shape (n, m)."""
         places = list[int]()
         for place, at in enumerate(time.tolist()):
             if abs(at - self._still_at) > _STILL + CLOSE:
@@ -564,7 +565,7 @@ class HeadingEstimator:
         return whole
 
     def _looks(self, time: Array, output: Array, result: Compensated, distance: Array) -> Array:
-        """Return the sensitivities in motion, which are held for a moment, shape (n, m)."""
+        """Return the sensitivities in motion, which are held for a short time, shape (n, m)."""
         places, (at, looked) = list[int](), self._looked
         rates = np.asarray(result.rate)
         for place, (now, rate) in enumerate(zip(time.tolist(), rates.tolist())):
@@ -591,7 +592,7 @@ class HeadingEstimator:
             temperature[places] if isinstance(temperature, np.ndarray) else temperature),
             distance[places]).T
 
-    # What rests teach the next run
+    # The bias at rest for the next run
 
     def _gather(self, begin: float, end: float, count: int, modelled: float, temperature: float,
                 seen: Sequence[Array]) -> None:
@@ -618,10 +619,10 @@ class HeadingEstimator:
 
     def learn(self, now: float, ending: bool = False) -> str:
         """
-        Bring what was seen at rest into the table; to be called now and then.
+        Add the bias of complete stretches of rest to the table; to be called regularly.
 
-        A stretch waits until the next one is complete, or the rest or the run has ended: if the
-        robot has turned slowly meanwhile, the tracker knows by then.
+        A stretch is pending until the next one is complete, or the rest or the run has ended: by
+        then the tracker has detected a slow turn.
 
         Returns
         -------
@@ -639,7 +640,7 @@ class HeadingEstimator:
             each.over = True
 
     def _learn_at_rest(self, now: float) -> None:
-        """Teach the table as soon as the next stretch is complete; `learn` may come later."""
+        """Add a stretch to the table as soon as the next one is complete."""
         while len(self._pending) > 1 and self.tracker.resting:
             message = self._add_to_table(self._pending.popleft(), now)
             self._table_message = message or self._table_message
@@ -658,10 +659,10 @@ class HeadingEstimator:
 
     def _believed(self, temperature: float, seen: Array) -> tuple[float, float]:
         """
-        Return bias at a temperature and its standard deviation by the tracker as it is now, rad/s.
+        Return bias at a temperature and its standard deviation by the tracker at present, rad/s.
 
-        It is that after the model and before the self-calibration. When a stretch is examined, its
-        rest may be over, and the temperature may have changed.
+        It is the bias after the model and before the self-calibration. When a stretch is tested,
+        its rest may be over, and the temperature may have changed.
 
         """
         calibration = self.used.self_calibration or SelfCalibration()
@@ -672,11 +673,11 @@ class HeadingEstimator:
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 
     def missing(self, brought: Collection[str]) -> list[str]:
-        """Return the channels that the model looks at and no message brings."""
+        """Return the channels that the model needs and that no message contains."""
         return [channel for channel in ('supply', 'specific_force')
                 if self.used.looks_at(channel) and channel not in brought]
 
 
 def _drifted_unseen(late: float) -> float:
-    """Return how far a temperature may have drifted while none came for some time, s, in K."""
+    """Return the assumed drift of the temperature, K, some time, s, after its last message."""
     return min(max(late, 0.0) * _LOST_RATE, _LOST)

@@ -9,11 +9,12 @@
 # under the License.
 
 """
-From rates to a heading and its error: threshold filter, and integration on the stamps.
+Integration of rates to a heading and its variance: threshold filter, and trapezoids on the stamps.
 
-The threshold decides on the mean over a window: single samples of a cheap gyro cross it half of
-the time. A window of 0 is the published decision. Rates are integrated by trapezoids on the
-stamps: the rectangle rule is half a sample late, and a nominal interval is a scale error.
+The threshold is compared with the mean over a window, because single samples of a cheap gyro cross
+it half of the time. A window of 0 is the published decision. Rates are integrated by the trapezoid
+rule on the stamps: the rectangle rule has a delay of half a sample, and a nominal interval causes
+a scale factor error.
 
 """
 
@@ -36,10 +37,10 @@ class Threshold:
 
     Attributes
     ----------
-    rate : rad/s; below it the robot counts as standing; 0 switches the filter off
+    rate : rad/s; below it the robot is taken to be at rest; 0 disables the filter
     window : s; the mean over it is compared with the rate. 0 compares single samples, as published
-    angle_random_walk : rad/√s; a window that varies by more than three times what this explains is
-        motion, whatever its mean; 0 switches this test off
+    angle_random_walk : rad/√s; a window whose standard deviation exceeds three times that of this
+        noise is motion, whatever its mean; 0 disables this test
 
     """
 
@@ -50,11 +51,11 @@ class Threshold:
 
 class ThresholdFilter:
     """
-    Set the rate to zero while the robot stands, sample by sample.
+    Set the rate to zero while the robot is at rest, sample by sample.
 
-    As published the filter decides on single samples. With the noise of a cheap gyro this has
-    little effect at rest, so here the mean over a short window decides. What it deletes is for the
-    caller to count: a turn slower than the threshold is lost.
+    The published filter uses single samples. With the noise of a cheap gyro this has little effect
+    at rest, so the mean over a short window is used here. A turn slower than the threshold is
+    lost; the caller counts the deleted heading.
 
     """
 
@@ -78,12 +79,12 @@ class ThresholdFilter:
         window.append((time, min(max(rate, -FASTEST), FASTEST)))
         while window[0][0] <= time - self.settings.window and len(window) > 1:
             window.popleft()
-        # summed anew, so that what has left the window leaves no rounding error
+        # not a running sum, which would accumulate rounding errors
         rates = [each for _, each in window]
         mean = sum(rates) / len(rates)
         if not abs(mean) < self.settings.rate:
             return False
-        # it shakes where the window varies by more than noise would
+        # motion if the window varies by more than the noise
         explained = 9.0 * self.settings.angle_random_walk ** 2 * len(rates)
         return not 0.0 < explained < (
             (sum(each * each for each in rates) / len(rates) - mean * mean)
@@ -126,12 +127,12 @@ class BlockIntegrator:
     """
     Filter and integrate a log block by block, with the same result as in one piece.
 
-    The result is that of a `tracking.HeadingTracker` that looks for no rests, for a log without
-    gaps longer than that one bridges.
+    The result is that of a `tracker.HeadingTracker` that does not detect rest, for a log without
+    gaps longer than its `maximum_gap`.
 
     Attributes
     ----------
-    intervals : of the samples, and how many are lost
+    intervals : of the samples, with the number of lost ones
 
     """
 
@@ -171,7 +172,7 @@ class BlockIntegrator:
                 np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen))
 
     def _unseen_at(self, time: Array, rate: Array, kept: Array) -> Array:
-        """Return the variance by what was lost in gaps so far, rad², shape (n,)."""
+        """Return the variance by the gaps so far, rad², shape (n,)."""
         unseen, (last_time, last_rows) = np.zeros(len(time)), self._last
         before = ((float(last_time[0]), self._last_rate, bool(last_rows[1, 0]))
                   if len(last_time) else None)

@@ -9,17 +9,17 @@
 # under the License.
 
 """
-Kalman filter of a heading: its error, those of calibrated values, and the wander of the bias.
+Kalman filter of a heading, of the errors of calibrated values, and of the wander of the bias.
 
-The state is the heading, the rate random walk w, the parts f of the flicker, and the errors e of
-the values of the calibration. In a turn, the heading goes on by the integral of the compensated
-rate, less what the state explains of it::
+The state is the heading, the rate random walk w, the components f of the flicker noise, and the
+errors e of the values of the calibration. In motion, the heading changes by the integral of the
+compensated rate, less the part that the state explains::
 
     turned = true turn + T w + sum of tau (1 - exp(-T / tau)) f - sensitivity e + white noise
 
-At rest the true turn is zero, and the same line is a measurement (d of Hong and Park, eq. 11, with
-the noise figures of the model). It determines the bias, and by the correlation with the heading
-also the error of the heading before.
+At rest the true turn is zero, and the same equation is a measurement (d of Hong and Park, eq. 11,
+with the noise figures of the model). It determines the bias, and through the correlation with the
+heading also the earlier error of the heading.
 
 """
 
@@ -33,25 +33,25 @@ from gyro_calibration.model.noise import CALIBRATED, known_mean, Noise
 import numpy as np
 from scipy.linalg import pinvh
 
-#: Places of the heading and the random walk in the state; the flicker begins after them.
+#: Indices of heading, random walk and first flicker component in the state.
 HEADING, WALK, _FLICKER = 0, 1, 2
 
 
 @dataclass(slots=True)
 class RateIntegral:
     """
-    What the rates of some time came to.
+    Integral of the rates over some time.
 
     Attributes
     ----------
     duration : s
     turned : integral of the compensated rate, rad
     sensitivity : integral of the sensitivity of the rate to the calibration, shape (m,)
-    lost : variance of what was turned unseen, rad²
-    noise : what the variance of the noise is beyond that of as long a time with all samples, rad²
-    wander : variance of what the robot turns at a rest that may be none, and its rates show, rad²
-    unseen : there were no rates: the heading stays, and the errors of rates do not affect it; not
-        to be added to others
+    lost : variance of rotation that was not measured, rad²
+    noise : additional variance of the noise by lost samples, rad²
+    wander : variance of the rotation during a detected rest that may be a straight drive, rad²
+    unseen : there were no rates: the heading is constant, and errors of rates do not affect it;
+        not to be added to others
 
     """
 
@@ -64,13 +64,13 @@ class RateIntegral:
     unseen: bool = False
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
-        """Return both after each other."""
+        """Return the integral over both, one after the other."""
         return RateIntegral(self.duration + other.duration, self.turned + other.turned,
                             self.sensitivity + other.sensitivity,
                             self.lost + other.lost, self.noise + other.noise)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
-        """Return what is left of this one behind another with which it begins."""
+        """Return the rest of this integral after another with which it begins."""
         return RateIntegral(self.duration - other.duration, self.turned - other.turned,
                             self.sensitivity - other.sensitivity,
                             self.lost - other.lost, self.noise - other.noise)
@@ -79,13 +79,13 @@ class RateIntegral:
 @dataclass(frozen=True)
 class Step:
     """
-    How the state changes over some time, but for what the heading turned through.
+    Transition of the state over some time, without the rotation itself.
 
     Attributes
     ----------
-    seen : what each part of the state adds to the integral of the compensated rate, shape (n,)
-    kept : what stays of each part, shape (n,)
-    grown : covariance of what comes in new, shape (n, n); its first row and column are those of
+    seen : contribution of each component to the integral of the compensated rate, shape (n,)
+    kept : decay factor of each component, shape (n,)
+    grown : covariance of the process noise, shape (n, n); the first row and column are those of
         the integral of the rate, negated
 
     """
@@ -110,11 +110,11 @@ class Drift:
 
     @property
     def calibrated(self) -> int:
-        """Return the place of the first value of the calibration in the state."""
+        """Return the index of the first value of the calibration in the state."""
         return _FLICKER + len(self.noise.flicker()[0])
 
     def step(self, turn: RateIntegral) -> Step:
-        """Return how the state changes over a turn."""
+        """Return the transition of the state over an integral of rates."""
         seen, variance = self._seen(turn)
         _, kept, grown = self._wandered(turn)
         grown = grown.copy()
@@ -125,7 +125,7 @@ class Drift:
         return _step(self.noise, round(turn.duration, 6), turn.unseen, len(turn.sensitivity))
 
     def _seen(self, turn: RateIntegral) -> tuple[Array, float]:
-        """Return `Step.seen`, and the variance of what comes in new to the integral, rad²."""
+        """Return `Step.seen`, and the variance of the noise of the integral, rad²."""
         seen, _, grown = self._wandered(turn)
         seen = seen.copy()
         seen[len(seen) - len(turn.sensitivity):] = -turn.sensitivity
@@ -133,7 +133,7 @@ class Drift:
         return seen, float(grown[HEADING, HEADING]) + white + turn.lost + turn.noise
 
     def moved(self, turn: RateIntegral) -> Drift:
-        """Return the state after a turn."""
+        """Return the state after a time in motion."""
         step = self.step(turn)
         transition = np.diag(step.kept)
         transition[HEADING] -= step.seen
@@ -142,22 +142,22 @@ class Drift:
         return Drift(self.noise, mean, transition @ self.covariance @ transition.T + step.grown)
 
     def heading_variance(self, turn: RateIntegral) -> float:
-        """Return the variance of the heading after a turn, rad²."""
+        """Return the variance of the heading after a time in motion, rad²."""
         row, variance = self._seen(turn)
         row[HEADING] -= 1.0
         return float(row @ self.covariance @ row) + variance
 
     def rested(self, turn: RateIntegral) -> Drift:
-        """Return the state after a time in which the true rate was zero."""
+        """Return the state after a time at rest, with its measurement."""
         step = self.step(turn)
         return self.measured(turn, step).carried(turn, step)
 
     def measured(self, turn: RateIntegral, step: Step | None = None) -> Drift:
         """
-        Return the state at the begin of a time of rest, with what it shows.
+        Return the state at the begin of a time at rest, updated by its measurement.
 
-        Where the robot may turn by a `wander`, that is part of what the rates show and of the
-        heading, which is then that of the end.
+        A `wander` of the turn is added to the variance of the measurement and to that of the
+        heading, which is then the heading at the end.
 
         """
         step = step or self.step(turn)
@@ -173,7 +173,7 @@ class Drift:
                      covariance - along[:, None] * along / variance)
 
     def carried(self, turn: RateIntegral, step: Step | None = None) -> Drift:
-        """Return the state after a time in which the heading stood and nothing was measured."""
+        """Return the state after a time of constant heading without a measurement."""
         step = step or self.step(turn)
         grown = step.grown.copy()
         grown[HEADING] = grown[:, HEADING] = 0.0
@@ -206,13 +206,13 @@ class Drift:
                 variance + float(sensitivity @ (covariance @ sensitivity - 2.0 * shared)))
 
     def uncertain(self, place: int, variance: float) -> Drift:
-        """Return the state with one part less well known."""
+        """Return the state with a variance added to one component."""
         covariance = self.covariance.copy()
         covariance[place, place] += variance
         return replace(self, covariance=covariance)
 
     def known_to_head(self, heading: float, variance: float) -> Drift:
-        """Return the state where later times have shown the heading, rad, rad²."""
+        """Return the state given a later estimate of its heading, rad, and variance, rad²."""
         own = self.covariance[HEADING, HEADING]
         gain = self.covariance[HEADING] / own if own > 0.0 else 0.0 * self.covariance[HEADING]
         return replace(
@@ -239,8 +239,8 @@ def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float
     covariance : of the calibration, shape (m, m), from `compensation.covariance`
     heading, variance : rad and rad²
     age : of a self-calibration, s, whose bias, the last value, is a mean over `CALIBRATED` s; None
-        without one. Its variance holds the floor of the Allan deviation for the flicker, which is
-        counted part by part here instead
+        without one. Its variance contains the floor of the Allan deviation for the flicker, which
+        is replaced here by that of the flicker components
 
     """
     constants, of_each = noise.flicker()
@@ -263,7 +263,7 @@ def heading_variances(drifts: list[Drift], turns: list[RateIntegral]) -> Array:
     figures = np.array([(turn.duration, turn.lost + turn.noise
                          + drift.noise.angle_random_walk ** 2 * turn.duration)
                         for drift, turn in zip(drifts, turns)])
-    # flicker and walk are the same in all states
+    # flicker and random walk have the same parameters in all states
     seen, variances = _integrated(drifts[0].noise, np.round(figures[:, 0], 6))
     rows = np.concatenate([-seen, [turn.sensitivity for turn in turns]], axis=1)
     rows[:, HEADING] += 1.0
@@ -272,7 +272,7 @@ def heading_variances(drifts: list[Drift], turns: list[RateIntegral]) -> Array:
 
 
 def _integrated(noise: Noise, durations: Array) -> tuple[Array, Array]:
-    """Return what heading, walk and flicker add to integrals, (k, parts), and their variance."""
+    """Return contributions of heading, walk and flicker to integrals, (k, parts), and variance."""
     constants, variance = noise.flicker()
     ratio = durations[:, None] / constants
     left = np.exp(-ratio)
@@ -295,7 +295,7 @@ def _step(noise: Noise, duration: float, unseen: bool,
 
 def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
     """
-    Return what heading, walk and flicker add to the integral, what stays, and what comes in new.
+    Return contributions of heading, walk and flicker to the integral, decay, and process noise.
 
     White noise is not included.
 
@@ -313,7 +313,7 @@ def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
 
 
 def _unseen(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
-    """Return the same where no rates are integrated: walk and flicker go on, and add nothing."""
+    """Return the same without rates: walk and flicker go on, and contribute nothing."""
     seen, kept, grown = (values.copy() for values in _wander(noise, duration))
     seen[:] = grown[HEADING] = grown[:, HEADING] = 0.0
     return seen, kept, grown
@@ -321,7 +321,7 @@ def _unseen(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
 
 def smoothed(states: list[Drift], turns: list[RateIntegral], resting: list[bool]) -> list[Drift]:
     """
-    Return the states with all that came later (Rauch, Tung and Striebel).
+    Return the states smoothed by all later data (Rauch, Tung and Striebel).
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ def smoothed(states: list[Drift], turns: list[RateIntegral], resting: list[bool]
 
 
 def _with_hindsight(state: Drift, turn: RateIntegral, rest: bool, later: Drift) -> Drift:
-    """Return a state with what the one after it has come to."""
+    """Return a state updated by the smoothed state after it."""
     step, start = state.step(turn), state
     if rest:
         after = state.measured(turn).carried(turn)
@@ -357,7 +357,7 @@ def _with_hindsight(state: Drift, turn: RateIntegral, rest: bool, later: Drift) 
 
 
 def _inverse(covariance: Array) -> Array:
-    """Return the inverse of a covariance in which some parts may be known exactly."""
+    """Return the pseudo-inverse of a covariance that may have zero variances."""
     size = np.sqrt(np.diagonal(covariance))
     size = np.where(size > 0.0, size, 1.0)
     return pinvh(covariance / np.outer(size, size)) / np.outer(size, size)

@@ -9,9 +9,9 @@
 # under the License.
 
 """
-A whole log: its compensation, and its heading as it was known live or with all that came later.
+Compensation of a whole log, and its heading by filter or smoother.
 
-A model with history follows its surroundings over blocks of the log.
+A model with history is evaluated over blocks of the log.
 
 """
 
@@ -33,12 +33,12 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 
-#: Where effects look at a heading without reference, it is found for so long at once, s; longer
+#: Length of the parts for which the heading of effects is iterated without a reference, s; longer
 #: parts need more passes.
 _AT_ONCE = 60.0
-#: A reference heading that is lost for no longer is interpolated, s.
+#: Longest gap of a reference heading that is interpolated, s.
 _BRIDGED = 1.0
-#: Passes end where the heading changes by less, rad, or after so many.
+#: Change of the heading at which the iteration ends, rad, and largest number of passes.
 _SETTLED, _PASSES = 1e-10, 50
 
 
@@ -46,18 +46,18 @@ class LogCompensation:
     """
     Compensate a log block by block, with the same result as in one piece.
 
-    The heading that effects look at is that of the reference. Without one it is the integral of
-    the compensated rates from 0 on.
+    The heading of effects is that of the reference. Without one it is the integral of the
+    compensated rates from 0 on.
 
-    Where a reference is lost, the heading goes on from its last value by the compensated rates. Up
-    to `_BRIDGED` s inside a block are interpolated instead; over the border of blocks the next
-    value is not known, and the result differs a little. Before the first value of a reference its
-    heading is that value; in blocks before the one with that it is found from 0 on.
+    In a gap of the reference, the heading is its last value plus the integral of the compensated
+    rates. Gaps up to `_BRIDGED` s inside a block are interpolated instead; across the border of
+    blocks the next value is not known, and the result differs slightly. Before the first value of
+    a reference the heading is that value; in earlier blocks it is integrated from 0 on.
 
     """
 
     def __init__(self, model: GyroModel):
-        """Begin with nothing known of the past."""
+        """Begin with an empty history."""
         self._model, self._history = model, model.history()
         self._begin: float | None = None
         self._referred = False
@@ -87,7 +87,7 @@ class LogCompensation:
                                         around)
 
     def _parts(self, log: Log) -> Iterator[Log]:
-        """Give the rows in parts with a reference or without one; those without are short."""
+        """Give the rows in parts with a reference, and in short parts without one."""
         if log.time is None or not self._model.looks_at('heading'):
             yield log
             return
@@ -122,7 +122,7 @@ class LogCompensation:
         return result, sensitivity
 
     def _found_heading(self, log: Log, around: Channels) -> Channels:
-        """Repeat: compensate with a heading, and integrate the rates to the next heading."""
+        """Iterate: compensate with a heading, and integrate the rates to the next heading."""
         assert log.time is not None
         last_time, last_rate, begin = self._turned
         carried, time = len(last_time), np.concatenate([last_time, self.true_time(log.time)])
@@ -149,11 +149,11 @@ def plausible(model: GyroModel, log: Log) -> Mask:
 
 
 def none_plausible(model: GyroModel) -> str:
-    """Return what to say of a log without a plausible row."""
+    """Return the message for a log without a plausible row."""
     coldest, hottest = model.temperature_limits
-    return (f'no row has an output within {model.rate_limit / DEGREE:.0f} deg/s and a temperature '
-            f'from {coldest:.0f} to {hottest:.0f} degC, which is all that is plausible; see '
-            'whether columns and units are right')
+    return ('no row is plausible, with an output within '
+            f'{model.rate_limit / DEGREE:.0f} deg/s and a temperature from {coldest:.0f} to '
+            f'{hottest:.0f} degC; check columns and units')
 
 
 def compensate_log(model: GyroModel, log: Log) -> Array:
@@ -170,7 +170,7 @@ def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
 
 
 def _bridged(time: Array, heading: Array | None) -> Array | float:
-    """Return a heading that is interpolated where it was lost."""
+    """Return a heading with its gaps interpolated."""
     if heading is None or not (known := np.isfinite(heading)).any():
         return 0.0
     return heading if known.all() else np.interp(time, time[known], heading[known])
@@ -185,8 +185,8 @@ class Track:
     ----------
     heading, variance, rate, rate_variance : rad, rad², rad/s and (rad/s)², shape (n,)
     resting : shape (n,)
-    deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
-    intervals : of the samples, and how many are lost
+    deleted : heading attributed to bias or noise at rest, or deleted by the threshold filter, rad
+    intervals : of the samples, with the number of lost ones
 
     """
 
@@ -212,11 +212,11 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     noise, covariance, settings, age : as in `HeadingTracker`
     wheels : whether wheels or commands move the robot, n of them, or None
     still : as in `HeadingTracker.add`
-    hindsight : let all that came later count too
+    hindsight : smooth the heading by all later data
 
     Raises
     ------
-    OverflowError : hindsight is wanted, and a heading or its variance is no finite number
+    OverflowError : with hindsight, a heading or its variance is not finite
 
     """
     tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
@@ -233,7 +233,7 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
 
 
 def _without_spikes(time: Array, rate: Array) -> Array:
-    """Return rates with what the tracker holds for no motion interpolated, shape (n,)."""
+    """Return rates with the outliers of the tracker interpolated, shape (n,)."""
     jumps = np.abs(np.diff(rate)) > JUMP + ACCELERATION * np.diff(time)
     back = np.abs(rate[2:] - rate[:-2]) <= JUMP + ACCELERATION * (time[2:] - time[:-2])
     spikes = np.flatnonzero(jumps[:-1] & back) + 1
@@ -245,19 +245,19 @@ def _without_spikes(time: Array, rate: Array) -> Array:
 
 def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
     """
-    Return heading, rad, its variance, rad², and rest, shape (n,) each, with all that came later.
+    Return smoothed heading, rad, its variance, rad², and rest, shape (n,) each.
 
-    The heading is what the rates came to, with the correction interpolated between the steps.
+    The heading is the integral of the rates, with the correction interpolated between the steps.
 
     Parameters
     ----------
-    tracker : that kept its steps, and was given the samples
+    tracker : with its steps kept, after all samples
     time, rate : of the samples, s and rad/s, shape (n,)
 
     """
     last, steps, states = tracker.finish(), tracker.steps, list[Drift]()
     end, later = len(steps), None
-    # a calibration that was used later knows the heading alone of what was before
+    # of the data before another calibration, only the heading is in its state
     for first, before in [*tracker.renewed[::-1], (0, None)]:
         part = steps[first:end]
         states = smoothed(

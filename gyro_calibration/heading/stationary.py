@@ -9,11 +9,11 @@
 # under the License.
 
 """
-Whether a gyro rests: the energy of its rate against the known noise, and how unlikely a mean is.
+Detection of rest: energy of the rate against the known noise, and tests of means of the rate.
 
-Each test has its share of the false alarms per hour at rest. What passes for a rest may be a
-straight drive; how likely that is follows from the scatter of its means. Of a log, whole blocks of
-samples are tested at once.
+Each test has its share of the false alarms per hour at rest. A detected rest may be a straight
+drive; its probability follows from the scatter of the means. The samples of a log are tested in
+whole blocks.
 
 """
 
@@ -33,24 +33,24 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-#: Length of a block of samples, and of the window whose energy is looked at, s.
+#: Length of a block of samples, and of the window whose energy is tested, s.
 BLOCK, WINDOW = 0.1, 0.5
-#: Times, s, over which the mean of the rate is compared with the bias that was known before them.
+#: Durations, s, over which the mean of the rate is compared with the bias known before them.
 LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
-#: Times, s, over which the scatter of means over 1 s is compared with the noise.
+#: Durations, s, over which the scatter of means over 1 s is compared with the noise.
 SCATTERED = (4.0, 8.0, 16.0, 32.0, 64.0)
-#: A window has at least so many samples.
+#: Least number of samples in a window.
 _SAMPLES = 8
-#: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
-#: of the model.
+#: Windows in the memory of the noise, least number for its use, and largest ratio to the noise of
+#: the model.
 _REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
-#: Possible scatter of means over 1 s on what passes for a rest, beyond the white noise and over
-#: its variance; the first is that of a rest, the others are those of straight drives.
+#: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
+#: to it; the first is that of a rest, the others are those of straight drives.
 SCATTERS = np.append(0.0, 4.0 ** np.arange(7))
-#: What is assumed of a robot at first: so many rests, and straight drives that pass for rests;
-#: of so many the scatter is remembered.
+#: Prior numbers of rests, and of straight drives that pass for rests; largest total of both.
 _RESTS, _STRAIGHT, _STRETCHES = 3.0, 1.0, 20.0
-#: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
+#: Threshold per mean for the onset of scatter: the maximum likelihood for a variance of three
+#: times that of the noise.
 BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
 
 
@@ -61,7 +61,7 @@ class Block:
 
     Attributes
     ----------
-    duration : of what its samples stand for, s; a gap is none of that
+    duration : of its samples, s, without gaps
     count : of samples
     total, squares : of the compensated rate, rad/s and (rad/s)²
     differences : sum of the squared differences of neighbours, (rad/s)²
@@ -75,7 +75,7 @@ class Block:
     differences: float = 0.0
 
     def add(self, duration: float, rate: float, before: float) -> None:
-        """Take a sample that stands for `duration` s."""
+        """Add a sample with a duration, s."""
         self.duration += duration
         self.count += 1
         self.total += rate
@@ -92,22 +92,22 @@ def sigmas(lag: float, false_alarms: float) -> float:
 
 @lru_cache(maxsize=1024)
 def _exceeded(freedom: int, chance: float) -> float:
-    """Return what chi squared exceeds by such a chance."""
+    """Return the value that chi squared exceeds with a probability."""
     return float(chdtri(freedom, chance))
 
 
 def most_scatter(lag: float, freedom: int, false_alarms: float) -> float:
-    """Return the sum of squares of means over `lag` s that gives `false_alarms` an hour."""
+    """Return the sum of squares of means over `lag` s that gives `false_alarms` per hour."""
     chances = 3600.0 / lag * _OVERLAPPING
     return _exceeded(freedom, min(false_alarms / (_TESTS * chances), 0.5))
 
 
-#: Tests that share the false alarms, and how many more chances windows have that overlap.
+#: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
 _TESTS, _OVERLAPPING = len(LAGS) + 2, 3.0
 
 
 class _Quietest:
-    """The lowest tenth of the last values."""
+    """The 10 % quantile of the last values."""
 
     def __init__(self) -> None:
         self._seen: deque[float] = deque()
@@ -135,8 +135,8 @@ class Energy:
 
     Attributes
     ----------
-    factor : noise of the samples over that of the model, by the quietest windows; 1 until enough
-        were seen
+    factor : ratio of the noise of the samples to that of the model, by the quietest windows; 1
+        until there are enough windows
 
     """
 
@@ -152,11 +152,11 @@ class Energy:
         self._sudden: float | None = None
 
     def clear(self) -> None:
-        """Forget the window, as where rates of another calibration come."""
+        """Clear the window, as before rates of another calibration."""
         self._blocks.clear()
 
     def add(self, block: Block) -> bool | None:
-        """Take the next block; tell whether the window is only noise; None until it is full."""
+        """Add a block; tell whether the window contains only noise; None until it is full."""
         blocks = self._blocks
         blocks.append(block)
         duration, count = 0.0, 0
@@ -182,16 +182,16 @@ class Energy:
         claimed *= self.factor ** 2
         if energy >= claimed * _exceeded(count - 1, self._level) / (count - 1):
             return False
-        # what a robot does is slower than its samples: means over blocks show it far better
+        # motion is slower than the samples, so that means over blocks show it far better
         freedom = len(blocks) - 1
         return bool(freedom < 2 or means - total * total / count
                     < claimed * _exceeded(freedom, self._level))
 
     def _learn(self, duration: float, count: int, energy: float, differences: float) -> None:
         """
-        Learn the noise of the samples from the quietest tenth of the windows.
+        Update the noise of the samples by the quietest tenth of the windows.
 
-        Vibration of a robot that goes straight is no noise, and shows less in differences of
+        Vibration in a straight drive is not noise; it contributes less to differences of
         neighbours.
 
         """
@@ -206,7 +206,7 @@ class Energy:
 
     def sudden(self) -> float:
         """
-        Return how far a single sample may be off at rest, rad/s.
+        Return the largest deviation of a single sample at rest, rad/s.
 
         Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
 
@@ -221,14 +221,14 @@ class Energy:
 @dataclass(frozen=True)
 class Snapshot:
     """
-    State at some time of a rest.
+    State at some time during a rest.
 
     Attributes
     ----------
-    drift, deleted, steps : the state, heading deleted until then, rad, and steps kept
-    turn : what the rates came to since it began
-    squares, means : sum of the squared surprises of the steps since it began, and their number
-    likelihood : logarithm of how likely their scatter is for each of `SCATTERS`, shape (k,)
+    drift, deleted, steps : the state, the heading deleted until then, rad, and number of steps
+    turn : integral of the rates since the rest began
+    squares, means : sum of the squared normalized innovations since it began, and their number
+    likelihood : log-likelihood of their scatter for each of `SCATTERS`, shape (k,)
 
     """
 
@@ -244,11 +244,11 @@ class Snapshot:
 @dataclass
 class StraightDrives:
     """
-    How much the rates scatter on what passed for rests.
+    Distribution of the scatter of the rates in detected rests.
 
     Attributes
     ----------
-    counts : how many had each of `SCATTERS`, shape (k,)
+    counts : number of rests with each of `SCATTERS`, shape (k,)
 
     """
 
@@ -261,7 +261,7 @@ class StraightDrives:
         return np.asarray(chances / chances.sum())
 
     def learn(self, last: Snapshot) -> None:
-        """Take in all of what passed for a rest."""
+        """Add a detected rest that has ended."""
         kept = _STRETCHES / max(_STRETCHES, float(self.counts.sum()))
         self.counts = kept * self.counts + self.chances(last.likelihood)
 
@@ -269,13 +269,13 @@ class StraightDrives:
 @dataclass
 class SlowTurn:
     """
-    A turn that was seen late, and is so slow that the bias may have moved instead.
+    A turn that was detected late, and is so slow that it may be a change of the bias.
 
     Attributes
     ----------
     before : the state when it began
     rate : of the turn, rad/s
-    turn : what the rates came to since
+    turn : integral of the rates since then
 
     """
 
@@ -284,9 +284,9 @@ class SlowTurn:
     turn: RateIntegral
 
 
-#: A correction of the heading is taken over with this time constant while the robot moves, s.
+#: Time constant with which a pending correction of the heading is applied in motion, s.
 SETTLING = 1.0
-#: Blocks at rest whose samples are compared with the bias at once; it is known anew each second.
+#: Blocks at rest whose samples are compared with one estimate of the bias.
 _LOOKED_AHEAD = 12
 
 
@@ -306,7 +306,7 @@ class Samples:
 
     def sample(self, place: int, resting: bool,
                ) -> tuple[float, float, Array, bool | None, Array | None]:
-        """Return what `HeadingTracker.add` wants."""
+        """Return the arguments of `HeadingTracker.add`."""
         return (float(self.time[place]), float(self.rate[place]),
                 (self.resting if resting else self.moving)[place],
                 None if self.wheels is None else self.wheels[place], self.still_at(place))
@@ -315,14 +315,14 @@ class Samples:
 @dataclass
 class Epoch:
     """
-    Samples over which nothing is learned; heading and what is pending of it at the begin, rad.
+    Samples with one state; heading and pending correction at the begin, rad.
 
     Attributes
     ----------
-    place : of the sample behind which it begins
-    taken : counts the epochs
-    opens : behind which samples blocks ended, and what the rates came to since the state
-    end : behind its last sample
+    place : index of the sample before its first
+    taken : number of the state
+    opens : last samples of its blocks, and integrals of the rates since the state
+    end : index after its last sample
 
     """
 
@@ -338,27 +338,27 @@ class Epoch:
 
 class EvenSamples:
     """
-    Samples without jumps and gaps, n of them, and their sums by blocks, k of them.
+    n samples without jumps and gaps, and their sums over k blocks.
 
     Attributes
     ----------
     time, rate, intervals, halves, turned : stamps, rates, the intervals before them, half of them,
         and the integrals of the rates over them, shape (n,)
     moving, resting : sensitivities, shape (n, m)
-    seen : those that were used, with that of the sample before, shape (n + 1, m)
-    begins, ends, whole : of the blocks, and which of them are whole
-    sums : duration, integral, share of a pending correction that stays, and sums of the rates,
+    seen : the sensitivities used, first that of the sample before, shape (n + 1, m)
+    begins, ends, whole : first samples and ends of the blocks, and range of complete blocks
+    sums : duration, integral, remaining share of a pending correction, and sums of the rates,
         their squares, and the squares of their steps, by block
     weighted : integrals of the sensitivities in motion and at rest, shape (k, m) each
-    found : what `HeadingTracker.follow` returns
-    rested : whether the last sample was taken at rest
-    epochs : begun so far
+    found : the result of `HeadingTracker.follow`
+    rested : whether the last sample was at rest
+    epochs : so far
 
     """
 
     def __init__(self, given: Samples, where: slice, last: tuple[float, float, float, Array],
                  begun: float, rested: bool, found: Array):
-        """Begin behind the last sample, with a block that has begun for some time, s."""
+        """Begin after the last sample, with an elapsed duration of the first block, s."""
         self._given, self._first, self.rested, self.found = given, where.start, rested, found
         self.time, self.rate = given.time[where], given.rate[where]
         self.moving, self.resting = given.moving[where], given.resting[where]
@@ -393,7 +393,7 @@ class EvenSamples:
         return np.asarray(np.add.reduceat(values, self.begins))
 
     def moved(self, number: int) -> Sequence[bool | None]:
-        """Return what is known of the wheels in a block."""
+        """Return whether wheels moved the robot, for the samples of a block."""
         wheels = self._given.wheels
         return () if wheels is None else wheels[self._first + self.begins[number]:
                                                 self._first + self.ends[number]]
@@ -426,7 +426,7 @@ class EvenSamples:
                     self.resting if epoch.resting else self.moving)[epoch.place + 1:end + 1]
 
     def fill(self, usual: Array) -> None:
-        """Fill in what was found in the epochs; `usual` are the intervals behind each sample."""
+        """Compute the results of the epochs; `usual` are the usual intervals at each sample."""
         found, interval = self.found, np.clip(np.minimum(self.intervals, usual), SHORTEST, None)
         moving = list[Epoch]()
         for epoch in self.epochs:

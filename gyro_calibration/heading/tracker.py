@@ -9,11 +9,11 @@
 # under the License.
 
 """
-The heading of a robot from compensated rates, with its variance and the bias seen at rest.
+The heading of a robot from compensated rates, with its variance, and the bias estimated at rest.
 
-At rest the bias is tracked, the rate is zero and the heading stands. In motion the bias stays,
-with a variance that grows. A turn too slow to be seen at once is seen over a longer time, and what
-was taken for bias meanwhile becomes heading again.
+At rest the bias is estimated, the rate is zero and the heading is constant. In motion the bias is
+constant, with a growing variance. A turn too slow to be detected at once is detected over a longer
+time; its rotation, which was attributed to the bias meanwhile, is then added to the heading.
 
 """
 
@@ -50,48 +50,48 @@ from gyro_calibration.logs.log import Array, DEGREE, SHORTEST
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: A rate that changes from one sample to the next by more than this, rad/s, and this acceleration,
-#: rad/s², and then comes back, is no motion of a robot.
+#: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
+#: larger change that is reversed in the next sample is an outlier.
 JUMP, ACCELERATION = 0.5, 200.0
-#: The state goes on at least so often, s.
+#: Longest step of the state, s.
 _STEP = 1.0
-#: A sample at rest may be off by so many standard deviations of the bias.
+#: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
 _FAR = 4.0
-#: A rest that is over sooner, without a sudden motion, was none, s.
+#: Shortest rest without a sudden end, s.
 _BRIEF = 2.0
-#: While the wheels stand, the robot does not turn, and the bias may have moved by so much, rad/s;
-#: odometry may show that for some time, s, after the robot began to turn.
+#: Change of the bias that is assumed while the wheels stand, rad/s; largest delay of odometry
+#: after the begin of a turn, s.
 _UNSEEN, _LATE_WHEELS = 0.2 * DEGREE, 4.0
-#: Noise of the samples counts from this factor over that of the model on; a mean may be off by so
-#: much more, for noise figures are not better known.
+#: Tolerance of the noise figures: factor of the noise of the samples to that of the model from
+#: which on it is used, and factor of the thresholds of means.
 _ALLOWED = 1.25
-#: A steady turn slower than so many times the slowest that is noticed may be a bias that moved;
-#: it is taken for one after so long, s.
+#: A steady turn slower than so many times the slowest detectable one may be a change of the bias;
+#: it is attributed to the bias after this time, s.
 _SLOW_TURN, _DECIDED = 1.5, 2.0 * LAGS[-1]
-#: Where rests are looked for anew, a pending correction waits so much longer, s, until a rest that
-#: goes on is found again.
+#: When the detection of rest restarts, a pending correction is delayed by this time, s, so that a
+#: continued rest is detected first.
 _RECOGNIZED = 1.0
-#: Samples of a log that are taken at once.
+#: Samples of a log in one chunk.
 _AT_ONCE = 1 << 15
-#: Last blocks of a rest that are remembered, among which its end is looked for.
+#: Last blocks of a rest in memory, among which its end is located.
 _BLOCKS = round((2.0 * _STEP + WINDOW) / BLOCK)
-#: States of a rest that are remembered.
+#: States of a rest in memory.
 _SNAPSHOTS = round(LAGS[-1] / _STEP) + 8
-#: The slowest turn that is noticed is missed with a probability of 5 %.
+#: Sigmas of a power of 95 %, for the slowest detectable turn.
 _POWER = 1.645
 
 
 @dataclass(frozen=True)
 class Settings:
     """
-    How the heading is tracked.
+    Settings of the heading tracker.
 
     Attributes
     ----------
-    false_alarms : rests taken for motion, in an hour at rest, 1/h; 0 looks for no rests, and nor
-        does an unknown noise
-    threshold : of the filter of Hong and Park, eq. 12; used where rests are not looked for
-    maximum_gap : over a longer gap in the stamps nothing is integrated, s
+    false_alarms : false detections of motion per hour at rest, 1/h; 0 disables the detection of
+        rest, as does an unknown noise
+    threshold : of the filter of Hong and Park, eq. 12; used without detection of rest
+    maximum_gap : longest gap in the stamps that is integrated, s
 
     """
 
@@ -102,7 +102,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Step:
-    """A part of the drive: state before, integral of the rates, robot at rest or not, end in s."""
+    """A part of the drive: state before it, integral of the rates, rest or motion, end in s."""
 
     before: Drift
     turn: RateIntegral
@@ -112,20 +112,20 @@ class Step:
 
 class HeadingTracker:
     """
-    Follow the heading sample by sample.
+    Track the heading sample by sample.
 
     Attributes
     ----------
-    heading : as it is published, rad, continuous, not wrapped
+    heading : published heading, rad, continuous, not wrapped
     rate : rad/s; zero at rest
-    resting : whether the robot rests
-    deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
-    intervals : of the samples, and how many are lost
-    refused : samples that were not used, as no robot turns so fast; they count as lost
-    outliers : samples that were not used, as no robot starts and stops so fast; they count as lost
-    rebuilt : how often the state was not finite and was built anew
-    steps : the drive so far, where it is kept
-    renewed : numbers of steps behind which another calibration was used, and the state before it
+    resting : whether the robot is at rest
+    deleted : heading attributed to bias or noise at rest, or deleted by the threshold filter, rad
+    intervals : of the samples, with the number of lost ones
+    refused : number of samples beyond the largest rate; they count as lost
+    outliers : number of samples beyond the largest acceleration; they count as lost
+    rebuilt : number of times that the state was not finite and was initialized again
+    steps : the drive so far, if it is kept
+    renewed : numbers of steps before another calibration was used, and the state before it
 
     """
 
@@ -140,8 +140,8 @@ class HeadingTracker:
         covariance : of the calibration, shape (m, m), from `compensation.covariance`
         age : of the self-calibration, whose s and b are the last values, s; None without one
         keep : the `steps`, for `smoothed`
-        per_rate : by which the sensitivity changes with the rate, shape (m,): the rates that are
-            added include the bias that rests have shown; a scale factor error does not act on it
+        per_rate : change of the sensitivity with the rate, shape (m,): the rates include the bias
+            estimated at rest, on which a scale factor error does not act
 
         """
         self._per_rate = per_rate
@@ -156,7 +156,7 @@ class HeadingTracker:
         self._reached = self._hesitates = 0.0
         self._drives, self.outliers, self._taken = StraightDrives(), 0, 0
         self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
-        # Stamp, s, and rate, rad/s, of the last sample before the last jump that was taken.
+        # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump.
         self._leap = -math.inf, 0.0
         self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
@@ -202,10 +202,10 @@ class HeadingTracker:
     def use(self, noise: Noise, covariance: Array, age: float | None = 0.0,
             per_rate: Array | None = None) -> None:
         """
-        Go on with other noise figures and another calibration.
+        Continue with other noise figures and another calibration.
 
-        The heading does not jump. What was learned of the bias at rest is forgotten, but not what
-        it showed of the turn before.
+        The heading does not jump. The estimate of the bias at rest is cleared, but the corrections
+        of the heading by it remain.
 
         """
         heading, variance = self.heading + self._pending, self.variance - self._pending ** 2
@@ -222,12 +222,12 @@ class HeadingTracker:
         self.set(self._settings)
 
     def reset(self) -> None:
-        """Call this direction zero, known exactly."""
+        """Set the heading to zero, without uncertainty."""
         self._settle()
         self.heading = self.deleted = 0.0
         self._drift = self._drift.turned_to(0.0)
         if self._slow:
-            # if the robot has stood since, it had this direction then
+            # if the turn was a change of the bias, the heading was the same at its begin
             self._slow.before = replace(
                 self._slow.before, drift=self._slow.before.drift.turned_to(0.0), deleted=0.0)
         self._take()
@@ -235,7 +235,7 @@ class HeadingTracker:
             self._rest()
 
     def rewind(self, heading: float, variance: float) -> None:
-        """Go back to a heading, rad, with its variance, rad²; the bias stays."""
+        """Set the heading, rad, and its variance, rad²; the bias estimate remains."""
         self._settle()
         self._recognize()
         self.heading, self._slow = heading, None
@@ -244,7 +244,7 @@ class HeadingTracker:
 
     @property
     def variance(self) -> float:
-        """Return the variance of the heading, rad²; what is still to be taken over counts too."""
+        """Return the variance of the heading, rad², with the square of a pending correction."""
         if self.resting:
             return float(self._drift.covariance[HEADING, HEADING]) + self._pending ** 2
         if self._known is None:
@@ -267,13 +267,13 @@ class HeadingTracker:
         sensitivity : of the rate to the calibration, shape (m,), as in `compensation`
         wheels : whether wheels or commands move the robot, or moved it since the last sample; None
             where that is not known
-        still : the sensitivity if the true rate is zero; without it that of the samples serves at
-            rest too: their noise then counts as a scale factor error, which is harmless only where
-            the scale factor is well known
+        still : the sensitivity if the true rate is zero; without it that of the samples is used at
+            rest too: their noise then acts as a scale factor error, which matters unless the scale
+            factor is well known
 
         Returns
         -------
-        '', or why the integration began anew with this sample
+        '', or why the integration was restarted with this sample
 
         """
         if not -FASTEST < rate < FASTEST:
@@ -284,9 +284,9 @@ class HeadingTracker:
             if spike is None:
                 self._spike = time, rate, sensitivity, wheels, still
                 return ''
-            # the rate stays there: when it began to, the samples do not tell
+            # the jump is permanent; its time between the samples is not known
             self._part.lost += (0.5 * (spike[1] - self._last[1]) * (spike[0] - self._last[0])) ** 2
-            # nor does it come back by itself within 2 s: what came between were no turns
+            # a rate between two jumps within 2 s may be erroneous
             begun, before = self._leap
             if 0.0 < spike[0] - begun < _BRIEF:
                 self._part.lost += ((self._last[1] - before) * (spike[0] - begun)) ** 2
@@ -297,7 +297,7 @@ class HeadingTracker:
         return self._add(time, rate, sensitivity, wheels, still)
 
     def _jumps(self, time: float, rate: float) -> bool:
-        """Tell whether no robot turns so much faster or slower since the last sample."""
+        """Tell whether the rate changed by more than a robot can since the last sample."""
         if self._last is None:
             return False
         interval, step = time - self._last[0], abs(rate - self._last[1])
@@ -306,7 +306,7 @@ class HeadingTracker:
 
     def _add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
              still: Array | None, lost: int | None = None) -> str:
-        """Take a sample; `lost` are samples before it where the intervals are known already."""
+        """Take a sample; `lost` is the number of lost samples before it, if known already."""
         self._still = still
         filtered = self._filter.filter(time, rate)
         last, self._last = self._last, (time, rate, filtered, sensitivity)
@@ -342,7 +342,7 @@ class HeadingTracker:
                wheels: Sequence[bool | None] | None = None, still: Array | None = None,
                resting: Array | None = None) -> Array:
         """
-        Take samples as `add` does, whole blocks at once where nothing is decided within them.
+        Take samples as `add` does, in whole blocks where no decision falls within them.
 
         Parameters
         ----------
@@ -386,7 +386,7 @@ class HeadingTracker:
         return len(even) if even.all() else int(np.argmin(even))
 
     def _follow_even(self, given: Samples, begin: int, end: int, found: Array) -> int:
-        """Take samples without jumps up to the next lost ones; return behind which sample."""
+        """Take samples without jumps up to the next lost ones; return the index after the last."""
         assert self._last is not None
         usual, lost = self.intervals.add_many(
             np.diff(given.time[begin:end], prepend=self._last[0]))
@@ -429,7 +429,7 @@ class HeadingTracker:
                      [(place, self._moving(self._open))])
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
-        """Take a whole block; return False, and take nothing, where it ends a rest within."""
+        """Take a whole block; return False, and take nothing, if a rest ends within it."""
         begin, end, moved = piece.begins[number], piece.ends[number], piece.moved(number)
         driven = True in moved
         if self.resting:
@@ -465,14 +465,14 @@ class HeadingTracker:
         return True
 
     def _off(self, sensitivity: Array) -> float:
-        """Return what a rate is off by, as seen at rest, rad/s; cached for one sensitivity."""
+        """Return the error of a rate as estimated at rest, rad/s; cached for one sensitivity."""
         if sensitivity is not self._seen:
             self._seen, self._seen_off = (
                 sensitivity, self._offset - float(sensitivity @ self._values))
         return self._seen_off
 
     def _integrate(self, interval: float, last: tuple[float, float, float, Array]) -> None:
-        """Take the heading on to the last sample."""
+        """Integrate the heading up to the last sample."""
         assert self._last is not None
         (_, rate, filtered, sensitivity), (_, last_rate, last_filtered, last_sensitivity) = (
             self._last, last)
@@ -501,7 +501,7 @@ class HeadingTracker:
         self.heading += corrected + settled
 
     def _look(self, duration: float, before: float, wheels: bool | None) -> None:
-        """Look for sudden motion at each sample, and for any at the end of each block."""
+        """Detect sudden motion at each sample, and slower motion at the end of each block."""
         assert self._last is not None
         _, rate, _, sensitivity = self._last
         self._block.add(duration, rate, before)
@@ -518,7 +518,7 @@ class HeadingTracker:
         self._block, self._driven = Block(), False
 
     def _decide(self, quiet: bool | None, wheels: bool | None) -> None:
-        """Decide at the end of a block; one that may still be a rest ends none."""
+        """Decide on rest or motion at the end of a block."""
         part, self._part, self._known = self._part, self._none(), None
         self._open += part
         if self.resting:
@@ -533,7 +533,7 @@ class HeadingTracker:
         if not quiet or wheels:
             self._wanted, self._slow = WINDOW, None
         if wheels:
-            # an even turn has no more energy than a rest: nothing is held back while wheels move
+            # a constant turn has the energy of a rest: no blocks are held while wheels move
             self._move(WINDOW)
         self._hold(part)
         if self._open.duration >= self._held.duration + _STEP - CLOSE:
@@ -545,7 +545,7 @@ class HeadingTracker:
             self._blocks.extend([*self._recent][1:])
 
     def _hold(self, part: RateIntegral) -> None:
-        """Hold the last blocks back that may turn out to be the begin of a rest."""
+        """Hold the last blocks, which may be the begin of a rest."""
         self._recent.append(part)
         self._held += part
         while (len(self._recent) > 2
@@ -553,11 +553,11 @@ class HeadingTracker:
             self._held -= self._recent.popleft()
 
     def _settled(self) -> RateIntegral:
-        """Return what is held back without its first block, in which the robot may move."""
+        """Return the held integral without its first block, in which the robot may move."""
         return self._held - self._recent[0]
 
     def _stands(self, wheels: bool | None) -> bool:
-        """Tell whether the mean of a quiet time that is long enough may be that of a rest."""
+        """Tell whether the mean over a quiet time of sufficient length is that of a rest."""
         if self._held.duration < self._wanted - CLOSE or len(self._recent) < 2:
             return False
         most = self._sigmas[self._wanted] * (1.0 if self._wanted == WINDOW else 0.5)
@@ -569,10 +569,10 @@ class HeadingTracker:
 
     def _drifted(self) -> bool:
         """
-        Take a slow turn that stays as it is for a bias that moved and a rest; tell whether so.
+        Attribute a slow turn of constant rate to a change of the bias at rest; tell whether so.
 
-        No robot turns as evenly for minutes. A bias that wanders by more than the model says would
-        otherwise make the heading drift at rest for ever.
+        A robot does not turn at a constant rate for minutes. Otherwise a bias that wanders by more
+        than the model states would cause a permanent drift of the heading at rest.
 
         """
         slow, held = self._slow, self._at_rest(self._held)
@@ -595,12 +595,12 @@ class HeadingTracker:
         return True
 
     def _surprise(self, drift: Drift, turn: RateIntegral, unseen: float = 0.0) -> float:
-        """Return how far the rates came to something else than at rest, in standard deviations."""
+        """Return the deviation of an integral from that at rest, in standard deviations."""
         expected, variance = drift.expected(turn)
         return (turn.turned - expected) / math.sqrt(variance + (unseen * turn.duration) ** 2)
 
     def _compare(self, wheels: bool | None) -> None:
-        """Compare the means over the longer times with the bias that was known before them."""
+        """Compare the means over the longer lags with the bias that was known before them."""
         for lag in LAGS:
             before = self._before(lag)
             if before is None:
@@ -622,7 +622,7 @@ class HeadingTracker:
             self._compare_scatter()
 
     def _compare_scatter(self) -> None:
-        """Compare the scatter of the means over 1 s with the noise, over the longer times."""
+        """Compare the scatter of the means over 1 s with the noise, over the longer lags."""
         last = self._snapshots[-1]
         for lag in SCATTERED:
             before = self._before(lag)
@@ -649,25 +649,25 @@ class HeadingTracker:
     # From rest to motion and back
 
     def _rest(self) -> None:
-        """Take the robot for standing from here on."""
+        """Begin a rest."""
         self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
         self._sure = False
         self._blocks = deque(maxlen=_BLOCKS)
         self._snapshots = [Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
 
     def _move(self, wanted: float) -> None:
-        """Take the robot for moving, until it is quiet for `wanted` s."""
+        """Begin a motion, which lasts until the rate is quiet for `wanted` s."""
         self.resting, self._wanted, self._recent, self._held = (
             False, wanted, deque[RateIntegral](), self._nothing)
 
     def _recognize(self) -> None:
-        """Look for a rest anew; if there was one, it may go on."""
+        """Restart the detection of rest; a rest may continue."""
         if self.resting:
             self._hesitates = _RECOGNIZED
         self._move(WINDOW)
 
     def _notice(self, lag: float, before: Snapshot | None = None) -> None:
-        """Take the robot for moving since `lag` s before the last block, or some snapshot."""
+        """Revise a rest to a motion since `lag` s before the last block, or since a snapshot."""
         self._advance()
         scattered = before is not None
         before = before or self._before(max(lag, WINDOW)) or self._snapshots[0]
@@ -688,11 +688,10 @@ class HeadingTracker:
     def _until_motion(self, before: Snapshot,
                       turn: RateIntegral) -> tuple[Snapshot, RateIntegral]:
         """
-        Return the state behind the last block at rest after a snapshot, and the turn since.
+        Return the state after the last block at rest after a snapshot, and the integral since.
 
-        Of all blocks at which motion may have begun, it is the likeliest, where the rates of a
-        motion scatter by an unknown size; the block before it is left out, for it may hold the
-        very begin.
+        The begin of motion is located by maximum likelihood, with rates of unknown scatter in
+        motion; the block before it is counted as motion, as it may contain the begin.
 
         """
         blocks, duration = list[RateIntegral](), 0.0
@@ -721,7 +720,7 @@ class HeadingTracker:
         return self._snapshots[-1], turn - quiet
 
     def _slow_turn(self, before: Snapshot, turn: RateIntegral) -> SlowTurn | None:
-        """Return what was noticed, where it is so slow that the bias may have moved."""
+        """Return the detected turn if it is so slow that it may be a change of the bias."""
         longest = replace(self._nothing, duration=LAGS[-1])
         least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
         rate = (turn.turned - before.drift.expected(turn)[0]) / turn.duration
@@ -730,10 +729,10 @@ class HeadingTracker:
 
     def _restart(self, interval: float, fastest: float, unseen: bool) -> str:
         """
-        Begin anew after a gap or a jump back, over which nothing is integrated.
+        Restart after a gap or a backward jump of the stamps, over which nothing is integrated.
 
-        Where the robot is not known to have stood, it may have turned to any direction meanwhile,
-        also from one rest to another. The stamps do not tell how much time a jump back hides.
+        Unless the wheels stood, the robot may have turned to any direction meanwhile, also between
+        two rests. The duration of a backward jump is unknown.
 
         """
         self._settle()
@@ -755,14 +754,14 @@ class HeadingTracker:
                 else f'the stamp jumps back by {-interval:.3f} s')
 
     def _settle(self) -> None:
-        """Take the state on to the last sample."""
+        """Propagate the state to the last sample."""
         self._open, self._part = self._open + self._part, self._none()
         if not self.resting:
             self._move(self._wanted)
         self._advance()
 
     def _advance(self, left: RateIntegral | None = None) -> None:
-        """Take the state on over what is open, but for what is left open."""
+        """Propagate the state over the open integral, except for the part `left`."""
         left = left or self._nothing
         turn, self._open = self._open - left, left
         if turn.duration > CLOSE:
@@ -773,7 +772,7 @@ class HeadingTracker:
         self._take()
 
     def _advance_at_rest(self, turn: RateIntegral, left: RateIntegral) -> None:
-        """Take the state on over a part of a rest, and see how much its rates scatter."""
+        """Propagate the state over a part of a rest, and update the scatter of its rates."""
         before, (expected, variance) = self._snapshots[-1], self._drift.expected(turn)
         white = self._drift.noise.angle_random_walk ** 2 * turn.duration
         squared = (turn.turned - expected) ** 2 / variance
@@ -789,26 +788,26 @@ class HeadingTracker:
         del self._snapshots[:-_SNAPSHOTS]
 
     def _go_on(self, turn: RateIntegral, end: float) -> None:
-        """Take the state on over a turn that ends at a time, s."""
+        """Propagate the state over an integral that ends at a time, s."""
         turn = turn if self.resting else self._moving(turn)
         if self._keep:
             self.steps.append(Step(self._drift, turn, self.resting, end))
         self._drift = self._drift.rested(turn) if self.resting else self._drift.moved(turn)
 
     def _moving(self, turn: RateIntegral) -> RateIntegral:
-        """Return what rates came to, with the sensitivity at the rates without their bias."""
+        """Return an integral with the sensitivity for the rates without their bias."""
         if self._per_rate is None or self._still is None or turn.unseen:
             return turn
         bias, _ = self._drift.bias(self._still)
         return replace(turn, sensitivity=turn.sensitivity - turn.duration * bias * self._per_rate)
 
     def _at_rest(self, turn: RateIntegral) -> RateIntegral:
-        """Return what the rates of a rest came to, without their noise in the sensitivity."""
+        """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
         return (turn + self._nothing if self._still is None
                 else replace(turn, sensitivity=turn.duration * self._still))
 
     def _take(self) -> None:
-        """Take over the state and the noise of the samples; the heading does not jump."""
+        """Adopt the new state and the noise of the samples; the heading does not jump."""
         if not math.isfinite(float(self._drift.mean.sum()) + float(self._drift.covariance.sum())):
             self._rebuild()
         walk = self._claimed.angle_random_walk * (
@@ -827,7 +826,7 @@ class HeadingTracker:
         self._good = self.heading, float(self._drift.covariance[HEADING, HEADING])
 
     def _rebuild(self) -> None:
-        """Begin anew from the last finite heading, which may be off by a full turn since."""
+        """Initialize the state at the last finite heading, with an uncertainty of a full turn."""
         heading, variance = self._good
         covariance, age = self._calibrated
         self._begin(self._claimed, np.nan_to_num(covariance), heading, variance + math.tau ** 2,
@@ -843,24 +842,24 @@ class HeadingTracker:
         self._move(WINDOW)
         self._known, self._pending = None, 0.0
         self.rebuilt += 1
-        self._mended = ('the state was not finite and was built anew; '
-                        'the heading may be off by a full turn')
+        self._mended = ('the state was not finite and was initialized again; '
+                        'the heading error may be up to a full turn')
         self._take()
 
     def _corrected(self, part: RateIntegral) -> float:
-        """Return what the rates of a part came to, less what rests have taught, rad."""
+        """Return the integral of the rates less their error as estimated at rest, rad."""
         return part.turned - part.duration * self._offset + float(part.sensitivity @ self._values)
 
     # What is known
 
     def finish(self) -> Drift:
-        """Take the state on to the last sample, and return it."""
+        """Propagate the state to the last sample, and return it."""
         self._settle()
         return self._drift
 
     @property
     def bias(self) -> tuple[float, float]:
-        """Return the bias seen at rest beyond the calibration, and its uncertainty, rad/s."""
+        """Return the bias at rest in addition to the calibration, and its deviation, rad/s."""
         return self.bias_by(self.sensitivity)
 
     @property
@@ -884,7 +883,7 @@ class HeadingTracker:
 
     @property
     def slowest_noticed(self) -> float:
-        """Return the slowest turn, rad/s, that is noticed in 95 % of cases; nan if unknown."""
+        """Return the slowest turn, rad/s, that is detected in 95 % of cases; nan if unknown."""
         turns = ([(lag, replace(self._nothing, duration=lag)) for lag in LAGS]
                  if self._seeks else [])
         return min(((self._sigmas[lag] + _POWER) * math.sqrt(self._drift.expected(turn)[1]) / lag

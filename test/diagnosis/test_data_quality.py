@@ -455,9 +455,9 @@ REFUSED = {
                        'the reference has a value in 50 of 6000'),
     'few rows': (Log(output=GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None,
                  '5 rows'),
-    'model in deg/s': (GOOD, OTHER_UNITS, 'of other units'),
+    'model in deg/s': (GOOD, OTHER_UNITS, 'other units'),
     'range in rad/s read as deg/s': (GOOD, GyroModel(rate_range=(-0.01, 0.01)),
-                                     'of other units, or of another gyro'),
+                                     'other units, or belongs to another gyro'),
     'noise in deg': (replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate,
                              reference_rate=None),
                      GyroModel(noise=Noise(1e-4 / DEGREE)), 'times the angle random walk')}

@@ -159,7 +159,7 @@ def test_what_happens_once_is_named_and_only_what_lasts_is_in_the_model(once, ow
     mean = np.mean(once.values[1] * (TIME > 130.0)) if once.effect.name == 'bias_step' else 0.0
     assert value(found.model, 'bias') == pytest.approx(2e-3 + mean, abs=5e-5)
     (finding,) = (each for each in found.findings if each.effect == once.effect.name)
-    assert 'of this log alone' in finding.remedy and not is_inside(finding, found)
+    assert 'in this log alone' in finding.remedy and not is_inside(finding, found)
 
 
 # a model that is right
@@ -264,7 +264,7 @@ def test_a_log_without_motion_says_nothing_of_rates(swing):
     assert found.model.rate_range == (-np.inf, np.inf)
     assert (value(found.model, 'scale_factor_error') == 0.0
             and value(found.model, 'bias') == pytest.approx(1e-3, abs=1e-4))
-    assert any('is in no model' in remark for remark in found.remarks) == (swing > 0.0)
+    assert any('is not added to the model' in remark for remark in found.remarks) == (swing > 0.0)
 
 
 # units, limit and steps
