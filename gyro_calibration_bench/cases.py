@@ -9,7 +9,7 @@
 # under the License.
 
 """
-Cases of the bench: what is hidden in each, beside which noise and reference.
+Cases of the bench: hidden effects, noise and reference of each.
 
 A case has a name, such as ``effects/warm_up/2/mixed/rate/0``; its random numbers depend on the
 name and a seed alone.
@@ -31,13 +31,13 @@ import numpy as np
 #: In the order of the tables.
 PARTS = ('nothing', 'effects', 'pairs', 'triples', 'outside', 'sets', 'separated', 'references')
 MULTIPLES = (1.2, 2.0, 5.0)
-#: The false alarms are counted in each of these; whatever else is hidden has them in turn.
+#: Noises in which false alarms are counted.
 ALARMS = ('white', 'walk', 'flicker')
 NOISES = ('mixed', 'walk', 'flicker', 'white', 'gauss_markov')
 #: References in turn: a rate, a heading, and the heading of an encoder.
 REFERENCES = ('rate', 'heading', 'rate', 'encoder')
 ENCODER_STEP = 2.0 * math.pi / 65536
-#: References that err, and the effects that are hidden beside them in turn.
+#: References with errors, and the effects that are hidden in logs with them in turn.
 IMPERFECT = {
     f'{kind}_{size:g}': Imperfect(kind, size)
     for kind, sizes in (
@@ -62,11 +62,11 @@ BESIDE = (
     'bias_step',
     'acceleration_sensitivity',
 )
-#: What is true of references without being hidden.
+#: Correct findings on references that were not hidden.
 TRUE = {'encoder': ('reference_quantization',), 'course': ('time_offset',)}
-#: Not in pairs: findings against a model only, and a wrong unit, which changes other sizes.
+#: Effects that are not combined: findings against a model, and a wrong unit, which changes sizes.
 ALONE = {*AGAINST_A_MODEL, 'unit_error'}
-#: So much of its multiple each of several effects must keep beside the others.
+#: Least share of the multiple of an effect that is independent of the others.
 LEFT = 0.8
 
 
@@ -96,7 +96,7 @@ class Case:
 
     @property
     def allowed(self) -> tuple[str, ...]:
-        """Return what is true of the reference without being hidden."""
+        """Return the correct findings on the reference that were not hidden."""
         return TRUE.get(self.reference.partition('_')[0], ())
 
     @property

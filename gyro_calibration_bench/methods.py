@@ -8,14 +8,14 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 """
-Methods to compare with: gyro_calibration, greedy selection by BIC, and the lasso.
+Methods of the bench: gyro_calibration, greedy selection by BIC, and the lasso.
 
-A method takes the paths of the logs of a case and the model that is known, or None, and returns
-the causes that it names and whether there is structure that none explains.
+A method takes the paths of the logs of a case and the known model, or None, and returns the causes
+that it names and whether there is unexplained structure.
 
-The two baselines take the formulas of the generator itself, on means over half a second, and take
-the noise for white. They have no columns for faults of samples, figures of the noise, saturation,
-steps, slips, tones, and a wrong unit.
+The two baselines use the formulas of the generator, on means over half a second, and assume white
+noise. They have no columns for faults of samples, noise figures, saturation, quantization, slips,
+tones, and a wrong unit.
 
 """
 
@@ -38,12 +38,12 @@ from scipy.ndimage import uniform_filter1d
 Known = Mapping[str, float]
 Answer = tuple[list[Named], bool]
 
-#: Causes that happen once, which one log suggests and cannot establish.
+#: Single events, which one log cannot establish.
 ONCE = ('bias_step', 'reference_slip')
 
 #: Length of the means, s.
 BLOCK = 0.5
-#: Small sizes at which effects that are not linear are in proportion to them.
+#: Small sizes at which nonlinear effects are proportional to their size.
 SMALL = {'time_offset': 0.02, 'bandwidth': 0.02, 'clock_rate': 1e-4}
 #: Columns with a larger correlation are ambiguous.
 ALIKE = 0.99
@@ -61,7 +61,7 @@ def named(finding: Any) -> Named:
 
 
 def reported(findings: Sequence[Any]) -> list[Any]:
-    """Return the findings that are established, and what happens once if it is suspected."""
+    """Return the established findings, and suspected single events."""
     return [each for each in findings if each.status == 'established'
             or each.effect in ONCE and each.p_value < 0.01]
 
@@ -91,14 +91,14 @@ def gyro_calibration(logs: Sequence[Path], known: Known | None) -> Answer:
 @dataclass(frozen=True)
 class Problem:
     """
-    Least squares, after bias of each log and scale are taken out where no model gives them.
+    A least squares problem, without the biases of the logs and the scale unless a model has them.
 
     Attributes
     ----------
     error : output less reference, shape (n,), rad/s
     columns : shape (n, m)
     owners : for each column the effect and the size that its coefficient 1 has, nan if none
-    nuisances : how many were taken out
+    nuisances : number of values that were taken out
 
     """
 
@@ -109,7 +109,7 @@ class Problem:
 
 
 def recorded(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
-    """Return what a log knows of the conditions, at even times, and the means of the error."""
+    """Return the conditions of a log at even times, means of the error, and which are valid."""
     columns: Any = np.genfromtxt(path, delimiter=',', names=True)
     stamps = columns['time_s']
     interval = float(np.median(np.diff(stamps)))
@@ -162,7 +162,7 @@ def choices(each: Session) -> list[tuple[str, float, Shapes, float]]:
             found.append((name, 1.0 / top, {}, math.nan))
         else:
             size = SMALL.get(name, 1.0)
-            # a wave has two columns, and a shape between those of the grid: no size
+            # a wave has two columns, and shapes are not on the grid: no size is estimated
             found += [(name, size, shapes, math.nan if shapes else size)
                       for shapes in grids.get(name, [{}])]
     return found
@@ -193,7 +193,7 @@ def problem(logs: Sequence[Path], known: Known | None) -> Problem:
     else:
         owners = [('scale_factor_error', 1.0), *[('bias', 1.0)] * len(read), *owners]
         count = 0
-    # a constant, or no temperature that changes, leaves nothing
+    # without columns that are zero or proportional to the nuisances
     seen = np.linalg.norm(table, axis=0) > 1e-6 * lengths
     return Problem(error, table[:, seen], tuple(
         owner for owner, each in zip(owners, seen) if each), count)

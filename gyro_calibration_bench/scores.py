@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""How right answers are, and the table of a set of them."""
+"""Scores of answers, and the table of a set of them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from gyro_calibration_bench.hidden import Cause, OUTSIDE
 from gyro_calibration_bench.hidden.effects import COUNTED, STEPPED
 from scipy.stats import binomtest
 
-#: What no log can part.
+#: Causes that no log can distinguish.
 SAME = {'reference_scale': 'scale_factor_error'}
-#: An answer with more names is no answer.
+#: Largest number of names in a set that counts as right.
 LARGEST_SET = 3
-#: Without a size that an interval could hold: what is counted, steps, and what has no size.
+#: Causes without an interval: counted faults, steps, and causes without a size.
 WITHOUT_SIZE = {*COUNTED, *STEPPED, 'unit_error', 'bias_instability'}
 
 
@@ -51,19 +51,19 @@ class Named:
 @dataclass(frozen=True)
 class Judged:
     """
-    How right an answer is.
+    Scores of an answer.
 
     Attributes
     ----------
     detected : something is reported
     first : the strongest finding has the right name
-    in_set : each hidden cause is a finding of its own, or in its set
-    set_sizes : of the findings that hold a hidden cause
-    extra : names of the findings that hold none
+    in_set : each hidden cause is in the set of a separate finding
+    set_sizes : of the findings that contain a hidden cause
+    extra : names of the findings that contain none
     beyond : variables of structures without a name
     right : each hidden cause is in a set of at most three, and nothing else is reported; a cause
         outside the catalogue is reported as unexplained, and nothing is named
-    held : of each cause that is named with a number, whether its interval of 95 % holds the truth
+    held : for each cause that is named with a number, whether its 95 % interval includes the truth
 
     """
 
@@ -106,12 +106,12 @@ def judged(causes: Sequence[Cause], findings: Sequence[Named], beyond: Sequence[
 
 
 def _names(finding: Named) -> set[str]:
-    """Return the set of a finding; what no log can part is one."""
+    """Return the set of a finding; causes that no log can distinguish are one."""
     return {SAME.get(name, name) for name in (finding.effect, *finding.ambiguous_with)}
 
 
 def _matched(wanted: Sequence[str], sets: Sequence[set[str]]) -> dict[str, int]:
-    """Give each hidden cause a finding of its own that holds it, to as many as can be."""
+    """Assign to as many hidden causes as possible a separate finding that contains the cause."""
     places: list[list[int | None]] = [
         [*(place for place, each in enumerate(sets) if name in each), None] for name in wanted]
     ways = (way for way in itertools.product(*places) if _once(way))
@@ -127,11 +127,11 @@ def _once(way: Sequence[int | None]) -> bool:
 def held(causes: Iterable[Cause], findings: Sequence[Named],
          deviations: float = 1.96) -> dict[str, bool]:
     """
-    Return for each cause named with a number whether its interval holds the truth.
+    Return for each cause named with a number whether its interval includes the truth.
 
-    Where the phase says the sign of a wave, the size has none. What is counted has no interval, a
-    wrong unit no size, and flicker beside a Gauss-Markov process none that an Allan deviation
-    would tell.
+    The size of a wave has no sign if it has a phase. Counted faults have no interval, a wrong unit
+    has no size, and flicker in addition to a Gauss-Markov process has none that an Allan deviation
+    determines.
 
     """
     by_name = {each.effect: each for each in findings}

@@ -23,7 +23,7 @@ from html import escape
 import math
 
 from gyro_calibration.diagnosis.words import clean, number, raised
-from gyro_calibration.logs.log import Array, Mask
+from gyro_calibration.logs.log import Array, Mask, NORMAL_95
 import numpy as np
 
 _EMPTY = {'path', 'line', 'circle', 'rect', 'meta', 'br'}
@@ -62,13 +62,11 @@ def _escaped(text: str) -> str:
     return escape('\n'.join(clean(line) for line in text.split('\n')))
 
 
-#: Of the drawing and of the plot in it: small, so that letters stay readable on a phone.
+#: Size of the drawing and of the plot in it: small, so that letters are readable on a phone.
 _WIDTH, _HEIGHT = 360.0, 236.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 344.0, 24.0, 196.0
-#: That fit side by side below an axis.
+#: Number of letters that fit side by side below an axis.
 _LETTERS = 30
-#: Of a normal distribution, for bands of 95 %.
-_BAND = 1.96
 
 
 @dataclass(frozen=True)
@@ -79,8 +77,8 @@ class Line:
     Attributes
     ----------
     name : for legend and table
-    style : measured, simulated, before or after; the page has a colour and a stroke for each
-    values : shape (n,), nan where there is none
+    style : measured, simulated, before or after; the page defines colour and stroke for each
+    values : shape (n,), nan where missing
     deviation : of the values, drawn as a band or as bars of 95 %; None where it is not known
     dots : draw dots instead of a line
 
@@ -96,16 +94,16 @@ class Line:
 @dataclass(frozen=True)
 class Chart:
     """
-    What a chart shows, in units of people.
+    A chart, in displayed units.
 
     Attributes
     ----------
     name : of the chart, unique on the page, for links inside it
-    title, description : for people, also for those who do not see it
-    across, across_unit, at : what goes to the right, shape (n,)
-    up, up_unit, lines : what goes up
+    title, description : for people, also for screen readers
+    across, across_unit, at : label, unit and values of the horizontal axis, shape (n,)
+    up, up_unit, lines : label, unit and lines of the vertical axis
     logarithmic : both axes
-    names : of what goes to the right, where that is numbered from 1 on
+    names : of the horizontal values, if they are numbered from 1 on
 
     """
 
@@ -195,11 +193,11 @@ def _shown(chart: Chart, line: Line) -> Mask:
 
 
 def _axes(chart: Chart, shown: Sequence[Mask]) -> tuple[_Axis, _Axis]:
-    """Return the axes; zero is always seen, but not where there is none."""
+    """Return the axes; linear ones include zero vertically."""
     at, ends = [], [] if chart.logarithmic else [np.zeros(1)]
     for line, known in zip(chart.lines, shown):
         deviation = (0.0 if line.deviation is None or chart.logarithmic
-                     else _BAND * np.nan_to_num(line.deviation))
+                     else NORMAL_95 * np.nan_to_num(line.deviation))
         at.append(chart.at[known])
         ends += [(line.values - deviation)[known], (line.values + deviation)[known]]
     across = np.array([0.5, len(chart.names) + 0.5]) if chart.names else np.concatenate(at)
@@ -250,7 +248,7 @@ def _line(line: Line, at: Array, places: Array, up: _Axis, shown: Mask) -> Marku
     x, y = at[shown], places[shown]
     parts = []
     if line.deviation is not None:
-        half = _BAND * np.nan_to_num(line.deviation)
+        half = NORMAL_95 * np.nan_to_num(line.deviation)
         above, below = (up.place(line.values + side)[shown] for side in (half, -half))
         corners = [*zip(x, above), *zip(x[::-1], below[::-1])]
         parts.append(element('path', d=''.join(
@@ -286,7 +284,7 @@ def _table(chart: Chart) -> Markup:
             return '–'
         return number(float(line.values[row])) + (
             '' if line.deviation is None
-            else f' ± {number(_BAND * float(line.deviation[row]), 2)}')
+            else f' ± {number(NORMAL_95 * float(line.deviation[row]), 2)}')
 
     heads = [(chart.across, chart.across_unit), *((each.name, chart.up_unit)
                                                   for each in chart.lines)]

@@ -53,7 +53,7 @@ from gyro_calibration.diagnosis.samples import (
     RepeatedSamples,
     SIDE,
 )
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_95
 from gyro_calibration.logs.quality import Codes, codes_of, robust_deviation, white_noise
 from gyro_calibration.logs.stamps import number_stamps, Stamps
 from gyro_calibration.model.gyro_model import GyroModel
@@ -125,7 +125,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
         if name is not None:
             factor = 1.0 / FACTORS[name]
             units = [_sized(
-                'unit_error', ratio, 1.96 * deviation,
+                'unit_error', ratio, NORMAL_95 * deviation,
                 float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
                 f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
                 f'{name} is {FACTORS[name]:.5g}',
@@ -283,7 +283,7 @@ def _of_codes(codes: Codes, seen: Compared, limit: Limit | None, at_limit: Mask,
     if (codes.step >= STEP * seen.white and codes.step
             and not _knows(model, 'quantization', codes.step)):
         chance = float(np.exp(-min(codes.counts.sum() * codes.aligned ** 2, 700.0)))
-        yield _sized('quantization', codes.step, 1.96 * codes.deviation, chance,
+        yield _sized('quantization', codes.step, NORMAL_95 * codes.deviation, chance,
                      f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s '
                      f'apart, where its white noise is {seen.white / DEGREE:.3g} deg/s')
     if limit is not None and not _knows(model, 'saturation', limit.size):

@@ -9,12 +9,11 @@
 # under the License.
 
 """
-What dwells say given a model: bias and scale factor fitted anew, and the causes they support.
+Fit of dwells given a model: bias and scale factor are refitted, and causes are added.
 
-Effects of a model that are not fitted anew are subtracted from the output first, so that what is
-left is that of a gyro without them. A polynomial of the output stays as it is: fitted together
-with effects of the rate it would explain the dwells by itself, for the output less the rate is
-what is to be explained.
+Effects of a model that are not refitted are subtracted from the output first. A polynomial of the
+output is not refitted: together with effects of the rate it would explain the dwells by itself,
+because output less rate is the error to be explained.
 
 """
 
@@ -69,13 +68,13 @@ from scipy.stats import f as fisher
 
 #: Fitted in any case.
 NUISANCES = (BIAS, SCALE_FACTOR_ERROR)
-#: What dwells without time can show of a model.
+#: Channels of effects that dwells without time can show.
 _SEEN = {'rate', 'output', 'temperature'}
-#: Parts of the false-alarm rate: of causes other than bias and scale factor, and of a bias and a
-#: scale factor that differ from the model's.
+#: Shares of the false-alarm rate: for causes other than bias and scale factor, and for a bias and
+#: a scale factor that differ from the model's.
 _CAUSES, _OF_NUISANCES = 0.65, 0.1
-#: Temperatures from which a curve may count without a slope, degC, but for the mean and
-#: the first.
+#: Trial reference temperatures of a parabola without a slope, degC, in addition to the mean and
+#: the first temperature.
 _USUAL = (25.0, 20.0)
 
 
@@ -86,12 +85,11 @@ class Named:
 
     Attributes
     ----------
-    fit : of these and of bias and scale factor, to dwells less what stays of the model
-    change : the same as changes of the model, each in addition to all of it; their evidence, but
-        for bias and scale factor
-    causes : those that are named, of the effects of the fit
-    model : that is put to the test
-    rate : of false alarms that the whole diagnosis may have
+    fit : of causes, bias and scale factor to dwells less the effects of the model that are kept
+    change : the same as changes in addition to the whole model, by which causes are tested
+    causes : the named effects of the fit
+    model : that is tested
+    rate : false-alarm rate of the diagnosis
 
     """
 
@@ -106,7 +104,7 @@ class Named:
         return _or_confounder(effect, self.change)
 
     def chance_of(self, effect: Effect) -> float:
-        """Return how likely dwells without a cause show as much of any of those tried."""
+        """Return the p-value of a cause, corrected for the number of causes tried."""
         if effect in NUISANCES:
             return min(1.0, _chance_of_change(self.fit, self.model, effect) * len(NUISANCES))
         return min(1.0, _chance(self.change, self.model, self.changed(effect))
@@ -116,7 +114,7 @@ class Named:
 # a model against dwells
 
 def surroundings(model: GyroModel, dwells: Dwells) -> Channels:
-    """Return what a model looks at, at its reference temperature where the table holds none."""
+    """Return the channels of a model, at its reference temperature if the table has none."""
     channels = channels_of(dwells)
     return channels if dwells.temperature is not None else replace(
         channels, temperature=np.full(len(dwells), model.reference_temperature))
@@ -142,7 +140,7 @@ def without_effects(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect]
 
 
 def technology(model: GyroModel) -> str | None:
-    """Return what the instrument is, if the model says so and physics has an answer."""
+    """Return the technology of the instrument, if the model states a known one."""
     stated = model.gyro.get('technology')
     return stated if stated in TECHNOLOGIES else None
 
@@ -158,7 +156,7 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
     ----------
     dwells : of a rate table
     model : that is put to the test, if one was given
-    rate : of false alarms that the whole diagnosis may have
+    rate : false-alarm rate of the diagnosis
     without : the names of causes that are withdrawn
 
     """
@@ -181,20 +179,20 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
 
 
 def level_of(rate: float, nuisance: bool = False) -> float:
-    """Return the chance at which one cause is named."""
+    """Return the level at which one cause is named."""
     return (_OF_NUISANCES * rate / len(NUISANCES) if nuisance
             else _CAUSES * rate / (len(STEADY) - len(NUISANCES)))
 
 
 def _without(change: Calibration, names: frozenset[str]) -> Calibration:
-    """Fit anew without the withdrawn causes, and without what was there for their sake."""
+    """Refit without some causes."""
     kept = [each for each in change.effects if each.name not in names]
     return (change if len(kept) == len(change.effects)
             else fit_effects(change.dwells, kept, change.scatter))
 
 
 def _refitted(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibration:
-    """Fit the values that changed as a whole: the model's own and the change of them are one."""
+    """Refit the changed effects as a whole, the values of the model and their changes."""
     own = {term.effect.name for term in model.terms}
     effects = tuple(
         other if (other := _confounder(each)) is not None and other.name in own - {each.name}
@@ -209,14 +207,14 @@ def _confounder(effect: Effect) -> Effect | None:
 
 
 def change_of(fit: Calibration, model: GyroModel, effect: Effect) -> float:
-    """Return the change of bias or scale factor from the model, which has 0 where it has none."""
+    """Return the change of bias or scale factor error from the model, which may have none."""
     found, own = ([term.values[-1] for term in each.terms if term.effect is effect]
                   for each in (fit, model))
     return float(sum(found) - sum(own))
 
 
 def _chance_of_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
-    """Return how likely dwells show as much change of bias or scale factor without any."""
+    """Return the p-value of a change of bias or scale factor."""
     column = columns_of(_used(fit), [term for term in fit.terms if term.effect is effect])[:, 0]
     return _chance(fit, model, effect, column * change_of(fit, model, effect))
 
@@ -224,13 +222,13 @@ def _chance_of_change(fit: Calibration, model: GyroModel, effect: Effect) -> flo
 def _chance(fit: Calibration, model: GyroModel, effect: Effect,
             added: Array | None = None) -> float:
     """
-    Return how likely dwells and errors of the model's values show as much of an absent effect.
+    Return the p-value of an effect, by the errors of dwells and of the model's values.
 
     Parameters
     ----------
     fit : of dwells given the model
-    model : whose own covariance counts too, where it has one
-    added : the effect in each dwell that is fitted, rad/s; None for all that the effect adds
+    model : whose covariance is included, if it has one
+    added : the effect in each fitted dwell, rad/s; None for the whole effect
 
     """
     if not fit.freedom:
@@ -258,7 +256,7 @@ def _used(fit: Calibration) -> Dwells:
 
 
 def uncertainty_of(fit: Calibration, model: GyroModel) -> Array:
-    """Return what 1-sigma deviations of model values add to each dwell, rad/s, shape (n, m)."""
+    """Return the errors of dwells by 1-sigma errors of model values, rad/s, shape (n, m)."""
     known = [term for term in seen(model) if term.fitted]
     if model.covariance is None or not known:
         return np.zeros((len(_used(fit)), 1))
@@ -272,14 +270,14 @@ def uncertainty_of(fit: Calibration, model: GyroModel) -> Array:
 
 
 def _or_confounder(effect: Effect, fit: Calibration) -> Effect:
-    """Return the effect, or its confounder where that stands for it in a fit."""
+    """Return the effect, or its confounder if that replaces it in a fit."""
     confounder = _confounder(effect)
     return effect if effect in fit.effects or confounder is None else confounder
 
 
 def _counted_well(fit: Calibration, model: GyroModel | None,
                   level: float) -> tuple[Calibration, tuple[Effect, ...]]:
-    """Return a fit whose temperature counts from where no slope is needed, and needless slopes."""
+    """Return a fit with a reference temperature that needs no slope, and the unneeded effects."""
     if fit.dwells.temperature is None:
         return fit, ()
     first = _USUAL if model is None else (model.reference_temperature, *_USUAL)
@@ -294,7 +292,7 @@ def _counted_well(fit: Calibration, model: GyroModel | None,
 
 
 def counted_from(fit: Calibration, temperature: float) -> Calibration:
-    """Return the same fit with effects of temperature that count from another temperature."""
+    """Return the same fit with another reference temperature of its effects."""
     terms = [replace(term, values=(temperature, *term.values[1:])) if term.effect.shapes
              and term.effect.shapes[0].name == 'reference_temperature' else term
              for term in fit.terms]
@@ -338,7 +336,7 @@ def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> Gyro
     terms = (*(new.get(term.effect.name, term) for term in stays),
              *(term for name, term in new.items() if name not in own))
     temperatures = [] if dwells.temperature is None else [dwells.temperature]
-    # A self-calibration behind the model was of its old bias and scale factor.
+    # A self-calibration belongs to the old bias and scale factor of the model.
     return replace(model, terms=terms, covariance=_covariance(model, fit, terms),
                    rate_range=wider(model.rate_range, [dwells.output], True),
                    temperature_range=wider(model.temperature_range, temperatures, True),
@@ -360,49 +358,49 @@ def _covariance(model: GyroModel, fit: Calibration, terms: Sequence[Term]) -> Ar
 
 
 def _places(terms: Sequence[Term], first: int) -> dict[str, list[int]]:
-    """Return where the fitted values of each term stand in a covariance."""
+    """Return the indices of the fitted values of each term in a covariance."""
     ends = np.cumsum([first, *(len(term.fitted) for term in terms)]).tolist()
     return {term.effect.name: list(range(begin, end))
             for term, begin, end in zip(terms, ends, ends[1:])}
 
 
 def tried(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
-    """Fit other effects to the dwells of a fit, or return None where they cannot be separated."""
+    """Fit other effects to the dwells of a fit; None if they cannot be separated."""
     try:
         return fit_effects(fit.dwells, effects, fit.scatter)
     except DataRefused:
         return None
 
 
-#: So many columns a curve has at most.
+#: Largest number of columns of a curve.
 _MOST_COLUMNS = 9
-#: Fewer dwells than this for each column do not tell a curve from chance.
+#: Least number of dwells for each column.
 _DWELLS_A_COLUMN = 4
-#: What of a curve the model explains already to this part of its length is not tried again.
+#: Least part of the columns of a curve that is independent of the model.
 _NEW = 1e-3
 RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = (
     'rate', 'temperature', 'rate_times_temperature', 'order_of_dwells', 'sweep')
 SINGLE_RATES = 'single_rates'
-#: A rate that is repeated in so many sweeps may show an error of its own.
+#: Least number of sweeps that repeat a rate for a column of that rate.
 _REPEATED = 4
 
 
 def what_is_left(fit: Calibration, level: float,
                  by_model: Array) -> tuple[tuple[Unexplained, ...], Mapping[str, float]]:
     """
-    Look for structure in what a fit leaves.
+    Search for structure in the residual of a fit.
 
     Parameters
     ----------
     fit : of dwells
-    level : the chance to find any where there is none
-    by_model : what deviations of the model's values add to each dwell, rad/s, shape (n, m): no
+    level : false-alarm rate
+    by_model : errors of dwells by errors of the model's values, rad/s, shape (n, m), which are not
         structure
 
     Returns
     -------
-    structure without a name, the clearest first, and by what each lowers the sum of the whitened
-    squared residuals
+    structure without a name, the most significant first, and the reduction of the sum of the
+    whitened squared residuals by each
 
     """
     used = take(fit.dwells, fit.scatter.kept)
@@ -424,7 +422,7 @@ def what_is_left(fit: Calibration, level: float,
 
 def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
             by_model: Array) -> tuple[Unexplained, float]:
-    """Return what a curve explains given what is known, its chance, and the misfit it saves."""
+    """Return share, p-value and reduction of the misfit of a curve given the known columns."""
     used = take(fit.dwells, fit.scatter.kept)
     whitener = Whitener(used, fit.scatter)
     white = whitener.whiten(known)
@@ -460,7 +458,7 @@ def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Ar
 def _probes(dwells: Dwells) -> Mapping[str, Array]:
     """Return the columns of each curve, shape (n, m)."""
     sweeps = len(np.unique(parts_of(dwells)))
-    # What differs between sweeps alone has no more evidence than there are sweeps.
+    # A variable that differs between sweeps alone has as many independent values as sweeps.
     slow = min(_MOST_COLUMNS, sweeps // 3)
     probes = {RATE: _spline(dwells.rate, min(_MOST_COLUMNS, len(dwells) // _DWELLS_A_COLUMN)),
               SINGLE_RATES: _by_rate(dwells),
@@ -510,14 +508,14 @@ def _by_sweep(dwells: Dwells) -> Array:
     return (parts[:, None] == np.arange(parts.max() + 1)) * (_scaled(dwells.rate) ** 2)[:, None]
 
 
-#: Of bias and scale factor, what dwells in one pose on one table never rule out.
+#: Confounders of bias and scale factor that dwells in one pose on one table never rule out.
 _ALWAYS = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
-#: Further dwells are aimed at this, for two fits vary by one standard deviation.
+#: Sigmas by which proposed dwells are to separate two fits, one more than required.
 _AIM = DISTINGUISHED + 1.0
 
 
 def alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
-    """Return what dwells cannot rule out in place of an effect, and what would distinguish it."""
+    """Return the alternatives of an effect, and the experiment that would distinguish them."""
     if effect in _ALWAYS:
         return [_ALWAYS[effect]], CAUSES[effect.name].separate_by
     steady = [(sigmas, other) for other in _others(fit, effect)
@@ -533,7 +531,7 @@ def alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
 def _others(fit: Calibration, effect: Effect) -> Iterator[Calibration]:
     """Give fits with another steady effect in place of one."""
     if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects:
-        return  # the curve would be without its slope
+        return  # the quadratic effect needs its slope
     for other in STEADY.values():
         swapped = (None if other in fit.effects
                    else tried(fit, swapped_effects(fit.effects, effect, other)))
@@ -542,7 +540,7 @@ def _others(fit: Calibration, effect: Effect) -> Iterator[Calibration]:
 
 
 def _beyond(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]]]:
-    """Give causes that are no effects of rate or temperature, with columns tried one by one."""
+    """Give causes other than effects of rate or temperature, with columns tried one by one."""
     rate, order = fit.dwells.rate, np.arange(len(fit.dwells)) / len(fit.dwells)
     if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
         yield 'rate_ramp', [order]
@@ -574,7 +572,7 @@ def _sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
     return math.sqrt(max(min(misfits) - fit.misfit, 0.0))
 
 
-# what would distinguish them
+# experiments
 
 def _sweeps(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
     """Give sweeps that may be added, the easiest first: in words, rates, and temperature."""
@@ -595,12 +593,12 @@ def _sweeps(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
 
 
 def _experiment(fit: Calibration, other: Calibration) -> str:
-    """Return the easiest sweep that would part two fits, or the best one, in words."""
+    """Return the easiest sweep that would separate two fits, or the best one, in words."""
     tried_sweeps = []
     for words, rates, temperature in _sweeps(fit):
         tried_sweeps.append((separation(fit, other, rates, temperature), words))
         if tried_sweeps[-1][0] >= _AIM:
             break
     sigmas, words = max(tried_sweeps)
-    return (f'add {words}: that parts them by {sigmas:.1f} standard deviations'
+    return (f'add {words}: that separates them by {sigmas:.1f} sigma'
             + ('' if sigmas >= _AIM else ', and repeat it'))

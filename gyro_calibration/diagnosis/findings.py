@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import math
 from typing import Any
 
-from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.log import Array, NORMAL_95
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 
@@ -46,8 +46,8 @@ class Estimate:
 
     @property
     def deviation(self) -> float:
-        """Return the standard deviation: the half-width of the interval over 1.96."""
-        return (self.interval[1] - self.interval[0]) / (2.0 * 1.96)
+        """Return the standard deviation: the half-width of the interval over `NORMAL_95`."""
+        return (self.interval[1] - self.interval[0]) / (2.0 * NORMAL_95)
 
     @property
     def holds_zero(self) -> bool:

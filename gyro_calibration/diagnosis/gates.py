@@ -37,7 +37,7 @@ from gyro_calibration.diagnosis.expected_output import (
     unit_of_scale,
 )
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_95, refuse_wrapped
 from gyro_calibration.logs.quality import codes_of, white_noise
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
@@ -386,7 +386,7 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
     assert log.time is not None
     factor, deviation = 1.0 / (found.factor * own), found.deviation / found.factor ** 2 / abs(own)
     seen = f'the output is {factor:.4g} times the reference'
-    size = factor, (factor - 1.96 * deviation, factor + 1.96 * deviation)
+    size = factor, (factor - NORMAL_95 * deviation, factor + NORMAL_95 * deviation)
     if not is_far(factor):
         yield Gate('sense', True, f'{seen}: the same sense')
         yield Gate('unit', True, f'{seen}: the same unit')

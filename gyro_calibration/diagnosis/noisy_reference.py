@@ -11,12 +11,12 @@
 """
 The diagnosis of a log whose reference has errors of its own, such as a course over ground.
 
-The score of a candidate is summed over stretches. Its variance is what the noise predicts or what
-the stretches scatter by, whichever is larger, and its distribution Student's, with the effective
-number of stretches less one as the degrees of freedom. The chance of the best of all candidates is
-that of one times their number; those that happen once are counted apart. A cause is established
-if, besides, it is chosen again without each fold, and predicts the stretches of the folds better
-than no cause does; else it is suspected.
+The score of a candidate is summed over stretches. Its variance is that by the noise or that by the
+scatter of the stretches, whichever is larger, and its distribution is Student's, with the
+effective number of stretches less one as the degrees of freedom. The p-value of the best candidate
+is that of a single one times their number; single events are counted separately. A cause is
+established if it is also selected without each fold, and predicts the stretches of the folds
+better than no cause; otherwise it is suspected.
 
 """
 
@@ -66,7 +66,7 @@ from gyro_calibration.diagnosis.spans import (
 )
 from gyro_calibration.diagnosis.steps import CHECKS, OnPart, OnProgress, Steps
 from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_95
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
@@ -75,23 +75,21 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-#: Parts of a log that are held out in turn: at least, at most, and the least length of one, s.
+#: Least and largest number of parts of a log that are held out in turn, and least length, s.
 _FEWEST_PARTS, _MOST_PARTS, _PART = 2, 6, 80.0
-#: Kinds whose values come with the samples of the gyro, by one clock.
+#: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
-#: Steps, % of the time as measured on 25 min of an encoder at 100 Hz.
+#: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
 _SHARES = {CHECKS: 4, 'data quality': 3, 'bias and scale factor error': 26,
            'search for causes': 45, 'cross-validation': 4, 'findings': 18}
-#: Standard deviations from which on a value is found in 95 % of logs, and from which on a lag is
-#: ruled out.
+#: Standard deviations of a value that is found in 95 % of logs, and of a lag that is ruled out.
 SEEN, _RULED_OUT = 4.8, 3.0
-#: A gyro is no more sluggish than this, s.
+#: Longest lag of a gyro, s.
 _OF_A_LAG = 0.1
 #: Bins of a curve.
 _BINS = 20
-#: Shares of the false-alarm rate: of the causes that are searched for, of a delay, and given a
-#: model of bias and of scale factor error. A delay between two clocks is no surprise: it has a
-#: level of its own.
+#: Shares of the false-alarm rate: for the search for causes, for a delay, and, with a model, for
+#: bias and scale factor error. A delay between two clocks is usual and has a separate level.
 _OF_SEARCH, _OF_VALUE = 0.6, {'bias': 0.05, 'scale_factor_error': 0.05, 'time_offset': 0.1}
 _SPOKEN = {'rate_command': 'a reference rate with noise', 'course': 'a course over ground',
            'encoder': 'an encoder', 'odometry': 'odometry', 'motion_capture': 'motion capture',
@@ -101,33 +99,33 @@ _METHOD = ('The heading by {} was compared with the integral of the output over 
            'cause is established if its evidence holds beyond the scatter between stretches, and '
            'if choice and fit on some stretches predict the others; else it is suspected. Only '
            'established causes are in the model. Intervals are of 95 %.')
-#: What is no candidate, because it is looked for in any log.
+#: Causes that are not candidates, because they are tested in each log.
 _ALWAYS_SEEN = {*PLAIN, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_error',
                 'quantization', 'saturation'}
-#: Most causes that are added, and parts of a log for cross-fitting.
+#: Largest number of causes that are added, and of parts of a log for cross-fitting.
 MOST, FOLDS = 4, 5
-#: Effects along the rate that are larger than this part of it are not established: no gyro has
-#: them (two deviations of the prior of a scale factor error), but where a motion makes columns
-#: alike, several that nearly cancel each other fit what none of them is.
+#: Largest effect along the rate that is established, as a share of the rate: two standard
+#: deviations of the prior of a scale factor error. Larger ones result from several similar columns
+#: that nearly cancel each other.
 _LARGEST = 2.0 * HEADING.prior[0]
-#: What errors of an encoder that repeat at its places may pass for.
+#: Variables whose causes are similar to errors of an encoder that repeat with its position.
 _OF_MOTION = frozenset({'rate', 'rate_change', 'heading'})
-#: Causes explain a log as well as the best of them up to this likelihood ratio.
+#: Largest likelihood ratio between the best cause and an equivalent one.
 _LIKELY = 25.0
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
                                 rate: float, on_progress: OnProgress) -> Diagnosis:
     """
-    Say what a simulation gets wrong, by a reference that errs more than the gyro.
+    Diagnose a log with a reference whose errors are larger than those of the gyro.
 
     Parameters
     ----------
     log : with output, time and a reference
     reference : its kind
-    model : of the simulation; an ideal gyro where it is None
+    model : of the simulation; None is an ideal gyro
     rate : of false alarms
-    on_progress : is given the share of the work that is done, and what begins
+    on_progress : is called with the share of the work done and the name of the step that begins
 
     """
     steps = Steps(on_progress, _SHARES)
@@ -149,7 +147,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     gain = _gain(plain, extended)
     inside = extended
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
-        # what predicts no better is in no model; a course shows no more than that
+        # causes that do not improve the prediction are not added to the model
         inside = plain
         if not plain.spans.fine:
             found = [replace(each, established=False) for each in found]
@@ -189,7 +187,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
 
 def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
                reference: Reference) -> Iterator[Finding]:
-    """Give delay, and given a model bias and scale factor error, where they are established."""
+    """Give delay, and with a model bias and scale factor error, if they are established."""
     lag = next((each for each in done.causes if each.cause == 'bandwidth'), None)
     own_clock = reference.kind not in _SAME_CLOCK
     for place, name in enumerate(PLAIN):
@@ -197,7 +195,7 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
             continue
         value, deviation = float(done.values[place]), math.sqrt(done.covariance[place, place])
         if name == 'bias' and model is not None:
-            # the mean of a log wanders about the bias of a model
+            # the mean bias of a log differs from that of the model by bias wander
             duration = float(done.spans.time[-1] - done.spans.time[0])
             deviation = math.sqrt(deviation ** 2 + max(
                 2.0 / math.pi * each.bias_instability ** 2
@@ -216,7 +214,7 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
         if chance >= share * rate or effective < FEWEST_STRETCHES:
             continue
         half = min(float(student.ppf(0.975, freedom)) * deviation,
-                   1.96 * done.spans.treatment.prior[place])
+                   NORMAL_95 * done.spans.treatment.prior[place])
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         if name == 'time_offset':
             of_reference = not 0.0 < value < _OF_A_LAG
@@ -265,10 +263,10 @@ def _finding(each: Confirmed, extended: SpanFit) -> Finding:
             parameters[parameter.name] = Estimate.about(value, 0.0, parameter.unit)
     shown = finding(
         name, parameters, each.p_value, [other for other in each.probability if other != name],
-        minimum_detectable=(SEEN * float(half[0]) / 1.96
+        minimum_detectable=(SEEN * float(half[0]) / NORMAL_95
                             if len(values) == 1 and name != 'bandwidth' else None),
-        evidence=f'it adds {each.predicted:.1f} to the log-likelihood of stretches that took no '
-        f'part in choice and fit, and is chosen in {100.0 * each.chosen:.0f} % of them',
+        evidence=f'it adds {each.predicted:.1f} to the log-likelihood of held-out stretches, and '
+        f'is selected in {100.0 * each.chosen:.0f} % of the folds',
         probability=each.probability,
         where=(each.column.shapes[0], float(done.spans.time[-1])) if each.column.once else None)
     return shown if each.established else as_suspected(shown)
@@ -283,10 +281,10 @@ def _lag(square: float, half: float) -> Estimate:
 
 def _extended(model: GyroModel | None, inside: SpanFit, log: Log,
               late: Finding | None) -> GyroModel:
-    """Return the extended model of a fit, with a delay that is of the gyro."""
+    """Return the extended model of a fit, with a delay of the gyro."""
     after = _model(model or GyroModel(), inside, log)
     if model is not None and model.prior is not None:
-        # what is known of this unit now takes the place of what is usual of its type
+        # the values of this unit replace those of its type
         after = replace(after, tolerance=Tolerance(), origin=origins_before(model))
     if late is None:
         return after
@@ -323,7 +321,7 @@ def _model(given: GyroModel, done: SpanFit, log: Log) -> GyroModel:
 
 
 def _noise(done: SpanFit) -> Noise:
-    """Return the noise of the gyro; a wander that the log does not show is none."""
+    """Return the noise of the gyro; bias wander that the log does not show is 0."""
     # at the edge of the grid nothing bounds it from below
     return Noise(done.size('angle_random_walk'), **{
         part.name: done.size(part.name)
@@ -331,10 +329,10 @@ def _noise(done: SpanFit) -> Noise:
         for part in shared_noise(done.spans)})
 
 
-# what is won
+# gain
 
 def _contributions(done: SpanFit) -> dict[str, Array]:
-    """Return what each cause adds to the change of heading over spans, and what is left, rad."""
+    """Return contributions of causes to the change of heading over spans, and residual, rad."""
     values = done.values.copy()
     values[2] -= done.spans.delay
     columns = all_columns(done.spans, done.causes) * values
@@ -352,7 +350,7 @@ def _gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     parts = int(np.clip(duration / _PART, _FEWEST_PARTS, _MOST_PARTS))
     number = np.minimum(((time[1:] - time[0]) * parts / duration).astype(int), parts - 1)
     window = min(WINDOW, WITHIN * duration / parts)
-    # under the noise of the plain fit, and given the bias that wanders
+    # under the noise of the plain fit, given the prior of the wandering bias
     noisy = whitened(plain, ())
     prior = len(noisy.observed) - len(spans.observed)
     models = {'given': (spans.plain()[:, 2:], noisy.plain[:, 2:]),
@@ -363,7 +361,7 @@ def _gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     counts: list[tuple[int, int]] = []
     for part in range(parts):
         held = np.flatnonzero(number == part)
-        # the log goes on on both sides: what is whitened across the border is left out
+        # whitened observations across the borders of the part are left out
         kept = np.setdiff1d(np.arange(len(spans.observed)), [*held, *(held + 1), *(held - 1)])
         if len(held) < 4 or len(kept) < 8:
             return None
@@ -383,7 +381,7 @@ def _gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
 # for people
 
 def _cannot_show(plain: SpanFit) -> dict[str, str]:
-    """Say of each cause that was not searched for why such a reference cannot show it."""
+    """Return the reason for each cause that was not searched for."""
     seen = {each.cause for each in candidates(plain)} | _ALWAYS_SEEN
     missing = {channel for channel in ('temperature', 'specific_force', 'supply')
                if getattr(plain.spans.log, channel) is None}
@@ -401,7 +399,7 @@ def _cannot_show(plain: SpanFit) -> dict[str, str]:
 
 def _remarks(reference: Reference, done: SpanFit, of_fleet: bool) -> Iterator[str]:
     if of_fleet:
-        yield ('The model, which is of a fleet, is the prior of bias and scale factor error.')
+        yield ('The model of the fleet is used as the prior of bias and scale factor error.')
     errors = (f'{done.size("reference") / DEGREE:.2g} deg from point to point, and '
               f'{1000.0 * done.size("motion"):.2g} ms times the rate'
               if done.spans.treatment.of_heading
@@ -409,13 +407,13 @@ def _remarks(reference: Reference, done: SpanFit, of_fleet: bool) -> Iterator[st
     yield (f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); if '
            f'it is another kind, state it with --reference-kind. Its errors: {errors}.')
     if done.scale_held:
-        yield ('The scale factor error rests on fewer than three stretches that turn, and is left '
-               f'at 0 +- {100.0 * done.spans.treatment.prior[0]:g} %: turn more often, both '
-               'ways.')
+        yield ('Fewer than three stretches with rotation determine the scale factor error, and it '
+               f'is kept at 0 +- {100.0 * done.spans.treatment.prior[0]:g} %: turn more often, '
+               'in both directions.')
 
 
 def _pictures(done: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
-    """Return what is left along the rate, and the rate as it is measured and simulated."""
+    """Return the residual along the rate, and the measured and simulated rate over time."""
     steps, time = np.diff(done.spans.time), done.spans.time
     assert done.spans.log.output is not None
     measured = done.spans.integrals(done.spans.log.output)[:len(steps)] / steps
@@ -439,11 +437,11 @@ class Confirmed:
     Attributes
     ----------
     column : the cause
-    p_value : chance that the best of all candidates shows as much in noise, cluster-robust
-    predicted : what it adds to the log-likelihood of stretches that took no part in choice and fit
-    chosen : part of the folds in which the choice was the same
+    p_value : of the best of all candidates in noise, cluster-robust
+    predicted : gain in log-likelihood on held-out stretches
+    chosen : share of the folds in which the same cause was selected
     established : whether it is confirmed
-    probability : of it and of those that may be in its place, by name
+    probability : of the cause and of its alternatives, by name
 
     """
 
@@ -511,10 +509,10 @@ def _columns(done: SpanFit) -> Iterator[Column]:
 
 
 def search(done: SpanFit, level: float, on_part: OnPart) -> tuple[SpanFit, list[Confirmed]]:
-    """Add one cause after the other, each confirmed, and fit again with those established."""
+    """Add one cause after the other, each cross-fitted, and fit again with those established."""
     found: list[Confirmed] = []
     offered = list(candidates(done))
-    # given one column of each cause, so that the noise does not swallow what a cause leaves
+    # noise given one column of each cause, so that it does not absorb their contributions
     columns = {each.cause: each for each in offered if not each.once}
     rich = fit_spans(done.spans, list(columns.values()))
     while len(found) < MOST:
@@ -539,7 +537,7 @@ def search(done: SpanFit, level: float, on_part: OnPart) -> tuple[SpanFit, list[
 
 
 def _contradiction(done: SpanFit, cause: Column) -> float:
-    """Return how much too large for the rate an effect is; infinite where its interval holds 0."""
+    """Return the ratio of an effect to the largest plausible one; inf if it may be 0."""
     places = done.places(cause)
     values = done.values[places]
     if len(values) == 1 and abs(values[0]) < done.half(places.start):
@@ -553,8 +551,8 @@ def _contradiction(done: SpanFit, cause: Column) -> float:
 
 def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequence[Column],
           level: float) -> Confirmed | None:
-    """Return the best of the causes that are open, given those found; None where it is chance."""
-    # what a scale factor error that is left at 0 would explain is no evidence of a cause
+    """Return the best of the remaining causes, given those found; None if insignificant."""
+    # what a scale factor error that is kept at 0 would explain is no evidence of a cause
     data = whitened(replace(done, prior=np.array(done.spans.treatment.prior)), given, rich,
                     most=True)
     widths = [done.spans.columns(each) for each in open_ones]
@@ -562,7 +560,7 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequ
     edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])
     places = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:])]
     chances = _evidences(data, columns, places, open_ones, np.ones(len(data.observed), dtype=bool))
-    # what happens once is never established, and does not cost the others a part of the level
+    # single events are never established, and are not counted in the number of the others
     lasting = sum(not each.once for each in open_ones)
     tried = [chance * (len(open_ones) if each.once else lasting)
              for each, (chance, _, _) in zip(open_ones, chances)]
@@ -577,13 +575,13 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequ
     gain = chances[strongest][1]
     alike = {name: other for name, other in best_of.items()
              if chances[other][1] > gain - math.log(_LIKELY) or other == strongest}
-    # of those that explain the log as well, the simplest: with the fewest values and fitted shapes
+    # the simplest of the equivalent causes: with the fewest values and fitted shapes
     place = min(alike.values(), key=lambda other: (widths[other].shape[1] + sum(
         each.default is None for each in getattr(CATALOGUE.get(open_ones[other].cause), 'shapes',
                                                  ())), tried[other]))
     column, p_value, stretches = open_ones[place], min(tried[place], 1.0), chances[place][2]
     found = _cross_fitted(data, columns, places, open_ones, alike)
-    # the errors of a course last: there a cause has to predict distant stretches as well
+    # errors of a course are correlated over time, so that distant stretches must be predicted too
     surely, predicted, chosen = max(found) if done.spans.fine else min(found)
     probability = {name: chance for name, chance in probabilities(
         {name: gain - chances[other][1] for name, other in best_of.items()}).items()
@@ -615,7 +613,7 @@ def _evidence(x: Array, left: Array, clusters: Sequence[NDArray[np.intp]],
     size = np.sqrt(np.diag(information))
     if not (size > least).all():
         return 1.0, 0.0, 0.0
-    # by what the candidate leaves: a score that holds the effect itself would hide it
+    # by the residual with the candidate: scores that contain the effect would overestimate scatter
     off = left - x @ np.linalg.lstsq(x, left, rcond=None)[0]
     count, found = x.shape[1], []
     root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size**2)))
@@ -636,14 +634,14 @@ def _cross_fitted(data: Whitened, columns: Array, places: Sequence[slice],
                   open_ones: Sequence[Column],
                   alike: Mapping[str, int]) -> list[tuple[float, float, float]]:
     """
-    Choose and fit without each fold, and predict it.
+    Select and fit without each fold, and predict it.
 
     Returns
     -------
-    for folds of every fifth stretch, and for fifths of the log (between neighbours, what is slow
-    is predicted by the wander as well): what is won in log-likelihood over its standard
-    deviation by the scatter between stretches, what is won, and the part of the folds in which
-    the choice was one of those alike
+    for folds of every fifth stretch, and for fifths of the log (in the first, slow causes are also
+    predicted by the bias wander of neighbouring stretches): gain in log-likelihood over its
+    standard deviation by the scatter of stretches, the gain, and the share of the folds in which
+    one of the equivalent causes was selected
 
     """
     numbers = np.arange(data.of_log)

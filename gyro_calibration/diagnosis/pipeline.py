@@ -99,7 +99,7 @@ from gyro_calibration.diagnosis.search import (
 )
 from gyro_calibration.diagnosis.steps import CHECKS, OnProgress, Steps
 from gyro_calibration.diagnosis.words import amount
-from gyro_calibration.logs.log import DataRefused, Log
+from gyro_calibration.logs.log import DataRefused, Log, NORMAL_95
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
@@ -115,9 +115,8 @@ _LARGEST = 0.5
 _REPEATS = 1e-3
 #: Variables whose causes are named only if they have the same size in all logs.
 _MUST_REPEAT = frozenset({'temperature', 'temperature_rate'})
-#: Probability that an effect of the minimum detectable size is found; half-width of a 95 %
-#: interval in standard deviations.
-_POWER, _DEVIATIONS = 0.95, 1.96
+#: Probability that an effect of the minimum detectable size is found.
+_POWER = 0.95
 #: Names of the shape parameters of causes that are not effects of the catalogue.
 _SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
 _ONCE = 'find its cause; it occurs in this log alone, and is not added to the model'
@@ -209,7 +208,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     search, everything = _searched(replays, generator, _OF_SEARCH * rate, steps)
     named, unnamed = _withdrawn(search, everything)
     named, unconfirmed = without_weakest(search, named, partial(sureness_of, search), SURELY)
-    named, contradicted = without_weakest(search, named, partial(_sigmas, search), 1.96)
+    named, contradicted = without_weakest(search, named, partial(_sigmas, search), NORMAL_95)
     refuted = {**{each.candidate.cause: 'it does not predict held-out stretches'
                   for each in unconfirmed if not lasts(each.candidate)},
                **{each.candidate.cause: 'the interval of its size includes 0'
@@ -421,9 +420,10 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
         chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
         if chance < _OF_BIAS * rate:
             different.append(finding(
-                name, {name: Estimate.about(value, 1.96 * deviation, CAUSES[name].unit)}, chance,
-                confounders, minimum_detectable=5.4 * deviation, evidence='it adds to the value '
-                f'of the model, {abs(value) / deviation:.3g} sigma from zero'))
+                name, {name: Estimate.about(value, NORMAL_95 * deviation, CAUSES[name].unit)},
+                chance, confounders, minimum_detectable=5.4 * deviation,
+                evidence='it adds to the value of the model, '
+                f'{abs(value) / deviation:.3g} sigma from zero'))
     return different
 
 
@@ -576,7 +576,7 @@ def _parameters(found: FittedValues, place: int) -> dict[str, Estimate]:
 
 
 def _estimate(value: Value, unit: str) -> Estimate:
-    return Estimate.about(value.value, _DEVIATIONS * value.deviation, unit)
+    return Estimate.about(value.value, NORMAL_95 * value.deviation, unit)
 
 
 def _as_phase(found: FittedValues, place: int, name: str, coefficients: Sequence[Value],

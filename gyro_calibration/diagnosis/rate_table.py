@@ -67,7 +67,7 @@ from gyro_calibration.diagnosis.findings import (
 from gyro_calibration.diagnosis.gates import refuse
 from gyro_calibration.diagnosis.steps import OnProgress
 from gyro_calibration.diagnosis.words import amount
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_95
 from gyro_calibration.model.effects import (
     CUBIC_NONLINEARITY,
     Effect,
@@ -82,10 +82,10 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 from scipy.stats import t as student
 
-#: Parts of the false-alarm rate: of structure without a name, and of outlying dwells; the rest is
-#: that of causes.
+#: Shares of the false-alarm rate: for structure without a name, and for outlying dwells; the rest
+#: is for causes.
 _LEFT, _OUTLYING = 0.2, 0.05
-#: An effect of the smallest size that is stated is found with this probability.
+#: Probability that an effect of the minimum detectable size is found.
 _POWER = 0.95
 _METHOD = (
     'The rates and temperatures of the dwells were simulated, and the difference of measured and '
@@ -94,29 +94,29 @@ _METHOD = (
     'was taken if it predicts left-out sweeps better and is improbable by chance: of tables '
     'without any cause, {share:.2g} % give an alarm. Then curves over rate, temperature and the '
     'order of the dwells were tested on the residual. The reduction of the error was measured on '
-    'sweeps that took no part in choice or fit; intervals are of 95 %.')
-#: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
+    'held-out sweeps; intervals are of 95 %.')
+#: Largest number of groups of sweeps that are left out in turn, for the computing time.
 _MOST_GROUPS = 8
-#: Bins of a curve at most, and dwells in each at least.
+#: Largest number of bins of a curve, and least number of dwells in each.
 _MOST_BINS, _DWELLS_A_BIN = 40, 4
-#: Parts of the time until causes are found, and of their cross-validation, as measured on a table
-#: of 700 dwells.
+#: Shares of the search and of the cross-validation in the computing time, measured on a table of
+#: 700 dwells.
 _FOUND, _VALIDATED = 0.22, 0.75
-#: A name is withdrawn where more than this part of what it explains is left along its variable.
+#: Largest ratio of unexplained structure along its variable to what a named cause explains.
 _WITHDRAWN = 0.1
 
 
 def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0.01,
                    on_progress: OnProgress = lambda share, words: None) -> Diagnosis:
     """
-    Say what a simulation gets wrong of the dwells of a rate table.
+    Find the causes of the difference between a simulation and the dwells of a rate table.
 
     Parameters
     ----------
     table : a log without time, or its dwells
-    model : that is tested; an ideal gyro with the best bias and scale factor where it is None
-    rate : of false alarms, a table
-    on_progress : is given the share of the work that is done, and what begins
+    model : that is tested; None is an ideal gyro with the best bias and scale factor
+    rate : false alarms per table
+    on_progress : is called with the share of the work done and the name of the step that begins
 
     Raises
     ------
@@ -159,7 +159,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0
 def _concluded(dwells: Dwells, model: GyroModel | None, rate: float,
                withdrawn: frozenset[str] = frozenset()
                ) -> tuple[Named, tuple[Unexplained, ...], frozenset[str]]:
-    """Name causes, and withdraw names along a variable where much has none."""
+    """Name causes, and withdraw names along a variable with much unexplained structure."""
     named = name_causes(dwells, model, rate, withdrawn)
     left, gains = what_is_left(named.fit, _LEFT * rate, uncertainty_of(named.fit, named.model))
     if withdrawn:
@@ -174,7 +174,7 @@ def _concluded(dwells: Dwells, model: GyroModel | None, rate: float,
 
 def _gain(dwells: Dwells, model: GyroModel | None, rate: float,
           withdrawn: frozenset[str], on_progress: OnProgress) -> Gain | None:
-    """Choose causes anew and fit without some sweeps in turn, and predict these; None if never."""
+    """Return the gain on sweeps left out of selection and fit in turn; None if not possible."""
     parts = parts_of(dwells)
     groups = parts * min(_MOST_GROUPS, parts.max() + 1) // (parts.max() + 1)
     errors = {name: np.full(len(dwells), np.nan) for name in ('given', 'plain', 'extended')}
@@ -196,7 +196,7 @@ def _gain(dwells: Dwells, model: GyroModel | None, rate: float,
         return None
     numbered = np.unique(parts[known], return_inverse=True)[1]
     what = 'sweeps' if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 'consecutive dwells'
-    # a heading error is that of so long a turn at the rate of a dwell
+    # the heading error of a turn over the window at the rate of a dwell
     squares = {name: np.outer(np.bincount(numbered, error[known] ** 2), [1.0, WINDOW ** 2])
                for name, error in errors.items()}
     return gain_of(f'{what} left out, each of {groups.max() + 1} groups in turn', squares,
@@ -205,7 +205,7 @@ def _gain(dwells: Dwells, model: GyroModel | None, rate: float,
 
 
 def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Finding]:
-    """Give outlying dwells, if the farthest is beyond chance given a fit to the others."""
+    """Give outlying dwells, if the largest deviation from a fit to the others is significant."""
     outlying = np.flatnonzero(~fit.scatter.kept)
     freedom = freedom_beside_surface(take(dwells, fit.scatter.kept))
     if not len(outlying) or min(freedom, fit.freedom) < 1:
@@ -223,14 +223,14 @@ def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Findin
         yield finding('outliers', {'outliers': Estimate.about(float(len(outlying)), 0.0, '1')},
                       chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
                       evidence=f'{len(outlying)} of {len(dwells)} dwells are up to '
-                      f'{far.max():.0f} standard deviations off the others: {places}',
+                      f'{far.max():.0f} sigma from the others: {places}',
                       along=RATE)
 
 
 # findings
 
 def _strength_of(named: Named, effect: Effect) -> float:
-    """Return by what the sum of squares falls with a cause."""
+    """Return the reduction of the sum of squares by a cause."""
     if effect not in NUISANCES:
         rest = _rest(named.change, named.changed(effect))
         return math.inf if rest is None else rest.misfit - named.change.misfit
@@ -248,9 +248,9 @@ def _finding(named: Named, effect: Effect) -> Finding:
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
     term, deviations = _with_deviations(named.fit, effect)
     own, parameters = _own_values(named, effect), effect.parameters
-    # what is added to the model's values; 1.96 deviations hold 95 %
+    # what is added to the model's values
     estimates = {parameters[place].name: Estimate.about(
-        term.values[place] - own[place], 1.96 * deviation, parameters[place].unit)
+        term.values[place] - own[place], NORMAL_95 * deviation, parameters[place].unit)
         for place, deviation in zip(term.fitted, deviations)}
     return finding(effect.name, estimates, named.chance_of(effect), others,
                    minimum_detectable=_smallest(named, effect), separate_by=separate_by,
@@ -275,13 +275,13 @@ def _with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[float
 
 
 def _smallest(named: Named, effect: Effect) -> float | None:
-    """Return the size from which an effect is found, in the unit of its first value."""
+    """Return the minimum detectable size of an effect, in the unit of its first value."""
     change, level = named.changed(effect), level_of(named.rate, effect in NUISANCES)
     if effect in NUISANCES:
         return _found_from(named.fit, effect, level)
     if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):
         return _found_from(named.change, change, level)
-    # A small sine response is found as what it begins with, -k² w³ / 6.
+    # A small sine response equals -k² w³ / 6.
     cubic = tried(named.change, swapped_effects(named.change.effects, change, CUBIC_NONLINEARITY))
     if cubic is None:
         return None
@@ -291,7 +291,7 @@ def _smallest(named: Named, effect: Effect) -> float | None:
 
 
 def _found_from(fit: Calibration, effect: Effect, level: float) -> float:
-    """Return the size from which on a value is found with a probability of 95 %."""
+    """Return the size of a value that is found with a probability of 95 %."""
     used = take(fit.dwells, fit.scatter.kept)
     place = [term.effect for term in fit.terms for _ in term.fitted].index(effect)
     uncertain = Uncertainty.of(used, fit.scatter, columns_of(used, fit.terms),
@@ -308,8 +308,7 @@ def _found_from(fit: Calibration, effect: Effect, level: float) -> float:
 
 
 def _evidence(named: Named, effect: Effect) -> str:
-    sigmas = (f'it stands out by {math.sqrt(max(_strength_of(named, effect), 0.0)):.1f} standard '
-              'deviations')
+    sigmas = f'{math.sqrt(max(_strength_of(named, effect), 0.0)):.1f} sigma from zero'
     if effect in NUISANCES:
         parameter = effect.parameters[-1]
         change = amount(change_of(named.fit, named.model, effect), parameter.unit, parameter.name)
@@ -321,7 +320,7 @@ def _evidence(named: Named, effect: Effect) -> str:
             f'deg/s, with it to {named.change.left_out_rms / DEGREE:.3g} deg/s; {sigmas}')
 
 
-# what a person should know
+# remarks
 
 def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Sequence[Unexplained],
              withdrawn: frozenset[str], gain: Gain | None, offered: bool) -> Iterator[str]:
@@ -330,14 +329,13 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Sequen
         yield (f'Not named: {", ".join(sorted(withdrawn))}: along the same '
                'variable, much structure is left without a name.')
     if named.causes and not offered:
-        yield ('The extension predicts left-out dwells worse than the simulation, so that it is '
-               'not offered.')
+        yield ('The errors of the extended model for left-out dwells are larger than those of the '
+               'simulation; it is not offered.')
     if gain is not None:
-        yield (f'Heading errors are those that the error of a dwell makes in {WINDOW:g} s at its '
-               'rate.')
+        yield (f'Heading errors are the errors of dwells integrated over {WINDOW:g} s.')
     if any(each.along == SINGLE_RATES for each in left):
-        yield ('What repeats at single rates may be of the table, or of the place within a sweep '
-               'where all sweeps have the same order.')
+        yield ('Errors that repeat at single rates may belong to the table, or to the position '
+               'within a sweep if all sweeps have the same order.')
     scatter = fit.scatter
     yield (f'Dwells scatter by {scatter.dwell / DEGREE:.2g} deg/s and '
            f'{100.0 * scatter.dwell_scale:.2g} % of the rate, sweeps by '
@@ -348,12 +346,12 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Sequen
 
 
 def _of_model(dwells: Dwells, model: GyroModel, fit: Calibration) -> Iterator[str]:
-    """Say what of a model dwells cannot test, and if named effects may replace its polynomial."""
+    """Give remarks on untested effects of a model, and on a replacement of its polynomial."""
     known = seen(model)
     unseen = [term.effect.name for term in model.terms if term not in known]
     if unseen:
-        yield (f'Dwells without time do not show {", ".join(unseen)}; they are left as the model '
-               'has them.')
+        yield (f'Dwells without time do not show {", ".join(unseen)}; these effects of the model '
+               'are unchanged.')
     if (any(term.effect.looks_at & {'temperature'} for term in known)
             and dwells.temperature is None):
         yield ('The table holds no temperature; the model is simulated at '
@@ -382,12 +380,12 @@ def _against_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
 
 # what cannot be shown
 
-_AVERAGED = 'a dwell is a mean at a steady rate; record samples with their time'
+_AVERAGED = 'a dwell is a mean at a constant rate; record samples with their time'
 _NO_TIME = 'a table without time does not show what changes with time; record a log in time'
 _REASONS = {
     **dict.fromkeys(('bandwidth', 'time_offset', 'clock_rate', 'reference_slip'),
-                    'at steady rates nothing changes that could come late; record fast reversals '
-                    'in time'),
+                    'at constant rates a delay has no effect; record fast reversals with their '
+                    'time'),
     **dict.fromkeys(('bias_temperature_rate', 'thermal_lag', 'thermal_hysteresis', 'warm_up',
                      'rate_ramp', 'bias_step'), _NO_TIME),
     **dict.fromkeys(('interference_tone', 'quantization', 'dead_zone', 'saturation',
@@ -396,10 +394,10 @@ _REASONS = {
     **dict.fromkeys(('heading_sensitivity', 'reference_once_per_rev', 'reference_quantization'),
                     'whole turns average over all headings; record reference_heading_deg in time'),
     **dict.fromkeys(('acceleration_sensitivity', 'vibration_rectification'),
-                    'of a table, rates and temperatures alone are looked at; record '
-                    'acceleration_mps2 in several poses, in time'),
+                    'only rates and temperatures of a table are evaluated; record '
+                    'acceleration_mps2 in several poses, with time'),
     'supply_sensitivity':
-        'of a table, rates and temperatures alone are looked at; record supply_v in time',
+        'only rates and temperatures of a table are evaluated; record supply_v with time',
     'reference_scale':
         'only a second reference separates the scale of the first from that of the gyro'}
 
@@ -418,7 +416,7 @@ def _cannot_show(dwells: Dwells) -> dict[str, str]:
     return found
 
 
-# curves, for people to see
+# curves
 
 def curves(dwells: Dwells, scatter: Scatter, before: GyroModel,
            after: GyroModel) -> tuple[Curve, ...]:

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Logs as a regression: whitened residual and columns, noises, and the values of causes."""
+"""Regression of logs on causes: whitened residual and columns, noises, and fitted values."""
 
 from __future__ import annotations
 
@@ -37,30 +37,30 @@ from gyro_calibration.diagnosis.replay import (
     Shape,
     SMOOTHED,
 )
-from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.log import Array, NORMAL_95
 from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from scipy.linalg import block_diag
 
-#: The longest interval, s, over which a smoothed residual is averaged; and how often the levels of
-#: its noise are found again, each time with the noise that was likeliest with those before.
+#: Longest averaging interval of a smoothed residual, s; and number of iterations of the levels of
+#: its noise, each with the most likely noise of the levels before.
 _LONGEST, _ROUNDS = 0.1, 3
-#: A shape is changed by this part of itself to see what its column changes by.
+#: Relative step of a shape for the derivative of its columns.
 _SMALL = 1e-4
-#: The ends of an interval of 95 %, in standard deviations, and the fall of a shape's score there.
-_DEVIATIONS, _FALL = 1.96, 1.92
+#: Drop of the log-likelihood at the ends of a 95 % interval.
+_FALL = 1.92
 
 
 @dataclass(frozen=True)
 class Named:
     """
-    A cause in the list.
+    A selected cause.
 
     Attributes
     ----------
     candidate : the cause with its shapes
-    values : of its columns; without them nothing is known of what its shapes change
-    price : of the choice of its first shapes among others, in logarithms of the likelihood
+    values : coefficients of its columns; empty before a fit, and its shapes are then fixed
+    price : penalty for the choice of its first shapes, in log-likelihood
 
     """
 
@@ -72,14 +72,14 @@ class Named:
 @dataclass(frozen=True)
 class RegressionProblem:
     """
-    The logs and the noises that may be in them.
+    The logs and the noises that are tried.
 
     Attributes
     ----------
     replays : the logs
-    first : the noise by which all is divided at first
-    deviation : what it gives each coefficient, with the levels of the logs, over that of white
-        noise, shape (m,)
+    first : the noise by which residual and columns are whitened first
+    deviation : standard deviation of each coefficient by it, with the levels of the logs, relative
+        to that of white noise, shape (m,)
     starts : first coefficient of each band
     shapes : noises that are tried
     noises : the same, as weights of the bands
@@ -100,20 +100,20 @@ class RegressionProblem:
             np.full(len(part), each.step) for part, each in zip(parts, self.replays)])
 
     def divided(self, noise: int) -> Array:
-        """Return what whitens coefficients divided by the first noise already, shape (m,)."""
+        """Return the factors that whiten coefficients whitened by the first noise, shape (m,)."""
         count = np.diff(np.append(self.starts, len(self.deviation)))
         return np.repeat(np.sqrt(self.noises.weights[noise]), count)
 
 
 def regression_problem(replays: Sequence[Replay]) -> RegressionProblem:
-    """Lay out the logs with a grid of noises."""
+    """Set up the regression of logs with a grid of noises."""
     reference = _rounding(replays) if any(each.rounded for each in replays) else 0.0
     return _problem(tuple(replays), Shape(reference=reference), noise_grid(
         min(each.step for each in replays), max(each.duration for each in replays), reference))
 
 
 def _rounding(replays: Sequence[Replay]) -> float:
-    """Return the likeliest rounding of a reference heading, relative to white noise."""
+    """Return the most likely variance of the rounding of a heading, relative to white noise."""
     shapes = [Shape(reference=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))]
     tried = _problem(tuple(replays), Shape(), [replace(shape, walk=walk) for shape in shapes
                                                for walk in (0.0, 1e-4, 1e-2)])
@@ -130,7 +130,7 @@ def _problem(replays: tuple[Replay, ...], first: Shape,
     starts = np.concatenate([bands(angle, step) + offset
                              for (angle, step), offset in zip(parts, offsets)])
     count = np.diff(np.append(starts, offsets[-1])).astype(float)
-    # Some coefficients of a band are enough to know its mean variance.
+    # The mean variance of a band is computed from some of its coefficients.
     few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int))
            for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
     angle, step = (np.concatenate([part for part, _ in parts]),
@@ -140,8 +140,7 @@ def _problem(replays: tuple[Replay, ...], first: Shape,
         np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen],
                         first_of)
         for shape in shapes]) / [len(part) for part in few]
-    # Each combination of parts has an even chance; that parts come in many sizes must not outweigh
-    # that they may be absent.
+    # Each combination of components has the same prior probability, whatever its number of sizes.
     kinds = [(bool(each.walk), bool(each.strength), bool(each.flicker)) for each in shapes]
     rare = [np.log(kinds.count(kind)) for kind in kinds]
     noises = Noises(1.0 / relative, np.log(relative) @ count + 2.0 * np.array(rare))
@@ -151,19 +150,19 @@ def _problem(replays: tuple[Replay, ...], first: Shape,
 @dataclass(frozen=True)
 class Fitted:
     """
-    A field with some causes in it.
+    A regression with some causes.
 
     Attributes
     ----------
-    problem : with the rate that the gyro sees, if something happens to it before
-    plain : the logs as they are
+    problem : the logs with the rate that the gyro senses, distorted by causes
+    plain : the logs with the reference rate
     named : causes
-    residual : whitened, without what the causes of fixed amplitude make, shape (m,)
-    columns : whitened and independent: scale factor error, those of the causes, what their shapes
-        change, shape (q, m)
-    owner : of each column: (place of the cause, or -1 for the scale; place of its value, or minus
-        one less place of its shape)
-    widths : of each cause, how many columns with free values it has
+    residual : whitened, less the columns of causes of fixed amplitude, shape (m,)
+    columns : whitened and independent: scale factor error, those of the causes, and derivatives
+        with respect to their shapes, shape (q, m)
+    owner : of each column: (index of the cause, or -1 for the scale factor error, or -2; index of
+        its value, or -1 less index of its shape)
+    widths : number of columns with free values of each cause
     marginalized, by_noise : see `noise_likelihood`
 
     """
@@ -183,7 +182,7 @@ class Fitted:
         """
         Return the logarithm of the likelihood at the best values, averaged over the noises.
 
-        This is the restricted likelihood without what it says of the units of the columns: see
+        This is the restricted likelihood without its dependence on the units of the columns: see
         `evidence`.
 
         """
@@ -205,7 +204,7 @@ class Fitted:
         return [part * own for part, own in zip(self.left(), self._by_log(factor))]
 
     def left(self) -> list[Array]:
-        """Return coefficients of each log's residual over the first noise: shape (points - 1,)."""
+        """Return each log's residual whitened by the first noise: shape (points - 1,)."""
         values, _ = self.estimates
         return self._by_log(self.residual - values @ self.columns)
 
@@ -228,12 +227,12 @@ class Fitted:
 
 
 def is_of_the_rate(name: str) -> bool:
-    """Tell whether a cause changes the rate before anything is added to it."""
+    """Tell whether a cause distorts the rate before errors are added to it."""
     return name in CATALOGUE and CATALOGUE[name].stage == 'rate'
 
 
 def seen(each: Replay, named: Sequence[Named]) -> Replay:
-    """Return a log with the rate that the gyro sees."""
+    """Return a log with the rate that the gyro senses, distorted by causes."""
     rate, time = each.channels.rate, each.channels.time
     for known in named:
         if is_of_the_rate(known.candidate.cause):
@@ -246,11 +245,11 @@ def seen(each: Replay, named: Sequence[Named]) -> Replay:
 def fitted(whole: RegressionProblem, named: Sequence[Named],
            extra: Sequence[Candidate] = ()) -> Fitted:
     """
-    Put causes into a field.
+    Fit causes to logs.
 
     Parameters
     ----------
-    whole : the logs as they are
+    whole : the logs with the reference rate
     named : causes with their shapes and values
     extra : candidates whose columns are nuisances too
 
@@ -286,7 +285,7 @@ def fitted(whole: RegressionProblem, named: Sequence[Named],
 
 
 def _changes(known: Named, replays: Sequence[Replay], own: Array) -> list[tuple[int, Array]]:
-    """Return the change of the sum of a cause's columns with each smooth, fitted shape."""
+    """Return the derivative of a cause's contribution to each smooth, fitted shape."""
     found: list[tuple[int, Array]] = []
     for place in free_shapes(known.candidate):
         moved = _moved(known.candidate, place, max(each.duration for each in replays))
@@ -296,9 +295,9 @@ def _changes(known: Named, replays: Sequence[Replay], own: Array) -> list[tuple[
 
 
 def _moved(candidate: Candidate, place: int, duration: float) -> Candidate:
-    """Return a cause with a shape changed a little, to the side where its bounds leave room."""
+    """Return a cause with a small change of a shape, within its bounds."""
     shape = candidate.shapes[place]
-    # A wave that is to change a little must stay in step throughout.
+    # The phase of a wave must change little up to the end of the log.
     step = (1e-3 / duration if candidate.cause == 'interference_tone'
             else _SMALL * abs(shape) if shape else 1e-6)
     moved = with_shape(candidate, place, shape + step)
@@ -306,17 +305,17 @@ def _moved(candidate: Candidate, place: int, duration: float) -> Candidate:
 
 
 def free_shapes(candidate: Candidate) -> list[int]:
-    """Return the places of shapes that a fit may vary: no conventions, no leaping columns."""
+    """Return the indices of fitted shapes on which the columns depend smoothly."""
     return [] if candidate.cause in ('bias_step', 'dead_zone') else fitted_shapes(candidate)
 
 
 def leaping_shapes(candidate: Candidate) -> list[int]:
-    """Return the places of the other shapes that are no conventions."""
+    """Return the indices of fitted shapes on which the columns do not depend smoothly."""
     return [place for place in fitted_shapes(candidate) if place not in free_shapes(candidate)]
 
 
 def deviation_of_leaping(done: Fitted, place: int, shape: int) -> float:
-    """Return the standard deviation of a shape whose columns leap, by where the score falls."""
+    """Return the standard deviation of a shape by the profile of the likelihood."""
     candidate = done.named[place].candidate
     others = fitted(replace(done.problem, replays=done.plain),
                     done.named[:place] + done.named[place + 1:])
@@ -328,11 +327,11 @@ def deviation_of_leaping(done: Fitted, place: int, shape: int) -> float:
 
     first = (done.plain[0].step if candidate.cause == 'bias_step'
              else 1e-3 * candidate.shapes[shape])
-    return max(_until(falls, first), _until(falls, -first)) / _DEVIATIONS
+    return max(_until(falls, first), _until(falls, -first)) / NORMAL_95
 
 
 def _until(falls: Callable[[float], bool], first: float) -> float:
-    """Return the distance at which something first happens, to 1 %, by doubling and halving."""
+    """Return the distance at which a predicate is first true, to 1 %, by doubling and halving."""
     near, far = 0.0, first
     while not falls(far) and abs(far) < 1e6 * abs(first):
         near, far = far, 2.0 * far
@@ -344,10 +343,10 @@ def _until(falls: Callable[[float], bool], first: float) -> float:
 
 def filtered(done: Fitted) -> tuple[Replay, ...]:
     """
-    Return the logs with the levels of their noise, and averaged where a filter left next to none.
+    Return the logs with the levels of filtered noise, averaged where hardly any noise is left.
 
-    A filter shows in what the causes leave. Before they are found, motion that is seen late or
-    slowly would pass for noise.
+    The levels are those of the residual of the causes. Before the causes are fitted, motion that
+    is delayed or filtered would pass for noise.
 
     """
     found = [fall(part) < 1.0 for part in done.whitened()]
@@ -356,7 +355,7 @@ def filtered(done: Fitted) -> tuple[Replay, ...]:
         done = _again(done, [replace(each, every=each.every * (1 + more))
                              for each, more in zip(done.plain, deep)])
     for number in range(_ROUNDS if any(found) else 0):
-        # At first by the residual as it is, or the fastest slow noise would stand for the filter.
+        # First by the residual that is not whitened, or slow noise would compensate the filter.
         of = zip(done.plain, done.whitened() if number else done.left(), found)
         done = _again(done, [each.filtered(levels(part)) if falls else each
                              for each, part, falls in of])
@@ -364,12 +363,12 @@ def filtered(done: Fitted) -> tuple[Replay, ...]:
 
 
 def _again(done: Fitted, replays: Sequence[Replay]) -> Fitted:
-    """Put the causes of a field into the same logs with other points or levels."""
+    """Fit the same causes to the logs with other points or levels."""
     return fitted(regression_problem(replays), done.named)
 
 
 def with_one_more(before: Fitted, candidate: Candidate) -> Fitted:
-    """Put one more cause into a field at its present shapes, and keep what is there already."""
+    """Add a cause to a fit at its present shapes, and keep the other columns."""
     if is_of_the_rate(candidate.cause):
         return fitted(replace(before.problem, replays=before.plain),
                       [*before.named, Named(candidate)])
@@ -387,7 +386,7 @@ def with_one_more(before: Fitted, candidate: Candidate) -> Fitted:
 
 
 def with_columns(before: Fitted, columns: Array) -> Fitted:
-    """Put whitened columns more into a field, which belong to no cause."""
+    """Add whitened columns to a fit that belong to no cause."""
     owner = (*before.owner, *[(-2, 0)] * len(columns))
     return _summed(before.problem, before.plain, before.named, before.residual,
                    np.concatenate([before.columns, columns]), owner, before.widths)
@@ -396,7 +395,7 @@ def with_columns(before: Fitted, columns: Array) -> Fitted:
 def _summed(whole: RegressionProblem, plain: tuple[Replay, ...], named: tuple[Named, ...],
             residual: Array, columns: Array, owner: tuple[tuple[int, int], ...],
             widths: tuple[int, ...]) -> Fitted:
-    """Sum whitened residual and independent columns, and find the likelihood of each noise."""
+    """Return the fit of a whitened residual to independent columns under each noise."""
     kept = _independent(columns)
     of, nothing = columns[kept], np.empty((0, len(residual)))
     by = marginalized(of, nothing, (), whole.starts, whole.noises)
@@ -406,7 +405,7 @@ def _summed(whole: RegressionProblem, plain: tuple[Replay, ...], named: tuple[Na
 
 
 def _independent(columns: Array) -> list[int]:
-    """Return the columns that are not made of those before them, nor zero."""
+    """Return the columns that are linearly independent of those before them."""
     product = columns @ columns.T
     length = np.sqrt(np.diag(product))
     kept: list[int] = []
@@ -429,14 +428,14 @@ class Value:
 @dataclass(frozen=True)
 class FittedValues:
     """
-    A field with its causes, as values.
+    The values of a fit.
 
     Attributes
     ----------
-    fitted : the causes in the field
-    replays : the logs as they were laid out
-    lasting : whether effects of the gyro that happen once are fitted, but explain nothing, as in a
-        model for other logs
+    fitted : the fit
+    replays : the logs
+    lasting : whether single events of the gyro are fitted, but excluded from the contributions, as
+        in a model for other logs
 
     """
 
@@ -450,7 +449,7 @@ class FittedValues:
         return self.fitted.named
 
     def explaining(self, cause: int) -> bool:
-        """Tell whether a cause, by its place, is in what is explained."""
+        """Tell whether a cause, by its index, is included in the contributions."""
         return not (self.lasting and happens_once(self.named[cause]))
 
     @cached_property
@@ -460,19 +459,19 @@ class FittedValues:
 
     @cached_property
     def _leaping(self) -> dict[tuple[int, int], float]:
-        """Return standard deviations of shapes whose columns leap, by cause and place."""
+        """Return standard deviations of discontinuous shapes, by cause and index."""
         return {(place, -1 - shape): deviation_of_leaping(self.fitted, place, shape)
                 for place, known in enumerate(self.named)
                 for shape in leaping_shapes(known.candidate)}
 
     def place(self, cause: int, number: int) -> int | None:
-        """Return the place of a value among the estimates: column from 0, or shape below 0."""
+        """Return the index of a value among the estimates: column from 0, or shape below 0."""
         ranks = [*self.fitted.owner, *self._leaping]
         return ranks.index((cause, number)) if (cause, number) in ranks else None
 
     @property
     def covariance(self) -> Array:
-        """Return that of all estimates."""
+        """Return the covariance of all estimates."""
         return np.asarray(block_diag(self._estimates[2],
                                      np.diag(np.square(list(self._leaping.values())))))
 
@@ -487,7 +486,7 @@ class FittedValues:
 
     @property
     def scale_factor_error(self) -> Value:
-        """Return what the scale factor differs by from the simulation's, 1."""
+        """Return the scale factor error relative to the simulation, 1."""
         return self._value(-1, 0)
 
     def coefficients(self, cause: int) -> list[Value]:
@@ -505,11 +504,11 @@ class FittedValues:
 
     @cached_property
     def explained(self) -> list[Array]:
-        """Return what causes and scale add to each log's output, less bias, rad/s, shape (n,)."""
+        """Return the contributions of causes and scale to each output, rad/s, shape (n,)."""
         return [self.explains(each, run) for run, each in enumerate(self.replays)]
 
     def parts(self, each: Replay, run: int) -> dict[str, Array]:
-        """Return what the scale and each cause add to the output of a log, rad/s, shape (n,)."""
+        """Return the contributions of scale and causes to the output of a log, rad/s, (n,)."""
         found: dict[str, Array | float] = {}
         new = each
         for known in self.named:
@@ -529,18 +528,18 @@ class FittedValues:
         return {name: np.asarray(part) for name, part in found.items()}
 
     def explains(self, each: Replay, run: int) -> Array:
-        """Return what the causes and the scale add to the output of a log."""
+        """Return the sum of the contributions of scale and causes to the output of a log."""
         return np.asarray(sum(self.parts(each, run).values()))
 
     def heading_changes(self, run: int,
                         plain: FittedValues | None) -> tuple[dict[str, Array], Array]:
         """
-        Return what adds to the change of heading of a log, rad, and its times, s.
+        Return the contributions to the change of heading of a log, rad, and its times, s.
 
         Parameters
         ----------
         run : number of the log
-        plain : bias and scale that the simulation has already; None where it has none
+        plain : bias and scale factor of the simulation, if they were fitted; else None
 
         """
         each = self.replays[run]
@@ -554,7 +553,7 @@ class FittedValues:
 
     @cached_property
     def residuals(self) -> list[Array]:
-        """Return what is left of each log, its bias too, rad/s, shape (n,)."""
+        """Return the residual of each log, with its bias, rad/s, shape (n,)."""
         return [each.channels.output - each.reference - added
                 for each, added in zip(self.replays, self.explained)]
 
@@ -570,7 +569,7 @@ class FittedValues:
         return float(means @ self._estimates[2] @ means)
 
     def _mean_change(self, cause: int, number: int) -> float:
-        """Return by what one more of a cause's value, or of the scale, lowers the mean bias."""
+        """Return the derivative of the mean bias to a value, with the sign reversed."""
         if cause < 0:
             parts = [seen(each, self.named).channels.rate for each in self.replays]
         elif number >= 0 and self.explaining(cause):
@@ -582,5 +581,5 @@ class FittedValues:
 
 
 def happens_once(known: Named) -> bool:
-    """Tell whether a cause is an effect of the gyro in one of the logs: a step or a tone."""
+    """Tell whether a cause is an effect of the gyro in one log alone: a step or a tone."""
     return known.candidate.run is not None and known.candidate.cause in CATALOGUE

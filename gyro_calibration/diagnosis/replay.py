@@ -9,13 +9,13 @@
 # under the License.
 
 """
-A log and its simulation: the residual and what the causes look at, by sample and on a grid.
+A log and its simulation: the residual and the channels of causes, by sample and on an even grid.
 
-The noise of a residual is treated in its cosine transform, where whitening is a division. White
-noise and a random walk of the rate with any start have cosines as their exact eigenvectors; those
-of a Gauss-Markov process are nearly so. The coefficient of order 0 is the bias and is left out.
-The rounding of an encoder is white noise of the heading; its rate by cubic splines is that times
-``(3 sin / (2 + cos))²``.
+The noise of a residual is treated in its cosine transform, where whitening is a division. Cosines
+are exact eigenvectors of white noise and of a rate random walk with any start, and approximate
+ones of a Gauss-Markov process. The coefficient of order 0 is the bias and is left out. The
+rounding of an encoder is white noise of the heading; differentiation by cubic splines multiplies
+its variance by ``(3 sin / (2 + cos))²``.
 
 """
 
@@ -39,15 +39,15 @@ from scipy.fft import dct, idct, next_fast_len
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 
-#: Parts of the angle in which the noise of a filtered output has levels of its own, at most; the
-#: least number of coefficients in each; and the lowest level, for what is nearly free of noise
-#: would count for more than it is worth.
+#: Largest number of parts of the frequency range in which filtered noise has separate levels;
+#: least number of coefficients in each; and lowest level, which limits the weight of a part that
+#: is nearly free of noise.
 _PARTS, _LEAST, _LOWEST = 32, 100, 0.003
-#: By how many of its standard deviations the level must fall for a filter: that of the logarithm
-#: of a median of n is 2.33 over root n.
+#: Standard deviations by which the level of filtered noise falls; the standard deviation of the
+#: logarithm of a median of n is 2.33 over root n.
 _SURE, _SCATTER = 4.5, 2.33
-#: Numbers of random walks, of strengths and times of Gauss-Markov processes, and of corners of
-#: flicker that are tried: see `noise_grid`.
+#: Numbers of random walks, of strengths and times of Gauss-Markov processes, and of corner
+#: frequencies of flicker in `noise_grid`.
 _WALKS, _STRENGTHS, _TIMES, _CORNERS = 14, 7, 7, 14
 
 
@@ -97,7 +97,7 @@ class Shape:
 
 
 def differentiated(angle: Array) -> Array:
-    """Return the gain in variance of white noise by a cubic spline's derivative, interval 1."""
+    """Return the variance of white noise after a cubic spline's derivative, interval 1."""
     return (3.0 * np.sin(angle) / (2.0 + np.cos(angle))) ** 2
 
 
@@ -118,10 +118,10 @@ def angles(count: int) -> Array:
 
 def levels(whitened: Array) -> Array:
     """
-    Return the power in equal parts of the angle over that in the second part: shape (parts,).
+    Return the power in equal parts of the angle relative to the second part: shape (parts,).
 
-    The first part is as the second: what is slow is for `Shape` to say. Too few coefficients have
-    one part.
+    The first part is set to 1, because slow noise is described by `Shape`. With too few
+    coefficients there is one part.
 
     """
     parts = np.array_split(whitened ** 2, max(min(_PARTS, len(whitened) // _LEAST), 1))
@@ -131,7 +131,7 @@ def levels(whitened: Array) -> Array:
 
 
 def fall(whitened: Array) -> float:
-    """Return the power in the last quarter of the angle over the second; 1 if maybe chance."""
+    """Return the power in the last quarter of the angle over the second; 1 if insignificant."""
     _, second, _, last = (float(np.median(part ** 2)) for part in np.array_split(whitened, 4))
     by_chance = math.exp(-_SURE * _SCATTER * math.sqrt(8.0 / len(whitened)))
     return last / second if last < by_chance * second else 1.0
@@ -153,18 +153,18 @@ def bands(angle: Array, interval: float, single: int = 24, ratio: float = 1.12) 
 
 def noise_grid(interval: float, duration: float, reference: float = 0.0) -> list[Shape]:
     """
-    Return noises that a residual may have, coarse enough to try all.
+    Return a grid of noises that a residual may have.
 
-    A random walk shows where it is stronger than white noise over the log; a Gauss-Markov part
-    where its correlation time lies between some samples and the log. Flicker takes the place of a
-    Gauss-Markov part.
+    A random walk shows if it is stronger than white noise over the duration of the log; a
+    Gauss-Markov process if its correlation time is between some samples and this duration. Flicker
+    replaces the Gauss-Markov process.
 
     """
     lowest = 0.02 / duration ** 2
     highest = max(1e5 * lowest, 1e-3 / interval ** 2 * 1e-3)
     walks = [0.0, *np.geomspace(lowest, highest, _WALKS)]
     times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, _TIMES)
-    # By their density at frequency 0 over the white one, from hardly seen to a hundred times.
+    # By their spectral density at frequency 0 relative to white noise.
     strong = [(ratio / (2.0 * time), time) for time in times
               for ratio in np.geomspace(0.3, 1000.0, _STRENGTHS)]
     plain = [Shape(walk, strength, time, reference) for walk in walks
@@ -174,51 +174,48 @@ def noise_grid(interval: float, duration: float, reference: float = 0.0) -> list
                     for corner in corners]
 
 
-#: More points of the grid than this are averaged in neighbours: causes differ with fewer, too.
+#: Largest number of points of the grid; with more, neighbours are averaged.
 MOST_POINTS = 50_000
-#: Towards the highest frequencies the power of jumps falls to 0.18 between the second and the last
-#: quarter, that of noise to no less; what falls below this was smoothed before it was recorded. It
-#: is averaged over intervals of at most so many s.
+#: Ratio of the power in the last to that in the second quarter of the frequencies, below which a
+#: record was smoothed (jumps have 0.18, noise not less). Longest averaging interval for it, s.
 SMOOTHED, _LONGEST = 0.05, 0.03
-#: Frequencies over which the power of a rate is averaged, and by what factor rounding is taken to
-#: be stronger than on average.
+#: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
 _NEIGHBOURS, _OVER = 101, 1.5
-#: A held reference that keeps its value for more than so many of its intervals stood still; a
-#: change of fewer steps may have been slow.
+#: Update intervals of a held reference, and steps of its change, from which on a constant value is
+#: a standstill.
 _STOOD = 1.5
-#: Samples next to a gap of a heading whose rate is not compared, where the gap has as many: a
-#: spline errs by 0.13, 0.036 and 0.01 of what its slope changes by there. Beside a shorter gap it
-#: changes by little.
+#: Samples next to a gap of at least as many whose rate is not used: the error of a spline is 0.13,
+#: 0.036 and 0.01 of the change of slope over the gap, which is small for shorter gaps.
 _BESIDE = 4
-#: Part of the white noise of a sample from which on a bend of the rate is a corner: a thousand of
-#: them, all of one sign, come to 3 sigma. The part of the samples that corners are, at most.
+#: Least bend of the rate at a corner as a share of the white noise: a thousand of them with one
+#: sign are 3 sigma. Largest share of corners.
 _BENT, _FEW_CORNERS = 0.1, 0.2
-#: Points of the grid for each sample, and points of a log that is too short to matter: most of a
-#: log must not be made up.
+#: Largest number of grid points per sample, and number of points up to which it is not limited:
+#: most of a log must not be interpolated.
 _EACH, _SHORT = 5, 10_000
 
 
 @dataclass(frozen=True)
 class Replay:
     """
-    One log, ready to be searched: n samples, of which some are trusted.
+    One log prepared for the search: n samples, of which some are used.
 
     Attributes
     ----------
-    channels : what the effects look at; the rate is that of the reference, the time counts from
-        the first sample
-    reference : the rate that the output is compared with, rad/s: as measured, where
-        `channels.rate` is smooth
-    kept : samples that are trusted
-    place : number of each kept sample on the even grid
+    channels : inputs of the effects; the rate is that of the reference, smoothed, the time is that
+        since the first sample
+    reference : the rate that the output is compared with, rad/s, as measured
+    kept : mask of the samples that are used
+    place : index of each used sample on the even grid
     interval : of the grid, s
-    every : so many points of the grid are averaged into one
-    filling : white noise of variance 1 for lost points of the grid, shape (place[-1] + 1,)
-    rounded : step of the heading that the reference is the derivative of, rad; 0 where it has none
-    has : names of the channels that the log has
-    added : what the simulation adds to the rate, rad/s, shape (n,); `channels.output` is without
-    coarse : variance that the rounding of the output adds to a sample, (rad/s)²
-    levels : of its white noise, where a filter took from it: see `spectrum.levels`
+    every : number of grid points that are averaged into one
+    filling : white noise of variance 1 for missing grid points, shape (place[-1] + 1,)
+    rounded : quantization step of the heading whose derivative is the reference, rad; 0 without
+    has : names of the channels of the log
+    added : error of the simulated output, rad/s, shape (n,), which is subtracted from
+        `channels.output`
+    coarse : variance of a sample by quantization of the output, (rad/s)²
+    levels : of filtered white noise: see `levels`
 
     """
 
@@ -242,7 +239,7 @@ class Replay:
 
     @property
     def points(self) -> int:
-        """Return how many points are searched: one with a fast transform, a few left out."""
+        """Return the number of points: with a fast transform, a few at the end left out."""
         return _fast((int(self.place[-1]) + 1) // self.every)
 
     @property
@@ -257,10 +254,10 @@ class Replay:
 
     def on_grid(self, values: Array, filling: float = 0.0) -> Array:
         """
-        Return samples, shape (n,), on the even grid: lost ones bridged, many neighbours averaged.
+        Return samples, shape (n,), on the even grid: gaps interpolated, neighbours averaged.
 
-        A bridge has no noise of its own. Where that would matter, white noise of a standard
-        deviation fills it.
+        Interpolated points have no noise. If that matters, white noise of a standard deviation is
+        added to them.
 
         """
         whole = _bridged(values[self.kept], self.place)
@@ -275,7 +272,7 @@ class Replay:
         return whole.reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
 
     def _rounding(self) -> Array:
-        """Return what rounding adds to the reference, rad/s, also where no output is kept."""
+        """Return the rounding error of the reference, rad/s, also where no output is used."""
         rows = np.flatnonzero(self.kept)
         rows = np.arange(rows[0], rows[-1] + 1)
         at = np.interp(rows, np.flatnonzero(self.kept), self.place)
@@ -287,10 +284,10 @@ class Replay:
 
     def noisy(self, values: Array) -> Array:
         """
-        Return the cosine transform of a residual; bridges get the white noise of the rest.
+        Return the cosine transform of a residual; interpolated points get white noise.
 
-        The error of a rounded heading is bounded. A bridge would carry what it has at the ends of
-        a gap on as a jump, so it is taken from the reference, which has no gap there.
+        The error of a rounded heading is bounded, but its interpolation over a gap would not be.
+        So it is taken from the reference, which has no gap there.
 
         """
         if not self.rounded:
@@ -307,31 +304,31 @@ class Replay:
         return level(angles(self.points), self.levels)
 
     def filtered(self, more: Array) -> Replay:
-        """Return it with its levels multiplied by more; the filling is filtered, too."""
+        """Return the log with its levels multiplied by factors, as its noise for gaps."""
         whole = transform(self.filling) * np.sqrt(
             level(angles(len(self.filling)) * self.every, more))
         filling = inverse(whole)
         return replace(self, levels=self.levels * more, filling=filling / white_noise(filling))
 
     def with_rate(self, rate: Array) -> Replay:
-        """Return it with another rate that the effects look at."""
+        """Return the log with another rate for the effects."""
         return replace(self, channels=replace(self.channels, rate=rate))
 
 
 def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None,
            step: float = 0.0, codes: float = 0.0, model: GyroModel | None = None) -> Replay:
     """
-    Lay a log out.
+    Prepare a log for the search.
 
     Parameters
     ----------
-    log : with output, time and a reference; one at rest needs no reference
+    log : with output, time and a reference, which is not needed at rest
     trusted : samples to use, shape (n,)
-    generator : source of the noise that fills what is lost
-    update : interval at which the reference is renewed, s, where it is held in between
-    step : of a reference heading, rad; 0 where it has none
-    codes : step between codes of the output, rad/s; 0 where it does not matter
-    model : the simulation that the output is compared with; that of an ideal gyro where it is None
+    generator : source of the noise for gaps
+    update : update interval of a reference that is held in between, s
+    step : of a reference heading, rad; 0 without one
+    codes : quantization step of the output, rad/s; 0 if it does not matter
+    model : of the simulation; None is an ideal gyro
 
     """
     assert log.time is not None and log.output is not None
@@ -349,9 +346,9 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     place, interval = numbered(time, kept)
     _refuse_gaps(log.time[kept], place)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
-    if model is not None and log.temperature is None:  # it has one to be simulated at
+    if model is not None and log.temperature is None:  # simulated at the reference temperature
         shown = replace(shown, temperature=np.full(len(log), model.reference_temperature))
-    # the heading that effects look at: the reference's, or the integral of its rate
+    # the heading for effects: that of the reference, or the integral of its rate
     heading = shown.reference_heading
     if heading is None or not np.isfinite(heading).all():
         heading = integral_of(time, np.nan_to_num(smooth))
@@ -367,7 +364,7 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     plain = replace(plain, every=every * _smoothed(plain))
     if model is None:
         return plain
-    # what the model adds is taken out of the output, and effects see the rate that its gyro sees
+    # the error by the model is subtracted from the output, and effects use its distorted rate
     rate = model.distorted('rate', smooth, time)
     added = model.output_in(plain.channels.moving(rate, rate)) - rate
     return replace(plain, channels=plain.channels.moving(rate, plain.channels.output - added),
@@ -375,16 +372,16 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
 
 
 def _refuse_gaps(time: Array, place: NDArray[np.intp]) -> None:
-    """Refuse a log of which most is missing: gaps are made up, and a clock's jump fills memory."""
+    """Refuse a log of which most is missing, as after a jump of the clock."""
     points = int(place[-1]) + 1
     if points <= max(_EACH * len(place), _SHORT):
         return
     gaps = np.diff(time)
     longest = int(np.argmax(gaps))
-    raise DataRefused(f'{len(place)} samples can be used where the log has room for {points}, at '
-                      f'least a fifth is needed; the longest gap, of {gaps[longest]:.6g} s, '
-                      f'begins at {time[longest]:.3f} s: cut the log there, and give both parts, '
-                      'or give --rate where the stamps are no use')
+    raise DataRefused(f'{len(place)} of {points} samples can be used, at least a fifth is needed; '
+                      f'the longest gap, of {gaps[longest]:.6g} s, begins at '
+                      f'{time[longest]:.3f} s: cut the log there, and give both parts, or give '
+                      '--rate if the stamps are wrong')
 
 
 def _even(time: Array) -> Array:
@@ -400,11 +397,11 @@ def _even(time: Array) -> Array:
 
 def _smoothed(plain: Replay) -> int:
     """
-    Return how many more points to average, so that no smoothing of the record is left.
+    Return the additional number of points to average, so that smoothing does not show.
 
-    A gyro whose samples are means of many, or a reference that was smoothed, has nearly nothing
-    but rounding at the highest frequencies. No noise of a model is like that, and what motion and
-    noise of the reference leave there would count for much more than it is worth.
+    A gyro with averaged samples, or a smoothed reference, has hardly any noise at the highest
+    frequencies. The noises of the grid do not describe that, so that small errors of motion and
+    reference would have too much weight there.
 
     """
     rest, more, found = plain.channels.output - plain.reference, 1, 1
@@ -419,11 +416,11 @@ def _smoothed(plain: Replay) -> int:
 
 def _rounding(output: Array, rate: Array, kept: Mask, step: float) -> Array:
     """
-    Return what rounding adds to the output on average, rad/s, shape (n,).
+    Return the mean rounding error of the output, rad/s, shape (n,).
 
-    Where steps are not small against the noise, this depends on the rate, and would pass for an
-    effect of it. It is the Fourier series of a saw, smoothed by the noise before the rounding
-    (Widrow, Kollar and Liu 1996).
+    If the steps are not small compared with the noise, it depends on the rate, and would pass for
+    a nonlinearity. It is the Fourier series of a sawtooth, smoothed by the noise before the
+    rounding (Widrow, Kollar and Liu 1996).
 
     """
     scale, bias = (np.polyfit(rate[kept], output[kept], 1) if np.ptp(rate[kept]) > 0.0
@@ -440,7 +437,7 @@ def _rounding(output: Array, rate: Array, kept: Mask, step: float) -> Array:
 
 
 def _reference(log: Log, time: Array, held: bool, step: float) -> tuple[Array, Array]:
-    """Return the reference rate as it is compared, and as effects look at it."""
+    """Return the reference rate for the comparison, and the smoothed one for effects."""
     if log.reference_rate is not None:
         rate = _between_updates(time, log.reference_rate, step) if held else log.reference_rate
         return rate, _filled(time, rate)
@@ -452,7 +449,7 @@ def _reference(log: Log, time: Array, held: bool, step: float) -> tuple[Array, A
 
 
 def _filled(time: Array, values: Array) -> Array:
-    """Return values without gaps: a delay or a lag carries what is lost to its neighbours."""
+    """Return values with interpolated gaps, which delays and lags of effects need."""
     known = np.isfinite(values)
     return np.interp(time, time[known], values[known])
 
@@ -467,10 +464,10 @@ def _fast(count: int) -> int:
 
 def _bridged(known: Array, place: NDArray[np.intp]) -> Array:
     """
-    Return samples on the whole grid, straight lines across what is lost.
+    Return samples on the whole grid, with straight lines over gaps.
 
-    A line begins and ends in the mean of as many samples as it bridges: the noise of a single one
-    would be carried across the gap.
+    A line begins and ends in the mean of as many samples as the gap has, which reduces their
+    noise.
 
     """
     if len(known) == place[-1] + 1:
@@ -501,10 +498,10 @@ def numbered(time: Array, kept: Mask) -> tuple[NDArray[np.intp], float]:
 
 def _between_updates(time: Array, values: Array, step: float) -> Array:
     """
-    Interpolate a held reference between its updates, for a held value is half an interval late.
+    Interpolate a held reference between updates, as a held value is half an interval late.
 
-    An update that brings the same value leaves no trace. So a value that stands for longer is held
-    until the last update before the next.
+    An update with the same value does not show. So a value that is constant for longer is held
+    until one update interval before the next change.
 
     """
     known = np.isfinite(values)
@@ -530,14 +527,14 @@ def _rates(time: Array, heading: Array, step: float) -> tuple[Array, Array]:
 
 def _corners(rate: Array, output: Array, kept: Mask, rounding: float) -> Mask:
     """
-    Return where the rate of a heading bends too sharply to be known from samples, shape (n,).
+    Return where the rate of a heading has corners that its samples do not resolve, shape (n,).
 
-    At a kink of the rate a spline through the heading and the integral of the output by trapezoids
-    differ by a twelfth of the second difference, which is a 24th of the fourth; where a motion
-    begins or ends, that passes for a dead zone or for a slip. Of a smooth motion, which splines
-    follow, the fourth difference is small, however fast it accelerates. A reference that bends
-    everywhere is noise, and is left to its treatment; steps of a heading alone do not make a
-    fourth difference of 24 times `rounding`, step over interval.
+    At a corner of the rate, a spline through the heading and the trapezoidal integral of the
+    output differ by a twelfth of the second difference, which is a 24th of the fourth; at the
+    begin or end of a motion that passes for a dead zone or a slip. The fourth difference of a
+    smooth motion, which splines follow, is small at any acceleration. A reference with bends
+    everywhere is noisy, and none are excluded; quantization of a heading alone has no fourth
+    difference of 24 times `rounding`, step over interval.
 
     """
     bend = np.abs(np.diff(np.pad(rate, 2, mode='edge'), 4)) / 24.0
@@ -549,10 +546,10 @@ def _corners(rate: Array, output: Array, kept: Mask, rounding: float) -> Mask:
 
 def _without_rounding(rate: Array, step: float, interval: float) -> Array:
     """
-    Return the rate of a heading without what rounding to steps makes of it, by a Wiener filter.
+    Return the rate of a heading with its rounding error removed by a Wiener filter.
 
-    Each frequency is kept as far as its power is beyond that of the rounding, so that quick motion
-    stays.
+    Each frequency is weighted by the share of its power above that of the rounding, so that fast
+    motion remains.
 
     """
     coefficients = dct(rate, norm='ortho')

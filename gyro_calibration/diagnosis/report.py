@@ -61,23 +61,23 @@ from gyro_calibration.model.model_file import model_text
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: Of a curve, so many points are drawn at most, four to a part: its ends and its extremes stay.
+#: Parts of a curve of which only the extremes are drawn.
 _PARTS = 90
-#: Residuals below this, rad/s, are read in deg/h.
+#: Residuals below this, rad/s, are displayed in deg/h.
 _SLOW = 2e-3 * DEGREE
-#: The curve that holds amplitudes in place of means.
+#: The variable of the curve of amplitudes instead of means.
 SPECTRUM = 'frequency'
 
 _METHOD = (
-    '{logs} replayed through the simulation: the motion and the temperature as recorded, the '
-    'output as the model has it. What the output then differs by, the residual, was compared with '
-    'every cause of the catalogue, under a noise of angle random walk, flicker and rate random '
-    'walk that was found together with the causes. A cause is named where it shows more than the '
-    'strongest of all causes does in noise drawn for this very log, so that of logs without any '
-    'cause {share} give an alarm. Causes were added one at a time, refined, exchanged, and taken '
-    'back where another one explains more. Those that explain the same are given as a set, of '
-    'which the simplest is in the model. Bias and scale factor are fitted in any case. The gain '
-    'was measured on parts that took no part in this; intervals are of 95 %.')
+    '{logs} replayed through the simulation, with motion and temperature as recorded. The '
+    'residual, measured less simulated output, was compared with every cause of the catalogue, '
+    'under a noise of angle random walk, flicker and rate random walk that was fitted together '
+    'with the causes. A cause is named if its evidence exceeds that of the strongest of all '
+    'causes in noise that was simulated for this log, so that {share} of logs without any cause '
+    'give an alarm. Causes were added one at a time, refined, exchanged, and removed if another '
+    'one explains more. Causes that explain the data equally well are given as a set, of which '
+    'the simplest is in the model. Bias and scale factor are fitted in any case. The gain was '
+    'measured on held-out parts; intervals are of 95 %.')
 
 
 def report(diagnosis: Diagnosis) -> str:
@@ -95,7 +95,7 @@ def page(title: str, body: Markup) -> str:
 
 
 def _as_it_was(diagnosis: Diagnosis) -> Diagnosis:
-    """Return the diagnosis with nothing drawn as after an extension, for there is none."""
+    """Return the diagnosis without curves after the extension."""
     heading, trace = diagnosis.heading, diagnosis.trace
     return replace(diagnosis,
                    curves=[replace(curve, after=curve.before) for curve in diagnosis.curves],
@@ -206,9 +206,9 @@ def _misfit(diagnosis: Diagnosis, guilty: Sequence[Numbered]) -> Iterator[Markup
     for place, curve in guilty:
         before, after = (amount(float(np.abs(each[np.isfinite(each)]).max(initial=0.0)), 'rad/s')
                          for each in (curve.before, curve.after))
-        yield element('p', f'Along {spoken(curve.along)}, the simulation is off by up to {before}'
-                      + ('.' if _same(curve)
-                         else f' as it was, and by up to {after} as extended.'))
+        yield element('p', f'Along {spoken(curve.along)}, the error of the simulation is up to '
+                      f'{before}' + ('.' if _same(curve)
+                                     else f' before the extension, and up to {after} after it.'))
         yield _pairs(draw(chart) for chart in (_predicted(curve, place), _residual(curve, place))
                      if chart is not None)
 

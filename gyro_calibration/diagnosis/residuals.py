@@ -9,9 +9,9 @@
 # under the License.
 
 """
-What is left of logs: its noise in the figures of IEEE Std 952 against those of the model; curves.
+Residuals of logs: noise parameters of IEEE Std 952 compared with those of the model, and curves.
 
-The curves are along each variable, of the simulation as given, and as extended.
+The curves are along each variable, of the given and of the extended simulation.
 
 """
 
@@ -33,7 +33,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
-#: Of logs with nothing but noise, so many lose a band of frequencies.
+#: Probability that a frequency band of noise alone is rejected, per log.
 _BY_CHANCE = 1e-3
 #: Bins of a curve, and points of a line over time.
 BINS, POINTS = 40, 600
@@ -50,7 +50,7 @@ class NoiseParameters:
     ----------
     noise : the figures
     interval : of 95 % of each, by name
-    chance : by name, how likely the model's figure would leave as much or as little
+    chance : p-value of the model's figure, by name
 
     """
 
@@ -67,8 +67,8 @@ class _Bands:
     Attributes
     ----------
     energy, count : of each band
-    parts : the variance that each figure of 1 gives them, shape (b, 3) or (b, 4)
-    known : the variance that is no figure's, shape (b,)
+    parts : variance of the bands by a figure of 1, shape (b, 3) or (b, 4)
+    known : variance by other noise, shape (b,)
 
     """
 
@@ -91,15 +91,15 @@ def noise_parameters(done: Fitted, expected: Noise, rounds: bool = False) -> Noi
     """
     Fit noise figures to the residual, and compare them with those of a model.
 
-    Frequencies with more than the noise, such as those of a vibration, are left out, as `allan`
-    leaves out averaging times that a filter or interference affects.
+    Frequencies with more power than the noise, such as those of a vibration, are left out, as
+    `allan` leaves out averaging times that a filter or interference affects.
 
     Parameters
     ----------
-    done : what was found
-    expected : the noise of the model; where its angle random walk is 0 it claims nothing
-    rounds : whether the model rounds its output itself, so that its angle random walk is without
-        that; otherwise it may be with it
+    done : the fit
+    expected : the noise of the model; not compared if its angle random walk is 0
+    rounds : whether the model has quantization, so that its angle random walk is without the
+        rounding noise; otherwise it may include it
 
     """
     bands = _without_tones(_bands(done))
@@ -130,7 +130,7 @@ def _compared(bands: _Bands, expected: Noise) -> NoiseParameters:
 def _bands(done: Fitted) -> _Bands:
     problem, (angle, step) = done.problem, done.problem.angles()
     left = np.concatenate(done.left()) * problem.deviation
-    # The figures of noise behind a filter are those below its cut-off, where the level is still 1.
+    # The noise parameters before a filter are those of frequencies below its cut-off.
     used = np.concatenate([angles(each.points) < 1.5 * np.pi / len(each.levels)
                            for each in problem.replays])
     coarse = np.concatenate([np.full(each.points - 1, each.coarse / each.every)
@@ -148,7 +148,7 @@ def _bands(done: Fitted) -> _Bands:
 
 
 def _without_tones(bands: _Bands) -> _Bands:
-    """Leave out bands with more energy than the noise of the others, the most unlikely first."""
+    """Remove bands with more energy than the noise of the others, the most unlikely first."""
     kept: Mask = np.ones(len(bands.energy), dtype=bool)
     while kept.sum() > len(kept) / 2:
         inside = _Bands(bands.energy[kept], bands.count[kept], bands.parts[kept],
@@ -163,7 +163,7 @@ def _without_tones(bands: _Bands) -> _Bands:
 
 
 def _fit(bands: _Bands, held: dict[int, float], start: Array | None = None) -> tuple[Array, float]:
-    """Return the likeliest logarithms of squared figures, some of them held, and the cost."""
+    """Return the most likely logarithms of squared figures, some of them fixed, and the cost."""
     size = bands.parts.shape[1]
     free = [place for place in range(size) if place not in held]
     usual = bands.energy / bands.count
@@ -185,14 +185,14 @@ def _fit(bands: _Bands, held: dict[int, float], start: Array | None = None) -> t
 
 
 def _floors(bands: _Bands, best: Array) -> Array:
-    """Return the logarithms below which a figure is nowhere a hundredth of the noise."""
+    """Return the logarithms below which a figure is less than 1 % of the noise everywhere."""
     variance = bands.variance(best)
     return np.array([np.log(0.01 * (variance / bands.parts[:, place]).min())
                      for place in range(len(best))])
 
 
 def _interval(bands: _Bands, place: int, best: Array, least: float) -> tuple[float, float]:
-    """Return where the cost is within that of 95 % of the least."""
+    """Return the 95 % interval of a figure by the profile of the cost."""
     limit = least + float(chi2.ppf(0.95, 1))
     ends = []
     for direction in (-1.0, 1.0):
@@ -208,12 +208,12 @@ def _interval(bands: _Bands, place: int, best: Array, least: float) -> tuple[flo
 # curves
 
 def what_is_left(found: FittedValues) -> list[Array]:
-    """Return what is left of each log without its bias, rad/s, shape (n,)."""
+    """Return the residual of each log without its bias, rad/s, shape (n,)."""
     return [residual - bias for residual, bias in zip(found.residuals, found.biases)]
 
 
 def residuals_of_model(replays: Sequence[Replay]) -> list[Array]:
-    """Return what a model that was given leaves of each log as it is, rad/s, shape (n,)."""
+    """Return the residual of the given model for each log, rad/s, shape (n,)."""
     return [each.channels.output - each.reference for each in replays]
 
 
@@ -223,7 +223,7 @@ def curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
 
     Parameters
     ----------
-    before : what the simulation leaves of each log, rad/s, shape (n,)
+    before : residual of the simulation for each log, rad/s, shape (n,)
     after : the extended simulation
 
     """
@@ -238,7 +238,7 @@ def curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
 
 
 def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[Replay], Array]]]:
-    """Give name, unit, and what takes it from a log."""
+    """Give name, unit, and a function that returns the variable of a log."""
     has = frozenset.intersection(*(each.has for each in replays))
     yield 'time', 's', lambda each: each.channels.time - each.channels.time[0]
     if any(np.ptp(each.channels.rate) > 0.0 for each in replays):
@@ -259,7 +259,7 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
 
 def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
            after: FittedValues) -> Curve:
-    """Bin evenly between the quantiles that hold nearly all, without bins of few samples."""
+    """Return means in even bins between the 0.1 % and 99.9 % quantiles, of 10 or more samples."""
     at = np.concatenate(parts)
     low, high = np.quantile(at, [0.001, 0.999])
     if not high > low:
@@ -279,8 +279,8 @@ def _variances(after: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
     """
     Return the variance by noise of the sum of the residual in each bin, (rad/s)², shape (BINS,).
 
-    Slow noise is alike in neighbours and averages out less than white noise; in the cosine
-    transform it is independent. What averages out among the samples of one grid point is white.
+    Slow noise is correlated between samples; its cosine transform is not. Noise that averages out
+    among the samples of one grid point is white.
 
     """
     total = np.zeros(BINS)

@@ -9,11 +9,11 @@
 # under the License.
 
 """
-What is wrong with single samples of an output.
+Faults of single samples of an output.
 
-Codes: the values of a digital output, their step, the dead band about zero, and the limit.
-Repeated samples: the last value once more, beyond the repeats that coarse codes explain. Outliers:
-samples far from their neighbours, and not because the gyro moves.
+Codes are the values of a digital output, with their step, the dead band about zero, and the limit.
+Repeated samples have the value of the sample before, more often than coarse codes explain.
+Outliers are samples far from their neighbours that motion does not explain.
 
 """
 
@@ -31,31 +31,30 @@ from scipy import stats
 from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtr
 
-#: The count of the extreme code is compared with that of so many next to it, or of those within
-#: this part of the white noise.
+#: Neighbouring codes with which the count of the extreme code is compared: their number, and their
+#: range as a share of the white noise, whichever is larger.
 _NEIGHBOURS, _WITHIN = 4, 0.05
-#: Codes finer than this part of the white noise hardly ever repeat by chance.
+#: Step of codes, as a share of the white noise, below which codes hardly repeat by chance.
 _FINE = 0.1
-#: A code that is reached in so many separate runs is not repeated by a fault.
+#: Least number of separate runs of an extreme code, which a repetition fault does not cause.
 _SEPARATE = 3
-#: An output below this part of the fastest is that of a rest: no limit is as low, and a dead band
-#: is about a rest.
+#: Output of a rest, as a share of the largest; a limit is higher, and a dead band is lower.
 _REST = 0.1
-#: Values of as many digits have steps of as many parts of them, up to this factor.
+#: Largest ratio of relative steps of values that are printed with the same number of digits.
 _DIGIT = 10.0
-#: A dead band keeps other codes away by more than so many steps.
+#: Least half-width of a dead band in steps of codes.
 _AWAY = 1.5
-#: What is expected so many standard deviations beyond a dead band may well be in it.
+#: Margin of a dead band for the expected output, in standard deviations.
 _EDGE = 2.0
 
 
 def steps_about(codes: Codes, output: Array) -> Array:
     """
-    Return the most that codes about each value may be apart, shape (n,).
+    Return an upper bound of the step of codes near each value, shape (n,).
 
-    Steps grow with the values in floats of 32 bits, and in what is printed with so many digits; or
-    they are too fine to be seen. They are no larger than the smallest gap between values as large
-    or larger, and than is usual for the digits of the finest.
+    Steps grow with the values of 32-bit floats and of decimals with a number of significant
+    digits; or they are too small to be determined. They are at most the smallest gap between
+    values of the same size or larger, and at most that usual for the smallest relative step.
 
     """
     steps = np.full(len(output), max(codes.step, float(np.diff(codes.values).min())
@@ -77,12 +76,12 @@ def steps_about(codes: Codes, output: Array) -> Array:
 @dataclass(frozen=True)
 class DeadBand:
     """
-    A value that comes again and again, while those near it never do.
+    A frequent value without other values near it.
 
     Attributes
     ----------
     value : rad/s
-    half : how far others keep away from it, rad/s
+    half : distance of the nearest other value, rad/s
 
     """
 
@@ -114,19 +113,19 @@ def dead_band(codes: Codes, output: Array) -> DeadBand | None:
 
 
 def _slow(output: Array) -> float:
-    """Return below which size an output is that of a rest; an outlier is not the fastest."""
+    """Return the largest absolute output of a rest, by a quantile that excludes outliers."""
     return _REST * float(np.quantile(np.abs(output), 0.99))
 
 
 def deviation_of(seen: Compared) -> float:
-    """Return the deviation of samples from the expected output, rad/s: noise and nonlinearity."""
+    """Return the standard deviation of samples from the expected output, rad/s."""
     return seen.white if seen.expected is None else max(seen.white, seen.scatter)
 
 
 @dataclass(frozen=True)
 class Limit:
     """
-    Codes that the output cannot go beyond.
+    Largest and smallest code of a saturated output.
 
     Attributes
     ----------
@@ -154,10 +153,9 @@ def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
     """
     Return the limit of an output, or None where it shows none.
 
-    An extreme code is one if it is beyond what comes at rests; if it stands more often than its
-    neighbours further in, where an output that is free to go beyond has fewer; and if the output
-    would have gone beyond by what is expected of it, which a coarse code at a constant rate would
-    not.
+    An extreme code is a limit if it is larger than the output at rest; if it is more frequent than
+    its neighbours, which are more frequent without a limit; and if the expected output is beyond
+    it, which is not so for a coarse code at a constant rate.
 
     Parameters
     ----------
@@ -205,18 +203,17 @@ def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
             or (fine and (runs >= _SEPARATE or middle > -3.0 * deviation)))
 
 
-#: Motions that are distinguished, by the change that is expected from one sample to the next.
+#: Number of classes of motion, by the expected change from one sample to the next.
 _CLASSES = 8
-#: From this share of repeats on, single ones of so coarse an output mean nothing; runs may.
+#: Probability of repeats from which on single repeats of a coarse output are not tested.
 _COARSE = 0.3
-#: Single repeats count as a fault where explained ones are as rare as this.
+#: Largest probability of a repeat for which single repeats are marked as a fault.
 _RARE = 0.02
-#: Excess of repeats over the explained ones, as a part of these, below which their number is not
-#: known well enough.
+#: Least relative excess of repeats over the expected number.
 _EXCESS = 0.5
-#: A run is like others up to so many times the longest of them.
+#: Largest ratio of a run at a limit to the longest run of repeats for which it is one of them.
 _ALIKE = 2.0
-#: A code that is narrower than this part of the noise is a point.
+#: Ratio of a code to the noise below which the probability is computed by its density.
 _NARROW = 1e-5
 
 
@@ -227,9 +224,9 @@ class RepeatedSamples:
 
     Attributes
     ----------
-    repeats : those that are not explained, shape (n,)
-    explained : how many repeats the codes and the noise explain
-    p_value : the chance of as many, or of runs as long
+    repeats : mask of the unexplained repeats, shape (n,)
+    explained : expected number of repeats by codes and noise
+    p_value : of the number of repeats, or of the length of runs
 
     """
 
@@ -302,11 +299,11 @@ def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: 
 def _explained_repeats(change: Array, expected: Array, step: Array,
                        known: Mask) -> tuple[Array, Array]:
     """
-    Return the chance of each change to be none, and the most that this is within a run, (n - 1,).
+    Return the probability of each repeat, and its upper bound within a run, shape (n - 1,).
 
-    The chance is the part of a code that the sample before leaves for this one, averaged over the
-    noise, among changes that are expected alike. The longer a run is, the likelier its code is the
-    one in whose middle the expectation lies; so within it that code counts.
+    The probability is averaged over the noise and over the position of the expected output within
+    a code, for changes of similar expectation. In a long run the expected output is probably near
+    the middle of the code, which gives the upper bound.
 
     """
     chances, again = np.ones((2, len(change)))
@@ -360,27 +357,26 @@ def _density(values: Array) -> Array:
     return np.exp(-0.5 * values ** 2) / math.sqrt(2.0 * math.pi)
 
 
-#: An outlier is beyond so many standard deviations, or more where so many samples reach that by
-#: chance.
+#: Least deviation of an outlier in standard deviations; more for very long logs.
 _FAR = 6.0
-#: Samples on each side that one is compared with.
+#: Number of neighbours on each side with which a sample is compared.
 SIDE = 3
-#: Samples by which a reference may tell of a jolt sooner or later.
+#: Largest time between a jolt in the output and in the reference, in samples.
 _SOON = 10
-#: Samples in which the scatter is taken to be the same.
+#: Samples in a block of constant scatter.
 _BLOCK = 256
-#: Kinds of motion that are distinguished, by how much the expectation changes about a sample.
+#: Number of kinds of motion, by the range of the expected output near a sample.
 _KINDS = 16
-#: Shares of the farthest samples at which the scatter is measured, for the tail of rough motion.
+#: Tail probabilities at which the scatter is estimated, for rough motion.
 _TAILS = (0.05, 0.01)
-#: So many side by side are no single samples any more.
+#: Largest number of consecutive outliers.
 _LONGEST = 2
-#: Mean rank among all samples, by the motion about them, from which on outliers are due to it.
+#: Mean rank of outliers among all samples by motion, from which on motion causes them.
 _DUE_TO_MOTION = 0.85
-#: Fewer outliers than this show no pattern; one that they have by this chance is none.
+#: Least number of outliers for a test of their pattern, and its p-value.
 _FEW, _BY_CHANCE = 3, 1e-3
-#: From here to the limit there are half as many samples as outliers at most, in standard
-#: deviations: else they are a tail of the noise.
+#: Deviation, in standard deviations, from which on to that of outliers there are at most half as
+#: many samples as outliers; more are a tail of the noise.
 _NEAR = 4.5
 
 
@@ -459,10 +455,10 @@ def _off(values: Array) -> Array:
 
 
 def _far(values: Array, moved: Array, good: Mask, floor: float) -> Array:
-    """Return distances from neighbours, in standard deviations about here and in such motion."""
+    """Return distances from neighbours in local standard deviations, also those by motion."""
     near = _neighbours(values, SIDE)
     off = np.abs(values - np.median(near, axis=1))
-    # A step, a corner or a steep slope leaves the median, but not what its neighbours span.
+    # A step, a corner or a steep slope is off the median, but within the range of its neighbours.
     outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
     scale = np.maximum(np.maximum(_about_here(off, good), _in_such_motion(off, moved, good)),
                        max(floor, 1e-300))

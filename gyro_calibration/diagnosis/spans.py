@@ -9,20 +9,20 @@
 # under the License.
 
 """
-Headings over spans: the change of a reference regressed on what the gyro integrates to.
+Headings over spans: regression of the change of a reference on the integral of the gyro.
 
-The reference errs, and its errors are larger than those of the gyro from sample to sample. So the
-heading of the reference (of a rate, its integral) is observed, and all columns are integrals of a
-rate ``w`` that is the likeliest given both (of a course, that of the gyro; `Spans.corrected`).
-With the output ``y`` and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``, the heading ``psi``
-of the reference is, at points ``t`` and less a constant::
+The errors of the reference are larger than those of the gyro from sample to sample. So the heading
+of the reference (the integral of a reference rate) is the observation, and all columns are
+integrals of the most likely rate ``w`` given both (with a course, that of the gyro;
+`Spans.corrected`). With the output ``y`` and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``,
+the heading ``psi`` of the reference is, at points ``t`` and except for a constant::
 
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
-with ``J`` the integrals. A point is the mean over some samples; the observations are the
-differences between points, so that a gap of the reference is a long span that the gyro bridges.
-How long the spans are, and which parts the noise has, depends on the kind of the reference
-(`Treatment`). The cost grows linearly with the number of spans.
+with the integrals ``J``. A point is the mean over some samples; the observations are the
+differences between points, so that a gap of the reference is a long span. The length of the spans
+and the components of the noise depend on the kind of the reference (`Treatment`). The computing
+time is proportional to the number of spans.
 
 """
 
@@ -42,7 +42,7 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.diagnosis.data_quality import encoder_step, heading_errors, rate_noise_share
 from gyro_calibration.diagnosis.expected_output import angle_of, bridged, integral_of
-from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.logs.log import Array, DEGREE, Log, NORMAL_95
 from gyro_calibration.logs.quality import robust_deviation, white_noise
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE, Channels
@@ -52,45 +52,46 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
-#: Names of the values that every model has.
+#: Names of the values that are always fitted.
 PLAIN = ('scale_factor_error', 'bias', 'time_offset')
-#: Evidence of fewer stretches establishes nothing.
+#: Least effective number of stretches of an established value.
 FEWEST_STRETCHES = 3.0
-#: A point counts no less than one that errs by so many times the usual.
+#: Largest standard deviation of an outlying point, relative to the others.
 _FARTHEST = 10.0
-#: What is not fitted keeps its value to this part of the prior.
+#: Factor of the prior of a value that is not fitted.
 _FIXED = 1e-6
-#: Delays of a reference that are tried first, s.
+#: Trial delays of a reference, s.
 _DELAYS = np.arange(-1.5, 1.501, 0.05)
-#: Noise is no more than this part of the column of a delay, if means over no longer than twice so
-#: many s allow it.
+#: Largest share of noise in the column of a delay, and largest half-width of the means that reduce
+#: it, s.
 _NOISY, _LONGEST = 0.05, 0.5
-#: Passes in which values, and points that stand out, are found robustly.
+#: Number of robust fits of values and outlying points.
 _PASSES = 2
-#: Places of a shaft, rad: readings in one are not independent of each other.
+#: Sector of a shaft, rad, in which encoder readings are not independent.
 _CELL = 10.0 * DEGREE
-#: A gyro rests where its course is lost for so long, s, and its output is as quiet as ever.
+#: Shortest rest of a gyro while its course is lost, s, and largest ratio of its scatter to the
+#: smallest of the log.
 _REST, _QUIET = 3.0, 2.0
 
 
 @dataclass(frozen=True)
 class Treatment:
     """
-    How a kind of reference is compared with the gyro.
+    Settings of the comparison of a kind of reference with the gyro.
 
     Attributes
     ----------
     span : least length, s
-    most : spans of a log, at most
-    prior : standard deviations of scale factor error, bias (rad/s) and delay (s) beforehand
+    most : largest number of spans of a log
+    prior : standard deviations of scale factor error, bias (rad/s) and delay (s)
     walk : smallest and largest angle random walk, in units of `Spans.walk`
-    largest_walk : rad/√s; what vibrates has more white noise than walks
-    cosines : of a bias that wanders
+    largest_walk : largest angle random walk, rad/√s, as white noise may be vibration
+    cosines : number of cosines of the wandering bias
     flicker, random_walk : smallest and largest bias instability and rate random walk, rad/s and
         rad/s/√s; relative to the angle random walk if `relative`
-    relative : whether they are
-    stretch : length of stretches whose scores count as independent, s
-    of_heading : whether the reference errs as a heading; the integral of a rate does not
+    relative : whether they are relative
+    stretch : length of stretches whose scores are independent, s
+    of_heading : whether the reference has errors of a heading, not of an integrated rate
     averaged : whether a point is the mean of a span
 
     """
@@ -109,14 +110,14 @@ class Treatment:
     averaged: bool
 
 
-#: What gyros on wheels are sold with: scale 1 %, bias 1 deg/s, angle random walk of 1.7 deg/√h,
-#: bias instability of 40 deg/h at most; and delays of a course of 1 s.
+#: Data-sheet limits of gyros for vehicles: scale factor 1 %, bias 1 deg/s, angle random walk 1.7
+#: deg/√h, bias instability 40 deg/h; and delays of a course of 1 s.
 COURSE = Treatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 5e-4, 12, (1e-6, 2e-4), None, False,
                    15.0, True, True)
-#: A reference with errors of an instrument; the wander of a gyro is in units of its white noise.
+#: A reference with errors of an instrument; bias wander is relative to the white noise.
 HEADING = Treatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), math.inf, 24, (3e-3, 0.5),
                     (1e-4, 0.1), True, 5.0, True, True)
-#: An encoder on the host of the gyro: a swing looks alike a period later.
+#: An encoder on the host of the gyro; small delays, as a swing agrees again a period later.
 ENCODER = replace(HEADING, prior=(*HEADING.prior[:2], LARGEST_TIME_OFFSET / 1.5))
 RATE = replace(HEADING, of_heading=False, averaged=False, cosines=60)
 
@@ -130,8 +131,8 @@ class Column:
     ----------
     cause : its name
     shapes : of the effect
-    once : whether it happens at one time only
-    positive : whether its value is no less than 0
+    once : whether it is a single event
+    positive : whether its value is at least 0
 
     """
 
@@ -149,16 +150,16 @@ class Spans:
     Attributes
     ----------
     log : with output, time and reference heading
-    channels : what effects look at; the rate is that of the gyro, as corrected so far
+    channels : inputs of the effects; the rate is that of the gyro, as corrected so far
     place : point of each known value of the reference
     at : times of these values, s
     time, heading : of the points, s and rad, shape (n + 1,)
     rests : begin and end row of each stretch at rest
     treatment : of the kind of the reference
     walk : the angle random walk by the white noise of the samples, with that of a reference rate,
-        and by what gyro and reference differ by over a second, the smaller first, rad/√s
-    noisier : noise of a reference rate over that of the gyro
-    delay : by which the stamps of the gyro are late against the reference, s
+        and by the difference of gyro and reference over a second, the smaller first, rad/√s
+    noisier : ratio of the noise of a reference rate to that of the gyro
+    delay : of the stamps of the gyro relative to the reference, s
     by_code : whether the points are changes of the code of an encoder
 
     """
@@ -178,7 +179,7 @@ class Spans:
 
     @property
     def fine(self) -> bool:
-        """Tell whether the reference errs so little that lags and short events show."""
+        """Tell whether the errors of the reference are small enough to show lags and events."""
         return self.treatment.relative
 
     @property
@@ -192,10 +193,10 @@ class Spans:
     @property
     def places(self) -> NDArray[np.intp]:
         """
-        Return the number of the place and sense of the shaft of each observation, shape (n + r,).
+        Return the number of the sector and sense of the shaft of each observation, shape (n + r,).
 
-        An encoder is read in time with the samples. Where a motion repeats in step with them, so
-        does the error of each code change, which stretches in time would take for that many.
+        If a motion repeats synchronously with the samples, the errors of an encoder repeat too.
+        Stretches in time would count them as independent.
 
         """
         middle = self.points(np.asarray(self.channels.heading))
@@ -204,7 +205,7 @@ class Spans:
         return np.unique(keys, return_inverse=True)[1].astype(np.intp)
 
     def points(self, values: Array) -> Array:
-        """Return the means of a signal at the points, its delay taken off, shape (n + 1,)."""
+        """Return the means of a signal at the points, corrected for the delay, shape (n + 1,)."""
         assert self.log.time is not None
         moved = np.interp(self.at + self.delay, self.log.time, values)
         return np.bincount(self.place, moved) / np.bincount(self.place)
@@ -238,8 +239,8 @@ class Spans:
         """
         Return the change of the rate over spans, shape (n,), without much noise.
 
-        A column of noise would hold a delay where it is tried first, with a short interval. So the
-        rate is a mean over as long as its noise needs to be a small part of the column.
+        Noise in this column would bias the delay. So the rate is a mean over a time for which its
+        noise is a small share of the column.
 
         """
         assert self.log.time is not None and self.log.output is not None
@@ -277,12 +278,12 @@ class Spans:
         return self.points(np.asarray(self.channels.rate))
 
     def corrected(self, values: Array) -> Spans:
-        """Return the spans with the rate that scale factor error and bias make of the output."""
+        """Return the spans with the rate corrected for scale factor error, bias and delay."""
         assert self.log.output is not None and self.log.time is not None
         rate: Array = (self.log.output - values[1]) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]))
         turned = angle_of(self.log.time, rate)
-        # of the reference, and between its points of the gyro
+        # the heading of the reference, between its points that of the gyro
         at = self.log.time - moved.delay
         away: Array = self.heading - moved.points(turned)
         if self.fine:
@@ -294,11 +295,11 @@ class Spans:
 
     def _of_both(self, away: Array) -> Array:
         """
-        Return what of the reference's heading less the gyro's, shape (n + 1,), is of the gyro.
+        Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
 
-        The heading that is the likeliest given both has errors that are independent of the
-        difference between both. Columns of it are no noise of what they are to explain; those of
-        a gyro alone are, and of motion that is nearly the same in two columns little else is left.
+        The errors of the most likely heading given both are independent of the difference of both.
+        Columns computed from it are not correlated with the noise of the observations; those of
+        the gyro alone are, which matters if two columns are nearly the same.
 
         """
         if not self.treatment.of_heading:
@@ -323,8 +324,8 @@ class SpanFit:
     causes : in addition to scale factor error, bias and delay
     fit : of the restricted likelihood
     values, covariance : estimates and their cluster-robust covariance
-    stretches_of : effective number of stretches that each value rests on
-    prior : standard deviations of what is known of scale factor error, bias and delay beforehand
+    stretches_of : effective number of stretches that determine each value
+    prior : standard deviations of the prior of scale factor error, bias and delay
 
     """
 
@@ -342,7 +343,7 @@ class SpanFit:
         deviation = math.sqrt(max(self.covariance[place, place], 0.0))
         half = float(student.ppf(0.975, freedom)) * deviation
         prior = self.spans.treatment.prior
-        return min(half, 1.96 * prior[place]) if place < len(prior) else half
+        return min(half, NORMAL_95 * prior[place]) if place < len(prior) else half
 
     @property
     def scale_held(self) -> bool:
@@ -366,13 +367,13 @@ class SpanFit:
 
 def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
     """
-    Lay a log with a reference out in spans.
+    Divide a log with a reference into spans.
 
     Parameters
     ----------
     log : with output, time and a reference
     kind : of the reference
-    prior : standard deviations of (s, b) as of `GyroModel.prior`, where the gyro's type is known
+    prior : standard deviations of (s, b) from `GyroModel.prior`, if the type of gyro is known
 
     """
     assert log.time is not None and log.output is not None
@@ -395,9 +396,8 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
         treatment = replace(treatment, of_heading=True)  # a heading that was differentiated
     at, by_code = time, kind == 'encoder' and encoder_step(reference) > 0.0
     if by_code:
-        # between two samples with different codes the shaft was in the middle between both; of
-        # one code only a range is known, and its error where the shaft rests or turns back is the
-        # same each time that it does so there: no noise, which averages out
+        # between two samples with different codes the shaft was in the middle of both; a single
+        # code gives only a range, and its error at rest or at a reversal is systematic
         at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
         reference = np.append(np.where(np.diff(reference) != 0.0,
                                        0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
@@ -420,10 +420,10 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
 
 
 def _walk(log: Log, white: float, treatment: Treatment) -> tuple[float, float]:
-    """Return bounds of the angle random walk, but for a factor, rad/√s."""
+    """Return bounds of the angle random walk, except for a factor, rad/√s."""
     assert log.time is not None
     walk = white * math.sqrt(float(np.median(np.diff(log.time))))
-    # a vibration is white noise that does not walk, and a filter takes from it what walks
+    # vibration adds white noise without a random walk, and a filter reduces the white noise
     walks = walk, heading_errors(log).both if treatment.relative else walk
     least, most = (min(max(each, 1e-9), treatment.largest_walk) for each in sorted(walks))
     return least, most
@@ -456,15 +456,15 @@ def fit_spans(spans: Spans, causes: Sequence[Column] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
-    A scale factor error that rests on fewer stretches than `FEWEST_STRETCHES` is one with what the
-    reference did there. It is left at 0, and its interval is that of the prior.
+    A scale factor error that is determined by fewer than `FEWEST_STRETCHES` stretches cannot be
+    separated from errors of the reference. It is kept at 0, and its interval is that of the prior.
 
     """
     prior = np.array(spans.treatment.prior)
     free = np.concatenate([prior, np.full(all_columns(spans, causes).shape[1] - 3, np.inf)])
 
     def disagreement(delay: float) -> float:
-        """Return what gyro and reference differ by at a delay, robustly."""
+        """Return the robust difference of gyro and reference at a delay, rad."""
         moved = replace(spans, delay=delay)
         left = _robustly(moved.plain()[:, :2], moved.observed, prior[:2])[1]
         return float(np.mean(np.minimum(np.abs(left[:len(spans.time) - 1]), 10.0 * DEGREE)))
@@ -493,7 +493,7 @@ def all_columns(spans: Spans, causes: Sequence[Column]) -> Array:
 
 
 def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
-    """Return values by weighted least squares, large residuals counting less, and what is left."""
+    """Return values by robust weighted least squares, and the residual."""
     left: Array = observed
     values: Array = np.zeros(columns.shape[1])
     own = np.diag(np.where(prior < np.inf, 1.0 / prior, 0.0))
@@ -508,10 +508,10 @@ def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Arr
 
 
 def _outlying(left: Array) -> Array:
-    """Return the variance of each point in units of the usual one, larger where it stands out."""
+    """Return the relative variance of each point, larger for outliers."""
     point = np.concatenate([[0.0], np.cumsum(left)])
     off = np.abs(point - median_filter(point, 9, mode='nearest'))
-    # what drifts one way is its own median
+    # a monotonic drift is equal to its median
     size = 1.4826 * max(float(np.median(off)), float(np.median(np.abs(np.diff(point, 2))))
                         / math.sqrt(6.0)) + 1e-9
     return np.clip(off / (3.0 * size), 1.0, _FARTHEST) ** 2
@@ -545,7 +545,7 @@ def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array]:
     """
     Return the covariance of the values, not less than the scatter of the scores between stretches.
 
-    Also the effective number of stretches that each value rests on: the squared sum of the
+    Also the effective number of stretches that determine each value: the squared sum of the
     information of the stretches over the sum of its squares.
 
     """
@@ -566,7 +566,7 @@ def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array]:
 
 
 def _effective(cluster: NDArray[np.intp], columns: Array) -> Array:
-    """Return the effective number of clusters on which each column rests."""
+    """Return the effective number of clusters that determine each column."""
     shares = np.array([np.bincount(cluster, part ** 2) for part in columns.T])
     return np.asarray(shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300))
 
@@ -594,10 +594,10 @@ def shared_noise(spans: Spans) -> list[SharedNoise]:
 @dataclass(frozen=True)
 class Whitened:
     """
-    A regression in units of its noise: ordinary least squares of it is generalized least squares.
+    A whitened regression, for which ordinary least squares is generalized least squares.
 
-    What is known beforehand, of values and of the bias that wanders, is rows below those of the
-    observations. Each of them is a stretch of its own.
+    The priors of the values and of the wandering bias are rows after those of the observations.
+    Each of them is a separate stretch.
 
     Attributes
     ----------
@@ -605,7 +605,7 @@ class Whitened:
     plain : columns of scale factor error, bias, delay and causes, then those of the wander
     stretch : of each row
     places : of an encoder, the place of the shaft of each row
-    of_log : the number of stretches of the log; those from it on are known beforehand
+    of_log : number of stretches of the log; those after them are priors
 
     """
 
@@ -629,11 +629,11 @@ def whitened(done: SpanFit, causes: Sequence[Column], noise: SpanFit | None = No
 
     Parameters
     ----------
-    done : the log, and what is known beforehand
+    done : the log and the prior
     causes : the columns in addition to scale factor error, bias and delay
-    noise : the fit whose noise is taken; `done` where it is None
-    most : whether the rate random walk is the largest that the log allows (upper limit of 95 %),
-        for what is slow is taken for a cause otherwise
+    noise : the fit whose noise is used; None is `done`
+    most : whether to use the upper 95 % limit of the rate random walk, as slow bias wander may
+        pass for a cause otherwise
 
     """
     spans, noise = done.spans, noise or done

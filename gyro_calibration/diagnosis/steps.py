@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""How far a diagnosis is, and what it does."""
+"""Progress of a diagnosis."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from typing import TypeAlias
 
 #: The first step of every diagnosis in time.
 CHECKS = 'checks of the log'
-#: Is given the share of a diagnosis that is done, which never falls, and what begins, in words.
+#: Is called with the share of the work done, which never decreases, and the name of the next step.
 OnProgress: TypeAlias = Callable[[float, str], object]
-#: Is given what begins, in words.
+#: Is called with the name of the next part.
 OnPart: TypeAlias = Callable[[str], object]
-#: A part of a step that has an unknown number of parts takes so much of what is left of the step.
+#: Share of the rest of a step that is assumed for each part, if their number is not known.
 _PART = 0.12
 
 

@@ -32,21 +32,21 @@ from gyro_calibration.model.gyro_model import GyroModel, same_effects
 
 _HOUR = 3600.0
 
-#: Unit of SI -> unit of people and the factor to it, where it is not simply degrees for radians.
+#: SI unit -> displayed unit and the factor to it, except for degrees instead of radians.
 _UNITS = {'1': ('%', 100.0), '1/K': ('%/K', 100.0), 'degC': ('°C', 1.0),
           'rad/√s': ('deg/√h', math.sqrt(_HOUR) / DEGREE),
           'rad/s/√s': ('deg/h/√h', _HOUR ** 1.5 / DEGREE), 'K/s': ('K/min', 60.0)}
-#: Parameters that people read in another unit than others of the same unit of SI.
+#: Parameters with another displayed unit than others of the same SI unit.
 _PARAMETERS = {'bias_instability': ('deg/h', _HOUR / DEGREE),
                'rate_ramp': ('deg/s/h', _HOUR / DEGREE), 'k': ('s', 1.0), 'unit_error': ('', 1.0),
                'outliers': ('', 1.0), 'stuck_samples': ('', 1.0), 'dropped_samples': ('', 1.0)}
-#: (unit, below this many, the finer unit, how many of it).
+#: (unit, value below which a finer unit is used, finer unit, factor to it).
 _FINER = (('s', 0.5, 'ms', 1e3), ('%', 0.01, 'ppm', 1e4))
 _RADIANS = re.compile(r'(/?)rad([²³]?)')
 
 
 def for_people(unit: str, parameter: str = '') -> tuple[str, float]:
-    """Return the unit that people read instead of one of SI, and the factor to it."""
+    """Return the displayed unit for an SI unit, and the factor to it."""
     if parameter in _PARAMETERS or unit in _UNITS:
         return _PARAMETERS.get(parameter) or _UNITS[unit]
     radians = _RADIANS.search(unit)
@@ -59,13 +59,13 @@ def for_people(unit: str, parameter: str = '') -> tuple[str, float]:
 @dataclass(frozen=True)
 class Quantity:
     """
-    An estimate in the unit and with the digits that people read.
+    An estimate as text, in the displayed unit and with its significant digits.
 
     Attributes
     ----------
-    value, interval : both without the power; the interval is empty where there is none
-    power : such as × 10⁻⁵; empty where there is none
-    unit : of people
+    value, interval : both without the power of ten; the interval is empty without one
+    power : such as × 10⁻⁵; empty without one
+    unit : as displayed
 
     """
 
@@ -105,7 +105,7 @@ def quantity(estimate: Estimate, parameter: str = '') -> Quantity:
     power = _power(max((abs(number) for number in numbers if math.isfinite(number)), default=0.0))
     value, low, high = (number / 10.0 ** power for number in numbers)
     width = high - low
-    # those that show two digits of the deviation
+    # two digits of the half-width of the interval
     decimals = (min(max(0, 1 - math.floor(math.log10(0.5 * width))), 8)
                 if 0.0 < width < math.inf else None)
     interval = f'{_fixed(low, decimals)} to {_fixed(high, decimals)}' if width > 0.0 else ''
@@ -120,7 +120,7 @@ def _finer(unit: str, factor: float, value: float, parameter: str) -> tuple[str,
 
 
 def _power(largest: float) -> int:
-    """Return the power of ten to write after numbers up to this one: 0 if readable without."""
+    """Return the power of ten to write after numbers up to this one: 0 if not needed."""
     return 0 if largest == 0.0 or 1e-4 <= largest < 1e6 else math.floor(math.log10(largest))
 
 
@@ -176,16 +176,16 @@ def chance(probability: float) -> str:
     return f'1 in {float(f"{1.0 / probability:.2g}"):,.0f}'.replace(',', ' ')
 
 
-#: Lines for a terminal are not longer.
+#: Largest length of lines for a terminal.
 _WIDTH = 120
-#: So many causes are named in one sentence.
+#: Largest number of causes in one sentence.
 _NAMED = 3
 _FIGURES = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
             'rate_random_walk': 'rad/s/√s'}
 
 
 def clean(text: str) -> str:
-    """Return a text, such as a file name, without what steers a terminal or breaks a page."""
+    """Return a text, such as a file name, without control characters."""
     plain = text.encode(errors='replace').decode()
     return ''.join('\ufffd' if unicodedata.category(each) in ('Cc', 'Cf') else each
                    for each in plain)
@@ -213,7 +213,7 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
     """Return two sentences: what the simulation gets wrong, and what the extended model gains."""
     if diagnosis.verdict == 'mismatched':
         (found,) = diagnosis.findings
-        return found.cause, f'Nothing else can be named before that is corrected: {found.remedy}.'
+        return found.cause, f'No cause can be named until this is corrected: {found.remedy}.'
     if diagnosis.verdict == 'adequate':
         return ('Simulation and measurement differ by no more than noise.',
                 _gained(diagnosis))
@@ -257,7 +257,7 @@ def verdict(diagnosis: Diagnosis) -> str:
 
 
 def divided(diagnosis: Diagnosis) -> str:
-    """Return which part of the heading error is fitted in any case, and which the causes are."""
+    """Return the shares of refitted values and of named causes in the heading error."""
     shares = diagnosis.heading_shares
     named = {each.effect for each in diagnosis.findings if each.status == 'established'}
     if not (shares and named):
@@ -280,7 +280,7 @@ def sizes(found: Finding) -> dict[str, Quantity]:
 
 
 def _share(share: float) -> str:
-    """Return a part of the whole in percent; the smallest ones read alike."""
+    """Return a share in percent, at least 0.1 %."""
     return ('less than 0.1 %' if share < 1e-3 else f'{100.0 * share:.0f} %' if share >= 0.1
             else f'{number(100.0 * share, 2)} %')
 
@@ -329,7 +329,7 @@ def _values(model: GyroModel) -> str:
 
 
 def change(errors: Change, unit: str, what: str) -> str:
-    """Return what becomes of an error, as the end of a sentence."""
+    """Return the change of an error, as the end of a sentence."""
     before, after = (amount(value, unit) for value in (errors.before, errors.after))
     if errors.interval is None:
         return (f'changes {what} from {before} to {after} rms; one part was held out, so there '
@@ -342,10 +342,10 @@ def change(errors: Change, unit: str, what: str) -> str:
             'includes zero')
 
 
-# one by one
+# single causes
 
 def shown_by(found: Finding) -> list[str]:
-    """Return what there is to say of a cause, apart from its size: a sentence each."""
+    """Return description and evidence of a cause, a sentence each."""
     return [sentence(text) for text in (found.cause, found.evidence) if text.strip()]
 
 
@@ -366,7 +366,7 @@ def remedy(found: Finding, diagnosis: Diagnosis) -> str:
 
 
 def alternatives(found: Finding) -> str:
-    """Return what else it could be, and what would distinguish them; empty where it is sure."""
+    """Return the alternatives and the experiment that would distinguish them; '' without any."""
     if not found.ambiguous_with:
         return ''
     others = listed([spoken(name) for name in found.ambiguous_with], 'or')
@@ -386,7 +386,7 @@ def smallest(found: Finding) -> str:
 
 
 def unknown(each: Unexplained) -> str:
-    """Return what is known of structure that no cause explains."""
+    """Return share and probability of structure that no cause explains."""
     share = _share(each.share_of_variance)
     return (f'Along {spoken(each.along)}: {share} of the variance of the residual; probability by '
             f'noise alone: {chance(each.p_value)}.')

@@ -35,21 +35,21 @@ REFERENCE_TEMPERATURE = 25.0
 REFERENCE_SUPPLY = 5.0
 Shapes = dict[str, float]
 
-#: What is a finding only beside a model that says otherwise.
+#: Effects that are findings only if a model differs from them.
 AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk',
                    'bias_instability', 'rate_random_walk')
 #: Counted effects, and the number that is just detectable: more than occur by chance.
 COUNTED = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
-#: Steps that are sized by the variance that they add, which a test of the variance would just see.
+#: Quantization, whose added variance is just detectable by a test of the variance.
 STEPPED = ('quantization', 'reference_quantization')
-#: What adds no column of its own.
+#: Effects without a column.
 WITHOUT_COLUMN = {*AGAINST_A_MODEL, *COUNTED, *STEPPED, 'unit_error'}
 
 
 @dataclass(frozen=True)
 class Form:
     """
-    How an effect is drawn and what it does.
+    How an effect is drawn and what it adds.
 
     Attributes
     ----------
@@ -60,8 +60,8 @@ class Form:
     stage : where it acts
     linear : the error is in proportion to the size
     signed : the size may be negative
-    most : (sessions) -> the largest size that still makes sense
-    once : it happens in one of several recordings only; `shapes` has its number as 'run'
+    most : (sessions) -> the largest reasonable size
+    once : it is in one of several recordings only; `shapes` has its number as 'run'
 
     """
 
@@ -143,7 +143,7 @@ def _saturation(session: Session, w: np.ndarray, limit: float, shapes: Shapes) -
 
 def seen(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0,
          bandwidth: float = 0.0) -> np.ndarray:
-    """Return the rate as a delayed and slow gyro with a clock of its own sees it."""
+    """Return the rate that a gyro with delay, bandwidth and clock rate error senses."""
     if not bandwidth:
         return session.motion.rate((1.0 + clock_rate) * session.time - time_offset)
     finer = 8

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What else in the catalogue looks like what is hidden, as far as these recordings can tell."""
+"""Similarity of a hidden effect to other effects of the catalogue in some recordings."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from gyro_calibration_bench.hidden.noise import NoiseFigures
 from gyro_calibration_bench.hidden.size import Columns, Metric, thinned
 import numpy as np
 
-#: A slip has any time, and a tone any frequency: enough of them explain anything.
+#: Effects with any time or frequency, several of which would explain any column.
 ANYTHING = {'reference_slip', 'interference_tone'}
-#: Samples that are averaged to one: what looks alike in fifths of a second looks alike.
+#: Number of samples that are averaged to one.
 THIN = 10
 
 
@@ -55,7 +55,7 @@ class Likeness:
         self._always = list(range(len(self._metric.nuisances)))
 
     def shares(self, hidden: Columns, without: str = '') -> dict[str, float]:
-        """Return the share of a column that each effect alone explains beside bias and scale."""
+        """Return the share of a column that each effect explains in addition to bias and scale."""
         total, along = self._measure(hidden)
         start = self._explained(along, self._always)
         best: dict[str, float] = {}
@@ -86,7 +86,7 @@ class Likeness:
 
 
 def _candidates(name: str, sessions: list[Session]) -> Iterator[list[Columns]]:
-    """Go through the columns that an effect may have, those that go together side by side."""
+    """Give the columns that an effect may have, in groups."""
     for shapes in _shapes(name, sessions):
         for size in _sizes(name, sessions):
             phases = ([{'phase': 0.0}, {'phase': 0.5 * math.pi}]

@@ -72,7 +72,7 @@ class Cause:
     minimum_detectable : size that is just detected alone; for saturation a limit, for a figure of
         the noise a change; nan without meaning
     multiple : of the minimum detectable effect, that is hidden
-    apart : the multiple that remains beside the other hidden effects
+    apart : the multiple that is independent of the other hidden effects
     likeness : of an effect outside the catalogue, the share that the best effect in it explains
     likeness_of_three : the same for the best three
 
@@ -107,7 +107,7 @@ class Cause:
 @dataclass(frozen=True)
 class Gyro:
     """
-    A hidden gyro: what can be recorded again under other conditions.
+    A hidden gyro, which can be recorded again under other conditions.
 
     Attributes
     ----------
@@ -344,7 +344,7 @@ def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:
 
 
 def _apart(causes: list[Cause], sizing: _Sizing) -> tuple[Cause, ...]:
-    """Tell of each cause that has a column what the others leave of its multiple."""
+    """Return the causes with the multiples that are independent of the other causes."""
     shown = [cause for cause in causes if cause.name not in WITHOUT_COLUMN]
     if not shown:
         return tuple(causes)
@@ -520,7 +520,7 @@ def _turning_rows(each: Session, count: int, generator: np.random.Generator,
 
 
 def _expected(gyro: Gyro, bias: float, expected: NoiseFigures | None) -> dict[str, float]:
-    """Return what a model says that knows all but what is hidden."""
+    """Return the values of a model without the hidden effects."""
     figures = expected or gyro.figures
     return {'bias': bias, 'scale_factor_error': gyro.scale_factor_error,
             'angle_random_walk': figures.angle_random_walk,

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What is won by who knows the truth."""
+"""The improvement with the truth known."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class OracleGain:
 def oracle_gain(log: HiddenLog, rows: slice | np.ndarray = slice(None),
                 window: float = 60.0) -> OracleGain:
     """
-    Return what the gyro's model gains by all that is hidden, known exactly.
+    Return the improvement of the gyro's model by the exact hidden effects.
 
     Parameters
     ----------

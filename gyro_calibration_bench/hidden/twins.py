@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Twins: conditions under which two causes are confounded, and those that distinguish them."""
+"""Look-alikes: conditions under which two causes are confounded, or distinguishable."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ import numpy as np
 @dataclass(frozen=True)
 class Twins:
     """
-    Two causes of one column.
+    Two causes that have the same column under some conditions.
 
     Attributes
     ----------
-    alike : words for `session`, so that they cannot be distinguished
-    apart : words for `session`, so that they can; None where no recording with this reference can
-    given : recordings -> shapes and signs of effects, where only these are alike
-    multiple : of the minimum detectable effect, at which they are alike there and distinct here
-    figures : of a gyro whose noise makes it so; any where it is None
-    longer : the parting recording is so many times as long
-    against_a_model : they show only beside a model that knows bias and scale
+    alike : arguments of `session` under which they are confounded
+    apart : arguments of `session` under which they are distinguishable; None if no recording with
+        this reference is
+    given : recordings -> shapes and signs of effects, if only these are confounded
+    multiple : of the minimum detectable effect
+    figures : noise of the gyro; None for any
+    longer : ratio of the durations of the separating and the first recording
+    against_a_model : they show only if a model has bias and scale factor error
 
     """
 

@@ -58,11 +58,11 @@ def test_a_reference_is_a_column_of_a_log():
     assert set(REFERENCES) <= set(QUANTITIES)
 
 
-#: What physics wants for each pair of twins, in their order.
+#: Words of the experiment for each pair of twins, in their order.
 WANTED = dict(zip(TWINS, [
     'heat and cool', 'heat and cool', 'rest for', 'whole turns', 'at eight speeds', 'motor',
-    'axis up, level, down', 'beyond', 'quick reversals', 'corners', 'corners', 'again', 'again',
-    'step the supply', 'axis up', 'whole turns']))
+    'axis up, level, down', 'beyond', 'quick reversals', 'abrupt changes', 'abrupt changes',
+    'again', 'again', 'step the supply', 'axis up', 'whole turns']))
 
 
 @pytest.fixture(name='laid', scope='module')

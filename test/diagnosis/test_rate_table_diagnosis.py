@@ -107,7 +107,7 @@ def test_a_true_model_is_adequate_and_stays_as_it_is():
     assert found.verdict == 'adequate' and found.gain is None and found.model is model
 
 
-# sets, and what parts them
+# sets, and what separates them
 
 def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(without_gain):
     generator, truth = np.random.default_rng(4), gyro('sine_response', 0.25)
@@ -289,8 +289,8 @@ def test_columns_of_a_table_that_are_not_used_are_not_reported_as_missing(withou
     log = Log(output=table.output, reference_rate=table.rate, temperature=table.temperature,
               supply=steady, specific_force=steady)
     told = diagnose_table(log, None).cannot_show
-    assert ('alone are looked at' in told['supply_sensitivity']
-            and 'alone are looked at' in told['acceleration_sensitivity'])
+    assert ('only rates and temperatures' in told['supply_sensitivity']
+            and 'only rates and temperatures' in told['acceleration_sensitivity'])
     assert not [reason for reason in told.values() if 'holds no' in reason]
 
 

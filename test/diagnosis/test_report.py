@@ -338,7 +338,7 @@ def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
     text = report(replace(whole, model=whole.before, gain=None, findings=(),
                           unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
     assert ('data-name="after"' in report(whole) and 'data-name="after"' not in text
-            and 'as extended' not in text)
+            and 'before the extension, and up to' not in text)
 
 
 @pytest.mark.parametrize('value, interval, unit, words', [
