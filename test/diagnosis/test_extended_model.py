@@ -138,7 +138,7 @@ def test_a_second_tone_is_not_reported_as_in_the_model():
     found = diagnosed(log, model)
     assert names(found) == ['interference_tone'] and not is_inside(found.findings[0], found)
     assert found.model.terms == model.terms and 'It is in the extended model' not in report(found)
-    assert any('interference tone happens once: it is not in the extended model' in remark
+    assert any('interference tone occurs once: it is not in the extended model' in remark
                for remark in found.remarks)
 
 
