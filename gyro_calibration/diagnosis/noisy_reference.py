@@ -208,7 +208,7 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
             value -= constant.estimate
             deviation = math.hypot(deviation, constant.deviation)
         effective = float(done.stretches_of[place])
-        freedom = max(effective - 1.0, 1.0)
+        freedom = float(done.freedom[place])
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
         share = 1.0 if name == 'time_offset' and own_clock else _OF_VALUE[name]
         if chance >= share * rate or effective < FEWEST_STRETCHES:

@@ -42,7 +42,7 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.diagnosis.data_quality import encoder_step, heading_errors, rate_noise_share
 from gyro_calibration.diagnosis.expected_output import angle_of, bridged, integral_of
-from gyro_calibration.logs.log import Array, DEGREE, Log, NORMAL_95
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_95
 from gyro_calibration.logs.quality import robust_deviation, white_noise
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE, Channels
@@ -325,6 +325,7 @@ class SpanFit:
     fit : of the restricted likelihood
     values, covariance : estimates and their cluster-robust covariance
     stretches_of : effective number of stretches that determine each value
+    freedom : degrees of freedom of the deviation of each value
     prior : standard deviations of the prior of scale factor error, bias and delay
 
     """
@@ -335,11 +336,12 @@ class SpanFit:
     values: Array
     covariance: Array
     stretches_of: Array
+    freedom: Array
     prior: Array
 
     def half(self, place: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
-        freedom = max(self.stretches_of[place] - 1.0, 1.0)
+        freedom = self.freedom[place]
         deviation = math.sqrt(max(self.covariance[place, place], 0.0))
         half = float(student.ppf(0.975, freedom)) * deviation
         prior = self.spans.treatment.prior
@@ -536,33 +538,57 @@ def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
     fit = noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
     values = fit.values.copy()
     values[2] += spans.delay
-    done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)), prior)
-    covariance, effective = _cluster_robust(whitened(done, causes), fit)
-    return replace(done, covariance=covariance, stretches_of=effective)
+    done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
+                   np.ones(len(values)), prior)
+    covariance, effective, freedom = _cluster_robust(whitened(done, causes), fit)
+    return replace(done, covariance=covariance, stretches_of=effective, freedom=freedom)
 
 
-def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array]:
+def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array, Array]:
     """
     Return the covariance of the values, not less than the scatter of the scores between stretches.
 
+    Nor less than what the values change by without each place of a shaft (jackknife, Tukey 1958).
+    A value may be determined by a few places only, such as the turning points of a swing at an
+    even rate, and then takes up most of their errors, so that what the fit leaves there is too
+    small.
+
     Also the effective number of stretches that determine each value: the squared sum of the
-    information of the stretches over the sum of its squares.
+    information of the stretches over the sum of its squares; and the degrees of freedom.
 
     """
     count, stretch = len(fit.values), data.stretch
     values = np.linalg.lstsq(data.plain, data.observed, rcond=None)[0]
     left = data.observed - data.plain @ values
     influence = data.plain @ np.linalg.pinv(data.plain.T @ data.plain)[:, :count]
-    found, inside = np.diag(fit.covariance), stretch < data.of_log
-    for cluster in (stretch, *data.places):
-        scores = np.array([np.bincount(cluster, part * left) for part in influence.T])
-        number = (_effective(cluster[inside], influence[inside]) if cluster is not stretch
-                  else float(cluster.max()) + 1.0)
-        found = np.maximum(found, np.sum(scores ** 2, axis=1) * number / np.maximum(
-            number - 1.0, 0.5))
-    larger = np.sqrt(found / np.diag(fit.covariance))
+    inside = stretch < data.of_log
+    scores = np.array([np.bincount(stretch, part * left) for part in influence.T])
+    number = float(stretch.max()) + 1.0
+    found = np.maximum(np.diag(fit.covariance), np.sum(scores ** 2, axis=1) * number / max(
+        number - 1.0, 0.5))
     effective = _effective(stretch[inside], data.plain[inside, :count])
-    return fit.covariance * np.outer(larger, larger), effective
+    freedom = np.maximum(effective - 1.0, 1.0)
+    for cluster in data.places:
+        rests_on = _effective(cluster[inside], influence[inside])
+        scatter = _jackknife(data, cluster, inside)[:count]
+        freedom = np.where(scatter > found, np.maximum(rests_on - 1.0, 1.0), freedom)
+        found = np.maximum(found, scatter)
+    larger = np.sqrt(found / np.diag(fit.covariance))
+    return fit.covariance * np.outer(larger, larger), effective, freedom
+
+
+def _jackknife(data: Whitened, cluster: NDArray[np.intp], inside: Mask) -> Array:
+    """Return the variance of the values by what they are without each cluster in turn."""
+    rows = np.column_stack([data.plain, data.observed])
+    scale = np.sqrt(np.sum(rows ** 2, axis=0)) + 1e-300
+    rows = rows / scale
+    whole, without = rows.T @ rows, []
+    for number in np.unique(cluster[inside]):
+        own = rows[cluster == number]
+        gram = whole - own.T @ own
+        without.append(np.linalg.pinv(gram[:-1, :-1], hermitian=True) @ gram[:-1, -1])
+    parts = len(without)
+    return np.asarray((parts - 1) * np.var(without, axis=0) * (scale[-1] / scale[:-1]) ** 2)
 
 
 def _effective(cluster: NDArray[np.intp], columns: Array) -> Array:

@@ -22,7 +22,7 @@ from gyro_calibration.diagnosis.data_quality import (
 from gyro_calibration.diagnosis.noisy_reference import search
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.spans import fit_spans, spans_of
+from gyro_calibration.diagnosis.spans import Column, fit_spans, spans_of
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.logs.recording import interpolated
@@ -294,6 +294,26 @@ def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
               reference_heading=np.floor(heading / step) * step)
     fit, found = search(fit_spans(spans_of(log, 'encoder')), 0.01, lambda words: None)
     assert not fit.causes and not any(each.established for each in found)
+
+
+def test_intervals_hold_nothing_where_few_turning_points_of_a_swing_show_it():
+    # at an even rate each way, scale, cubic and once a revolution differ at the turns alone
+    generator, time = np.random.default_rng(12), np.arange(0.0, 220.0, 0.01)
+    sigmas = []
+    for start in range(6):
+        period = generator.choice([8.0, 10.0, 12.0])
+        knots = period * np.array([0.0, 0.04, 0.46, 0.54, 0.96, 1.0])
+        size = 69.0 * DEGREE / (0.46 * period) * np.array([0.0, 1.0, 1.0, -1.0, -1.0, 0.0])
+        rate = np.interp(time % period, knots, size)
+        heading = np.cumsum(rate) * 0.01 - 0.005 * rate + generator.uniform(-np.pi, np.pi)
+        log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
+                  reference_heading=np.floor(heading / (0.4 * DEGREE)) * 0.4 * DEGREE)
+        for name in ('cubic_nonlinearity', 'reference_once_per_rev'):
+            found = fit_spans(spans_of(log, 'encoder'), [Column(name)])
+            sigmas += [1.96 * found.values[place] / found.half(place)
+                       for place in range(3, len(found.values))]
+            sigmas.append(1.96 * (found.values[0] - 0.004) / found.half(0))
+    assert np.sqrt(np.mean(np.square(sigmas))) < 1.3, np.round(sigmas, 1)
 
 
 @pytest.mark.parametrize('seed', [1, 2])
