@@ -518,15 +518,16 @@ def rate_noise_share(log: Log) -> float:
     if len(rate) < 100 or not np.ptp(rate) > 0.0:
         return 0.0
     line = np.polyfit(rate, output, 1)
-    fast, left = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
-    blocks = len(fast) // _BLOCK
-    energy = np.sum(fast[: blocks * _BLOCK].reshape(blocks, _BLOCK) ** 2, axis=1)
-    # selected by the blocks on both sides, as a block that is quiet itself may be so by chance;
-    # one with far more energy than these is a motion between two rests
-    sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
-    most = np.quantile(sides, min(max(_QUIETEST, 8.0 / blocks), 1.0))
-    quiet = np.repeat((sides <= most) & (energy <= 3.0 * most), _BLOCK)
-    fast, left = fast[: len(quiet)][quiet], left[: len(quiet)][quiet]
+    every, rest = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
+    # a quick swing may have no three blocks in a row without a reversal, but as many half as long
+    fast = left = every[:0]
+    for block in (_BLOCK, _BLOCK // 2):
+        quiet = _quiet(every, block)
+        part = every[: len(quiet)][quiet]
+        if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
+            fast, left = part, rest[: len(quiet)][quiet]
+    if not len(fast):
+        return 0.0
     energy_of_fast = float(fast @ fast)
     variance = energy_of_fast / len(fast) / 20.0
     if not (variance > 0.0 and float(fast[1:] @ fast[:-1]) < _WHITE * energy_of_fast):
@@ -538,3 +539,14 @@ def rate_noise_share(log: Log) -> float:
             return 0.0
     gyro = float(np.mean(left**2)) / 20.0 - variance * line[0] ** 2
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
+
+
+def _quiet(fast: Array, block: int) -> Mask:
+    """Tell which third differences of a rate are in blocks that are most quiet."""
+    blocks = len(fast) // block
+    energy = np.sum(fast[: blocks * block].reshape(blocks, block) ** 2, axis=1)
+    # by the blocks on both sides, for those that are quiet themselves are so by chance; one with
+    # far more energy than these is a motion between two rests
+    sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
+    most = np.quantile(sides, min(max(_QUIETEST, 8.0 / blocks), 1.0))
+    return np.asarray(np.repeat((sides <= most) & (energy <= 3.0 * most), block))

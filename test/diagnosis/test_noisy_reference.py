@@ -254,6 +254,17 @@ def test_the_noise_of_a_reference_rate_is_seen_in_the_only_short_rest():
         assert limits(log, reference_of(log)) and not limits(exact, reference_of(exact))
 
 
+@pytest.mark.parametrize('interval', [0.05, 0.1])
+def test_the_noise_of_a_reference_rate_is_seen_between_two_quick_reversals(interval):
+    def to_and_fro(time):
+        return np.interp(time % 10.0, [0.0, 0.1, 4.9, 5.1, 9.9, 10.0], [0, 1, 1, -1, -1, 0])
+
+    for seed in range(3):
+        log = swing(seed, to_and_fro, 1e-4, interval)
+        assert rate_noise_share(log) == pytest.approx(0.3, rel=0.4)
+        assert rate_noise_share(replace(log, reference_rate=to_and_fro(log.time))) < 1e-3
+
+
 def test_a_fine_encoder_and_an_exact_rate_are_taken_as_they_are():
     hidden = hide_beside([], 0.0, np.random.default_rng(2), Imperfect('encoder', 0.0055))
     log = log_of(hidden)
