@@ -456,8 +456,11 @@ def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Arra
     weights /= weights.sum()
     shared = run + np.outer(ratios ** 2 * stated, (0.0, 1.0))
     gains = shared / total[:, None]
-    within = (covariance + np.diag([0.0, stated * float(weights @ ratios ** 2)])
-              - (shared * (weights / total)[:, None]).T @ shared)
+    # the form of Joseph, which rounding does not make negative
+    kept = np.eye(2) - np.einsum('ki,j->kij', gains, (0.0, 1.0))
+    priors = covariance + np.einsum('k,ij->kij', ratios ** 2 * stated, np.diag([0.0, 1.0]))
+    within = (np.einsum('k,kia,kab,kjb->ij', weights, kept, priors, kept)
+              + variance * (weights[:, None] * gains).T @ gains)
     return weights @ gains, within + rate ** 2 * np.cov(gains.T, aweights=weights, ddof=0)
 
 

@@ -72,8 +72,8 @@ def test_a_value_beside_a_model_is_what_comes_on_top_of_it():
                       noise=Noise(WHITE / np.sqrt(RATE)))
     found = diagnose([log], np.random.default_rng(4), model)
     bias = next(each for each in found.findings if each.effect == 'bias').parameters['bias']
-    assert bias.estimate == pytest.approx(0.002,
-                                          rel=0.05) and 'adds' in found.findings[0].evidence
+    assert bias.estimate == pytest.approx(0.002, rel=0.05)
+    assert 'adds to the value of the model' in found.findings[0].evidence
     assert found.model.terms[0].values[0] == pytest.approx(0.02 + bias.estimate)
 
 

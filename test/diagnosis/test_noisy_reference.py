@@ -125,7 +125,7 @@ def turning_once(seed):
 @pytest.mark.parametrize('seed', range(2))
 def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate(seed):
     found = diagnosed(turning_once(seed), kind='course')
-    assert 'fewer than three stretches' in ' '.join(found.remarks)
+    assert 'Fewer than three stretches' in ' '.join(found.remarks)
     follow = {'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
               'reference_once_per_rev'}
     assert not follow & {each.effect for each in found.findings}, lines(found)

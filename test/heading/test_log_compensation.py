@@ -158,7 +158,7 @@ def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(tmp_path, run):
     code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
                         '--out', tmp_path / 'out.csv')
     assert code == 0 and all(words in text for words in (
-        'no supply voltage', 'no reference heading', 'saturation: At the limit'))
+        'no supply voltage', 'no reference heading', 'saturation: An output at the limit'))
 
 
 @pytest.mark.parametrize('name, value',
