@@ -27,7 +27,7 @@ import math
 from pathlib import Path
 import sys
 
-from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.logs.log import DEGREE
 import numpy as np
 
@@ -44,7 +44,7 @@ CHECKS = {'kvh_1750': 'CRC-32', 'fizoptika': 'sum, 16 bits', 'kvh_ecore': 'sum, 
 
 def arrived(name: str, share: float, full_scale: float | None) -> list[float]:
     """Return the rates that arrive, rad/s, and as the first one that which a good line gives."""
-    protocol, generator = find(name), np.random.default_rng(1)
+    protocol, generator = find_protocol(name), np.random.default_rng(1)
     settings = replace(Settings(sensitivity=DEGREE / 27880.0 if name == 'fizoptika' else None),
                        full_scale=full_scale)
     encode, decoder = protocol.encoder(settings), protocol.decoder(settings)

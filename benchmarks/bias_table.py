@@ -94,7 +94,8 @@ def sizes_row(number: int, gyros: int) -> str:
     for coefficients, turn_ons in SIZES.values():
         bias_table._SIZES = np.array([(each, other) for each in coefficients
                                       for other in turn_ons])
-        bias_table._MET = np.outer(list(coefficients.values()), list(turn_ons.values())).ravel()
+        bias_table._SIZE_PROBABILITIES = np.outer(list(coefficients.values()),
+                                                  list(turn_ons.values())).ravel()
         generators = [np.random.default_rng([200 + number, gyro]) for gyro in range(gyros)]
         asked = np.array([answers(each, curve(each, size), **given) for each in generators])
         for place in (0, 4):

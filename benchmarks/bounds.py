@@ -24,7 +24,7 @@ import math
 from drives import Drive
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 
 #: Longest time that is one step of the filter, s.
@@ -48,7 +48,7 @@ def knows_errors_and_rests(drive: Drive) -> Array:
 
 
 def _true_rate(drive: Drive) -> Array:
-    return (drive.output - drive.bias) / (1.0 + drive.gyro.true[0])
+    return (drive.output - drive.bias) / (1.0 + drive.gyro.true_values[0])
 
 
 def knows_rests(drive: Drive) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -92,7 +92,7 @@ def _calibrated(drive: Drive) -> tuple[Array, Array]:
     mean, covariance = np.zeros(_SIZE), np.diag([0.0, 0.1 ** 2, DEGREE ** 2,
                                                  *np.full(len(_CONSTANTS), flicker)])
     corners = np.searchsorted(time, np.arange(0.0, time[-1] + 1e-9, 0.1) - 1e-9)
-    said, true = integrate(time, output)[corners], CALIBRATION.heading_at(time[corners])
+    said, true = integrate(time, output)[corners], CALIBRATION_MOTION.heading_at(time[corners])
     for duration, gyro, turned in zip(np.diff(time[corners]), np.diff(said), np.diff(true)):
         mean, covariance = _measured(mean, covariance, _seen(turned / duration),
                                      (gyro - turned) / duration,

@@ -31,14 +31,14 @@ import os
 from pathlib import Path
 import sys
 
-from gyro_calibration.calibration.dwells import Dwells, from_table, take
+from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.compensation import (
     compensate,
-    covariance,
     quadratic_form,
     rate_sensitivity,
+    uncertainty_covariance,
 )
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
@@ -58,7 +58,7 @@ def judge(model: GyroModel, dwells: Dwells) -> tuple[float, float]:
     """Return the error, deg/s, and the root mean square of z of the sweeps."""
     done = compensate(model, dwells.output, dwells.temperature)
     error = done.rate - dwells.rate
-    deviation = np.sqrt(quadratic_form(covariance(model), rate_sensitivity(
+    deviation = np.sqrt(quadratic_form(uncertainty_covariance(model), rate_sensitivity(
         model, dwells.output, done.rate, done.temperature)) + 0.0 * error)
     sweeps = [dwells.sweep == number for number in np.unique(dwells.sweep)]
     return rms(error) / DEGREE, rms([error[part].mean() / deviation[part].mean()
@@ -78,7 +78,7 @@ def least_squares_error(seen: Dwells, unseen: Dwells) -> float:
     rate = unseen.output
     for _ in range(50):
         rate = rate + unseen.output - output(
-            found.x, Dwells(rate, rate, unseen.temperature, rate, unseen.sweep, unseen.place))
+            found.x, Dwells(rate, rate, unseen.temperature, rate, unseen.sweep, unseen.location))
     return rms(rate - unseen.rate) / DEGREE
 
 
@@ -86,9 +86,9 @@ def of_recording(dwells: Dwells) -> Iterator[tuple[Dwells, Dwells, bool]]:
     """Give campaigns, what comes after them, and whether that is faster."""
     for first, count in PARTS:
         inside = (dwells.sweep >= first) & (dwells.sweep < first + count)
-        after = take(dwells, dwells.sweep >= first + count)
+        after = select_dwells(dwells, dwells.sweep >= first + count)
         for fastest in FASTEST:
-            yield (take(dwells, inside & (np.abs(dwells.rate) < fastest * DEGREE)), after,
+            yield (select_dwells(dwells, inside & (np.abs(dwells.rate) < fastest * DEGREE)), after,
                    fastest < FASTEST[-1])
 
 
@@ -126,8 +126,8 @@ def line(name: str, campaigns: Iterator[tuple[Dwells, Dwells, bool]]) -> str:
     found: list[tuple[float, ...]] = []
     for seen, unseen, faster in campaigns:
         model = select_effects(seen).calibration.model
-        slow = take(unseen, np.abs(unseen.rate) <= np.abs(seen.rate).max() + 1e-9)
-        same = take(seen, seen.sweep % 4 < 2), take(seen, seen.sweep % 4 >= 2)
+        slow = select_dwells(unseen, np.abs(unseen.rate) <= np.abs(seen.rate).max() + 1e-9)
+        same = select_dwells(seen, seen.sweep % 4 < 2), select_dwells(seen, seen.sweep % 4 >= 2)
         inside = judge(select_effects(same[0]).calibration.model, same[1])
         found.append((*judge(model, unseen), judge(model, slow)[1], inside[1],
                       least_squares_error(seen, unseen), faster))
@@ -143,7 +143,7 @@ def main(count: int) -> None:
           '| z in range | hotter | hotter and faster |\n|---|---|---|---|---|---|---|')
     folder = os.environ.get('GYRO_CALIBRATION_DATA')
     if folder:
-        dwells = from_table(read_log(Path(folder) / 'fog_rate_table' / 'table.csv'))
+        dwells = dwells_from_table(read_log(Path(folder) / 'fog_rate_table' / 'table.csv'))
         print(line('recording', of_recording(dwells)), flush=True)
     for name, sine in (('simulated, open-loop', True), ('simulated, MEMS', False)):
         print(line(name, of_simulation(count, sine)), flush=True)

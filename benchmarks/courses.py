@@ -35,7 +35,7 @@ from pathlib import Path
 import sys
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.logs.log import Array, DataRefused, Log, part, read_log
+from gyro_calibration.logs.log import Array, DataRefused, Log, read_log, select_rows
 import numpy as np
 
 DEGREE = math.pi / 180.0
@@ -45,7 +45,8 @@ WINDOW, STEP, LAGS, POINT = 60.0, 15.0, np.arange(-100, 101) * 0.02, 0.1
 
 def half(log: Log, second: bool) -> Log:
     """Return the first or the second half of a log."""
-    return part(log, (log.time > log.time[0] + 0.5 * (log.time[-1] - log.time[0])) == second)
+    return select_rows(log, (log.time > log.time[0] + 0.5 *
+                             (log.time[-1] - log.time[0])) == second)
 
 
 def points(log: Log, lag: float, bias: float = 0.0,

@@ -33,9 +33,9 @@ prints each failed one, and ``--out`` writes all of them as JSON, one a line. Pa
                   of the Allan deviation); and N with effects at each multiple, in turn
 
     What is suspected only does not count, but for the column `suspected`, which has such names a
-    log; of what happens once (`methods.ONCE`), which is never established, it does. The figures:
-    `detected`, something is reported; `first`, the strongest finding has the right name; `in
-    set`, each hidden cause is a finding or in the set of one; `set size`, of the findings that
+    log; of what happens once (`methods.SINGLE_EVENTS`), which is never established, it does. The
+    figures: `detected`, something is reported; `first`, the strongest finding has the right name;
+    `in set`, each hidden cause is a finding or in the set of one; `set size`, of the findings that
     hold a hidden cause; `extra`, findings that hold none, a log; `beyond`,
     structures without a name, a log; `right`, each hidden cause is found or in a set of at most
     three, and nothing else is reported; `interval`, the size lies in its 95 % interval, of those
@@ -70,10 +70,16 @@ sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
 from diagnosed import diagnosis_of, judged_findings, won  # noqa: E402
 from gyro_calibration.diagnosis.findings import Finding  # noqa: E402
-from gyro_calibration_bench.cases import Case, cases, made, PARTS, source  # noqa: E402
+from gyro_calibration_bench.cases import (  # noqa: E402
+    Case,
+    make_logs,
+    part_cases,
+    PARTS,
+    random_source,
+)
 from gyro_calibration_bench.hidden import Cause  # noqa: E402
-from gyro_calibration_bench.methods import reported  # noqa: E402
-from gyro_calibration_bench.scores import Judged  # noqa: E402
+from gyro_calibration_bench.methods import reported_findings  # noqa: E402
+from gyro_calibration_bench.scores import Judgement  # noqa: E402
 import numpy as np  # noqa: E402  (after the number of its threads is set)
 
 
@@ -87,7 +93,7 @@ class Answer:
     findings: Sequence[Mapping[str, Any]]
     problem: str
     seconds: float
-    how: Judged
+    how: Judgement
     gain: Mapping[str, tuple[float, float]]
     right: bool
     suspected: Sequence[str]
@@ -97,26 +103,26 @@ class Answer:
 
 def answered(case: Case, seed: int) -> Answer:
     """Run a case; one that fails in whatever way is a row of the table, and not the end of it."""
-    generator = source(case, seed)
-    logs = made(case, generator)
+    generator = random_source(case, seed)
+    logs = make_logs(case, generator)
     hidden = logs[0]
     begin, found, problem = time.process_time(), None, ''
     try:
-        found = diagnosis_of(logs, generator, case.against_a_model)
+        found = diagnosis_of(logs, generator, case.has_model)
     except Exception as raised:
         problem = f'{type(raised).__name__}: {raised}'
     seconds = time.process_time() - begin
     findings, beyond = ([], []) if found is None else (
-        reported(found.findings), [each.along for each in found.unexplained])
+        reported_findings(found.findings), [each.along for each in found.unexplained])
     suspected = [] if found is None else [each.effect for each in found.findings
                                           if each not in findings]
     how = judged_findings(hidden, findings, beyond, case.allowed)
-    return Answer(str(case), case.row,
+    return Answer(str(case), case.table_row,
                   {cause.name: _told(cause) for cause in hidden.truth.gyro.causes},
                   [_answer(each) for each in findings], problem, seconds, how,
                   won(hidden, found) if found is not None and hidden.truth.names
                   and case.part not in ('references', 'separated') else {},
-                  how.right and not problem, suspected)
+                  how.is_right and not problem, suspected)
 
 
 def _told(cause: Cause) -> dict[str, Any]:
@@ -139,18 +145,22 @@ HEADER = ('| hidden | logs | detected | first | in set | set size | extra | beyo
 
 def line(row: str, answers: Sequence[Answer]) -> str:
     """Return a row of the table in Markdown, in percent where it is a share."""
-    sizes = [size for each in answers for size in each.how.set_sizes]
-    held = [value for each in answers for value in each.how.held.values()]
-    cells = [row, str(len(answers)), _percent([each.how.detected for each in answers])]
-    hidden = [_percent([getattr(each.how, name) for each in answers])
+    sizes = [size for each in answers for size in each.judgement.set_sizes]
+    held = [value for each in answers for value in each.judgement.interval_holds.values()]
+    cells = [row, str(len(answers)), _percent([each.judgement.is_detected for each in answers])]
+    hidden = [_percent([getattr(each.judgement, name) for each in answers])
               for name in ('first', 'in_set')]
-    cells += hidden if any(each.hidden for each in answers) else ['', '']
-    cells += [f'{np.mean(sizes):.2f}' if sizes else '',
-              f'{np.mean([len(each.how.extra) for each in answers]):.3f}',
-              f'{np.mean([len(each.how.beyond) for each in answers]):.3f}',
-              f'{np.mean([len(each.suspected) for each in answers]):.3f}',
-              _percent([each.right for each in answers]), _percent(held), _share(answers, 'rate'),
-              _share(answers, 'heading'), f'{np.mean([each.seconds for each in answers]):.1f}']
+    cells += hidden if any(each.has_hidden for each in answers) else ['', '']
+    cells += [
+        f'{np.mean(sizes):.2f}' if sizes else '',
+        f'{np.mean([len(each.judgement.false_names) for each in answers]):.3f}',
+        f'{np.mean([len(each.judgement.unexplained_variables) for each in answers]):.3f}',
+        f'{np.mean([len(each.suspected) for each in answers]):.3f}',
+        _percent([each.is_right for each in answers]),
+        _percent(held),
+        _share(answers, 'rate'),
+        _share(answers, 'heading'), f'{np.mean([each.seconds for each in answers]):.1f}'
+    ]
     return f'| {" | ".join(cells)} |'
 
 
@@ -166,11 +176,11 @@ def _share(answers: Sequence[Answer], name: str) -> str:
 
 def failing(answer: Answer) -> str:
     """Return what went wrong in a case, in a line or two."""
-    hidden = ', '.join(f'{name} {_short(each)}' for name, each in answer.hidden.items())
+    hidden = ', '.join(f'{name} {_short(each)}' for name, each in answer.has_hidden.items())
     said = [f'{"|".join([each["effect"], *each["ambiguous_with"]])} p={each["p_value"]:.1e} '
             f'{_short(each["parameters"])}' for each in answer.findings]
-    said += [f'unexplained along {along}'
-             for along in answer.how.beyond] + [answer.problem] * bool(answer.problem)
+    said += [f'unexplained along {along}' for along in answer.judgement.unexplained_variables
+             ] + [answer.problem] * bool(answer.problem)
     return (f'{answer.case}\n    hidden: {hidden or "nothing"}\n'
             f'    answer: {"; ".join(said) or "nothing"}')
 
@@ -200,7 +210,9 @@ def main(words: Sequence[str] | None = None) -> None:
     print(f'seed {given.seed}, {given.logs} logs of each kind\n\n{HEADER}\n|---|{"---:|" * 13}',
           flush=True)
     for part in given.part:
-        chosen = [case for case in cases(part, given.logs) if re.search(given.only, str(case))]
+        chosen = [
+            case for case in part_cases(part, given.logs) if re.search(given.only, str(case))
+        ]
         _print(_run(chosen, given))
 
 
@@ -208,7 +220,7 @@ def _run(chosen: Sequence[Case], given: argparse.Namespace) -> Iterator[Answer]:
     """Run cases, in some processes, and keep them in a file."""
     with get_context('fork').Pool(given.processes) as pool:
         for answer in pool.imap(partial(answered, seed=given.seed), chosen):
-            if given.verbose and not answer.right:
+            if given.verbose and not answer.is_right:
                 print(failing(answer), file=sys.stderr, flush=True)
             if given.out:
                 with open(given.out, 'a') as file:

@@ -18,7 +18,7 @@ from functools import partial
 
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.motion import CALIBRATION, Motion, ROBOT
+from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import GOOD_MEMS, Preset, RD2100, XV3500
 import numpy as np
@@ -163,7 +163,7 @@ class Course:
 
 #: The first is that of `reproduction.hong_park`, whose gyro comes fresh.
 COURSES = {
-    'robot, 160 s': Course(lambda generator: of_motion(ROBOT), 0.0),
+    'robot, 160 s': Course(lambda generator: of_motion(ROBOT_MOTION), 0.0),
     'random, 160 s': Course(partial(random_path, 160.0)),
     'random, 30 min': Course(partial(random_path, 1800.0)),
 }
@@ -173,10 +173,10 @@ def simulate(gyro: Preset, course: Course, generator: np.random.Generator) -> Dr
     """Return what a gyro says of a calibration and of a course after it."""
     way = begun_any_time(course.path(generator), generator)
     every, before = round(gyro.interval / STEP), round(course.warm / gyro.interval)
-    begin = of_motion(CALIBRATION)
+    begin = of_motion(CALIBRATION_MOTION)
     rate = np.concatenate([begin.rate[:-1], way.rate])[::every]
-    count, first = len(rate), round(CALIBRATION.duration / gyro.interval)
-    noise, (s, b) = gyro.model.noise, gyro.true
+    count, first = len(rate), round(CALIBRATION_MOTION.duration / gyro.interval)
+    noise, (s, b) = gyro.model.noise, gyro.true_values
     white = simulate_noise(Noise(noise.angle_random_walk), count, gyro.interval, generator)
     slow = Noise(0.0, noise.bias_instability, noise.rate_random_walk)
     bias = b + simulate_noise(slow, before + count, gyro.interval, generator)[before:]

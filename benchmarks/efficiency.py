@@ -41,12 +41,12 @@ import sys
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.motion import CALIBRATION, from_headings, Motion
+from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_from_headings
 import numpy as np
 
 INTERVAL = 0.01
 TIME = np.arange(2001) * INTERVAL
-HEADING, RATE = CALIBRATION.heading_at(TIME), CALIBRATION.rate_at(TIME)
+HEADING, RATE = CALIBRATION_MOTION.heading_at(TIME), CALIBRATION_MOTION.rate_at(TIME)
 SCALE_FACTOR_ERROR, BIAS = 0.03, 0.5 * DEGREE
 #: Step of the encoder, rad, and standard deviation of the noise of one sample of the rate, rad/s.
 CASES = {'0.088 deg, 0.02 deg/s': (0.088 * DEGREE, 0.02 * DEGREE),
@@ -101,7 +101,8 @@ def errors(step: float, noise: float, seed: int) -> Array:
     """Return the errors of (s, b) of each method in one run, shape (methods, 2)."""
     generator = np.random.default_rng([seed, round(1e6 * step), round(1e6 * noise)])
     rate = (1.0 + SCALE_FACTOR_ERROR) * RATE + BIAS + noise * generator.standard_normal(len(TIME))
-    motion = from_headings(TIME, np.round((HEADING + generator.uniform(0.0, step)) / step) * step)
+    motion = motion_from_headings(TIME,
+                                  np.round((HEADING + generator.uniform(0.0, step)) / step) * step)
     return np.array([method(TIME, rate, motion) for method in METHODS.values()]) - (
         SCALE_FACTOR_ERROR, BIAS)
 

@@ -28,7 +28,7 @@ import sys
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.logs.log import Array, DEGREE, Log
-from gyro_calibration.model.motion import from_rates, Motion
+from gyro_calibration.model.motion import Motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 
@@ -48,7 +48,7 @@ def swing(duration: float, generator: np.random.Generator, half: float = 4.0) ->
     knots = (starts[:, None] + (0.0, 0.3, half - 0.7, half - 0.4)).ravel()
     speeds = np.where(np.arange(len(starts)) % 2, -1.0,
                       1.0) * generator.uniform(55.0, 65.0, len(starts)) * DEGREE
-    return from_rates(knots, (speeds[:, None] * (0.0, 1.0, 1.0, 0.0)).ravel())
+    return motion_from_rates(knots, (speeds[:, None] * (0.0, 1.0, 1.0, 0.0)).ravel())
 
 
 def simulated(noise: Noise, drift: float, generator: np.random.Generator,

@@ -35,16 +35,16 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from drives import begun_any_time, GYROS, of_motion, random_path, STEP
-from gyro_calibration.calibration.self_calibration import record, self_calibrate
+from gyro_calibration.calibration.self_calibration import self_calibrate, to_model_record
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import Preset
 import numpy as np
@@ -89,23 +89,23 @@ class Drive:
 def simulate(gyro: Preset, interval: float, duration: float,
              generator: np.random.Generator) -> Drive:
     """Return a drive with the calibration before it; one that is refused is run again."""
-    begin, way = of_motion(CALIBRATION), begun_any_time(random_path(duration, generator),
-                                                        generator)
+    begin, way = of_motion(CALIBRATION_MOTION), begun_any_time(random_path(duration, generator),
+                                                               generator)
     coarse = np.concatenate([begin.rate[:-1], way.rate])
     time = np.arange(round((len(coarse) - 1) * STEP / interval) + 1) * interval
     true = np.interp(time, np.arange(len(coarse)) * STEP, coarse)
-    s, b = gyro.true
-    first = round(CALIBRATION.duration / interval)
+    s, b = gyro.true_values
+    first = round(CALIBRATION_MOTION.duration / interval)
     while True:
         output = (1.0 + s) * true + b + simulate_noise(gyro.model.noise, len(true), interval,
                                                        generator)
         try:
-            fit = self_calibrate(time[:first + 1], output[:first + 1], CALIBRATION,
+            fit = self_calibrate(time[:first + 1], output[:first + 1], CALIBRATION_MOTION,
                                  noise=gyro.model.noise)
             break
         except DataRefused:
             continue
-    calibration = record(fit, 'likelihood', '', None)
+    calibration = to_model_record(fit, 'likelihood', '', None)
     model = replace(gyro.model, terms=(), self_calibration=calibration)
     heading = integrate(time[first:], true[first:])
     return Drive(time[first:] - time[first], np.asarray(calibration.correct(output[first:])),
@@ -132,8 +132,10 @@ def stamped(time: Array, number: Array, stamps: str, interval: float,
     clock = SampleClock(1.0 / interval, MODULUS if stamps == 'sequence' else 0)
     pieces = np.split(number, np.flatnonzero(np.diff(come) > 0.0) + 1)
     ends = come[np.cumsum([len(piece) for piece in pieces]) - 1]
-    found = [clock.stamp([Sample(0.0, sequence=int(each) % MODULUS) for each in piece], float(end))
-             for piece, end in zip(pieces, ends)]
+    found = [
+        clock.stamp_samples([Sample(0.0, sequence=int(each) % MODULUS) for each in piece],
+                            float(end)) for piece, end in zip(pieces, ends)
+    ]
     return np.concatenate([np.array(stamps) for stamps in found])
 
 
@@ -146,8 +148,8 @@ def errors(drive: Drive, fault: Fault, generator: np.random.Generator) -> tuple[
                     drive.rate[comes])
     sensitivity, still = (rate_sensitivity(drive.model, value, value, 25.0)
                           for value in (rate, 0.0))
-    found = track(stamps, rate, sensitivity, drive.model.noise, covariance(drive.model),
-                  Settings(), still=still)
+    found = track(stamps, rate, sensitivity, drive.model.noise,
+                  uncertainty_covariance(drive.model), Settings(), still=still)
     looks = np.searchsorted(drive.time[comes], np.arange(LOOK, drive.time[-1] + 0.5 * LOOK,
                                                          LOOK)).clip(max=len(rate) - 1)
     return (found.heading - drive.heading[comes])[looks], found.variance[looks]

@@ -30,21 +30,34 @@ import time
 from typing import Any
 
 from fleet_tasks import calibrate
-from gyro_calibration.calibration.self_calibration import Reference, self_calibrate
-from gyro_calibration.diagnosis.expected_output import bridged
+from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_calibrate
+from gyro_calibration.diagnosis.expected_output import bridge_gaps
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.fleet.pooling import DRIVES, Observed, Pooled, POWER_ONS, SLOPES, UNITS
-from gyro_calibration.fleet.run import finished, Lost, processes
-from gyro_calibration.fleet.summary import counted, lacking, models, summarized
-from gyro_calibration.fleet.table import entries
-from gyro_calibration.fleet.work import done, slow_effects, Task
+from gyro_calibration.fleet.pooling import (
+    DRIVES,
+    Observations,
+    PooledValue,
+    POWER_ONS,
+    SLOPES,
+    UNITS,
+)
+from gyro_calibration.fleet.run import process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.summary import (
+    build_models,
+    count_effects,
+    find_missing_effects,
+    summarize_types,
+)
+from gyro_calibration.fleet.table import find_logs
+from gyro_calibration.fleet.work import fit_slow_effects, LogTask, process_log
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.logs.log import Array, DEGREE, Log, part, read_log
+from gyro_calibration.logs.log import Array, DEGREE, Log, read_log, select_rows
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.motion import from_rates
+from gyro_calibration.model.motion import motion_from_rates
 import numpy as np
 from numpy.random import Generator
+from scipy.special import ndtri
 from scipy.stats import beta
 
 #: Units, drives; standard deviations between units, drives and power-ons, and the stated error;
@@ -54,7 +67,7 @@ FLEETS = ((5, 4, 0.44, 0.0, 0.01, 0.02, 0.5), (5, 4, 0.3, 0.5, 0.1, 0.7, 0.1),
 Fleet = tuple[int, int, float, float, float, float, float]
 
 
-def drawn(generator: Generator, fleet: Fleet) -> tuple[Observed, Array]:
+def drawn(generator: Generator, fleet: Fleet) -> tuple[Observations, Array]:
     """Return values of a fleet whose type has the mean 3, and the true values of its units."""
     units, drives, between, common, power_on, error, own = fleet
     unit, drive = np.indices((units, drives)).reshape(2, -1)
@@ -64,7 +77,7 @@ def drawn(generator: Generator, fleet: Fleet) -> tuple[Observed, Array]:
              + power_on * generator.standard_normal(len(unit))
              + np.sqrt(own) * sigma * generator.standard_normal(len(unit))
              + np.sqrt(1.0 - own) * error * generator.standard_normal(drives)[drive])
-    return Observed(value, sigma, unit, drive), true
+    return Observations(value, sigma, unit, drive), true
 
 
 def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
@@ -80,15 +93,15 @@ def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
         estimates = []
         for _ in range(fleets):
             observed, values = drawn(generator, fleet)
-            pooled = Pooled(observed)
+            pooled = PooledValue(observed)
             found = pooled.components
             for name, value in true.items():
                 held[name].append(found[name].low <= value <= found[name].high)
             estimates.append([found[name].estimate for name in true])
             for name, wanted, value in (
-                    ('mean', pooled.wanted(), np.array([3.0])),
-                    ('unit', pooled.wanted(unit=np.arange(units)), values),
-                    ('new', pooled.wanted(units=1.0),
+                    ('mean', pooled.linear_functions(), np.array([3.0])),
+                    ('unit', pooled.linear_functions(unit=np.arange(units)), values),
+                    ('new', pooled.linear_functions(units=1.0),
                      3.0 + between * generator.standard_normal(1))):
                 interval = pooled.estimate(wanted)
                 held[name].extend((interval.low < value) & (value < interval.high))
@@ -108,7 +121,9 @@ def drives(folder: str, out: str = '') -> Iterator[str]:
 
     """
     with tempfile.TemporaryDirectory() as new:
-        records = [done(Task(entry, out or new)) for entry in entries([f'{folder}/rc_car_*'])]
+        records = [
+            process_log(LogTask(entry, out or new)) for entry in find_logs([f'{folder}/rc_car_*'])
+        ]
     units, named = (sorted({each[key] for each in records}) for key in ('unit', 'drive'))
     unit, drive = (np.array([names.index(each[key]) for each in records])
                    for names, key in ((units, 'unit'), (named, 'drive')))
@@ -146,19 +161,21 @@ def first(folder: str, out: str = '') -> Iterator[str]:
 
     """
     with tempfile.TemporaryDirectory() as new:
-        records = [done(Task(entry, out or new)) for entry in entries([f'{folder}/rc_car_*'])]
+        records = [
+            process_log(LogTask(entry, out or new)) for entry in find_logs([f'{folder}/rc_car_*'])
+        ]
     error: dict[str, list[float]] = {}
     for record in records:
         log = read_log(record['log'])
         offset = record['values']['time_offset']['value']
         assert log.time is not None and log.reference_heading is not None
         begin = log.time[np.isfinite(log.reference_heading)][0]
-        short = part(log, (log.time >= begin) & (log.time <= begin + 20.0))
+        short = select_rows(log, (log.time >= begin) & (log.time <= begin + 20.0))
         others = [each for each in records if each['drive'] != record['drive']]
-        (of_type,), (of_unit,) = (summarized(each) for each in (
+        (of_type,), (of_unit,) = (summarize_types(each) for each in (
             [each for each in others if each['unit'] != record['unit']], others))
-        given = {'none': None, 'type': dict(models(of_type))[''],
-                 'unit': dict(models(of_unit))[record['unit']]}
+        given = {'none': None, 'type': dict(build_models(of_type))[''],
+                 'unit': dict(build_models(of_unit))[record['unit']]}
         for name, model in given.items():
             found = diagnose([short], np.random.default_rng(0), model).model
             for how, used in (('20 s', found), ('model alone', model)):
@@ -177,7 +194,7 @@ def first(folder: str, out: str = '') -> Iterator[str]:
 def _error_over(log: Log, model: GyroModel, begin: float, offset: float) -> float:
     """Return by how much the heading is off after 60 s, rad, as means over 5 s of course."""
     assert log.time is not None and log.reference_heading is not None
-    turned = integrate(log.time, bridged(compensate_log(model, log)))
+    turned = integrate(log.time, bridge_gaps(compensate_log(model, log)))
     known = np.isfinite(log.reference_heading)
     at, course = log.time[known], log.reference_heading[known]
     left = np.interp(at + offset, log.time, turned) - course
@@ -188,10 +205,12 @@ def _error_over(log: Log, model: GyroModel, begin: float, offset: float) -> floa
 def _predicted(value: Array, sigma: Array, unit: Any, drive: Any, left: Any, known: bool
                ) -> tuple[Array, Array]:
     """Return errors of predicted values of the logs that are left out, and whether they hold."""
-    pooled = Pooled(Observed(value[~left], sigma[~left], unit[~left], drive[~left] if known
-                             else np.unique(drive[~left], return_inverse=True)[1]))
-    wanted = (pooled.wanted(unit=unit[left], drive=drive[left], error=sigma[left], power_ons=1.0)
-              if known else pooled.wanted(unit=unit[left], error=sigma[left], power_ons=1.0,
+    pooled = PooledValue(
+        Observations(value[~left], sigma[~left], unit[~left],
+                     drive[~left] if known else np.unique(drive[~left], return_inverse=True)[1]))
+    wanted = (pooled.linear_functions(unit=unit[left], drive=drive[left], error=sigma[left],
+                                      power_ons=1.0) if known else pooled.linear_functions(
+                                          unit=unit[left], error=sigma[left], power_ons=1.0,
                                           drives=1.0))
     found = pooled.estimate(wanted)
     return (value[left] - found.value,
@@ -217,16 +236,16 @@ def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
                                                                          len(observed))])
             columns = columns - columns.mean(axis=0)
             true = mean + between * generator.standard_normal((fleet[0], 2))
-            pooled = Pooled(replace(
+            pooled = PooledValue(replace(
                 observed, value=observed.value + np.sum(true[observed.unit] * columns, axis=1),
-                columns=columns, slopes=2))
+                columns=columns, slope_count=2))
             for name, value in spreads.items():
                 of = pooled.components[name]
                 held.setdefault(name, []).append(of.low <= value <= of.high)
             for place in range(2):
                 row = np.eye(3)[1 + place:2 + place]
-                of_type = pooled.estimate(pooled.wanted(fixed=row))
-                of_units = pooled.estimate(pooled.wanted(
+                of_type = pooled.estimate(pooled.linear_functions(fixed=row))
+                of_units = pooled.estimate(pooled.linear_functions(
                     unit=np.arange(fleet[0]), fixed=np.tile(row, (fleet[0], 1)), part=1 + place))
                 for name, interval, value in (('type', of_type, mean[place:place + 1]),
                                               ('units', of_units, true[:, place])):
@@ -274,10 +293,11 @@ def alarms(generator: Generator, fleets: int = 100) -> Iterator[str]:
     for units, count in ((5, 4), (16, 3), (30, 2)):
         found = 0
         for _ in range(fleets):
-            (each,) = summarized(_records(generator, units, count))
-            found += bool(lacking(each)) or any(one.owner for one in counted(each)) or any(
-                one.outlying_units or one.outlying_drives or one.changed
-                for one in each.values.values())
+            (each,) = summarize_types(_records(generator, units, count))
+            found += bool(find_missing_effects(each)) or any(
+                one.owner for one in count_effects(each)) or any(
+                    one.outlying_units or one.outlying_drives or one.changes
+                    for one in each.values.values())
         yield (f'| {units}, {count} | {fleets} | {found} | '
                f'{100.0 * beta.ppf(0.95, found + 1, fleets - found):.1f} % |')
 
@@ -289,11 +309,11 @@ def smallest(generator: Generator, fleets: int = 20) -> Iterator[str]:
     for units in (5, 10, 20, 40, 80, 160):
         sizes = []
         for _ in range(fleets):
-            observed = Observed(generator.standard_normal(units), np.full(units, 0.3),
-                                np.arange(units), np.full(units, -1))
-            pooled = Pooled(observed)
-            found = pooled.estimate(pooled.wanted(), level=0.99)
-            sizes.append(0.5 * float(found.high[0] - found.low[0]))
+            observed = Observations(generator.standard_normal(units), np.full(units, 0.3),
+                                    np.arange(units), np.full(units, -1))
+            pooled = PooledValue(observed)
+            found = pooled.estimate(pooled.linear_functions())
+            sizes.append(float(ndtri(0.995) * found.deviation[0]))
         yield f'| {units} | {np.mean(sizes):.3g} | {np.mean(sizes) * np.sqrt(units):.3g} |'
 
 
@@ -311,7 +331,7 @@ def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]
     """Give how often a ramp is found by one log and by ten, and none where it is wander."""
     ramp = 'rate_ramp'
     level = 0.01
-    usual = [slow_effects(_log(generator, 0.0), names=[ramp])[ramp]['deviation']
+    usual = [fit_slow_effects(_log(generator, 0.0), names=[ramp])[ramp]['deviation']
              for _ in range(10)]
     size = 1.2 * 4.8 * float(np.median(usual))
     yield f'A ramp of 1.2 times 4.8 deviations of a usual log, {size:.2g} rad/s².'
@@ -322,13 +342,13 @@ def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]
                        ('a quarter', 0.25 * size), ('none: wander', 0.0)):
         single, pooled_found = 0, 0
         for _ in range(fleets):
-            found = [slow_effects(_log(generator, each), names=[ramp])[ramp]
+            found = [fit_slow_effects(_log(generator, each), names=[ramp])[ramp]
                      for _ in range(logs)]
             value, sigma = (np.array([one[what] for one in found])
                             for what in ('value', 'deviation'))
             single += int(np.sum(np.abs(value) > 2.576 * sigma))
-            pooled = Pooled(Observed(value, sigma, np.arange(logs), np.full(logs, -1)))
-            pooled_found += bool(pooled.chance(pooled.wanted())[0] < level)
+            pooled = PooledValue(Observations(value, sigma, np.arange(logs), np.full(logs, -1)))
+            pooled_found += bool(pooled.p_value(pooled.linear_functions())[0] < level)
         yield f'| {name} | {single} of {fleets * logs} | {pooled_found} of {fleets} |'
 
 
@@ -344,11 +364,11 @@ def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
         alone = [_alone()]
         begin = time.process_time()
         done_, lost, memory, used = 0, 0, [], {}
-        with processes(2, preload=['fleet', 'fleet_tasks']) as create:
-            for _, found in finished(calibrate, iter(given), 2, create):
-                lost += isinstance(found, Lost)
-                done_ += not isinstance(found, Lost)
-                if not isinstance(found, Lost):
+        with process_executors(2, preload=['fleet', 'fleet_tasks']) as create:
+            for _, found in run_tasks(calibrate, iter(given), 2, create):
+                lost += isinstance(found, WorkerLost)
+                done_ += not isinstance(found, WorkerLost)
+                if not isinstance(found, WorkerLost):
                     used[found[1]] = found[2]
                 if (done_ + lost) % (count // 4) == 0:
                     memory.append(_memory())
@@ -379,7 +399,7 @@ def prior(generator: Generator, runs: int = 40) -> Iterator[str]:
     """Give the errors of runs of 20 s of one more unit, without and with the prior of its type."""
     spread, slip = np.array([0.003, 0.05 * DEGREE]), 0.0058
     times = np.arange(0.0, 20.0, 0.02)
-    motion = from_rates(times, 0.5 * np.sin(2.0 * np.pi * times / 10.0))
+    motion = motion_from_rates(times, 0.5 * np.sin(2.0 * np.pi * times / 10.0))
     yield '| | scale factor error, rms, % | held | bias, rms, deg/s | held |'
     yield '|---|---:|---:|---:|---:|'
     found: dict[str, list[Any]] = {'without': [], 'with': []}
@@ -389,7 +409,7 @@ def prior(generator: Generator, runs: int = 40) -> Iterator[str]:
         noise = 3e-3 * generator.standard_normal(len(times))
         rate = (1.0 + s) * driven * motion.rate_at(times) + b + noise
         for name, known in (('without', None), ('with', spread)):
-            fit = self_calibrate(times, rate, motion, reference=Reference(slip), prior=known)
+            fit = self_calibrate(times, rate, motion, reference=ReferenceErrors(slip), prior=known)
             error = np.array([fit.scale_factor_error - s, fit.bias - b])
             found[name].append([*error, *(np.abs(error) < 1.96 * np.sqrt(
                 np.diag(fit.covariance)))])

@@ -29,10 +29,15 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 import sys
 
-from gyro_calibration.calibration.likelihood import UNLIKELY
+from gyro_calibration.calibration.likelihood import MIN_FIT_PROBABILITY
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.model.motion import CALIBRATION, from_rates, Motion, turns
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    constant_rate_motion,
+    Motion,
+    motion_from_rates,
+)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
@@ -85,7 +90,7 @@ def drawn(number: int, level: float) -> Run:
                generator.uniform(0.0, 0.2), simulate_noise(noise, len(TIME), INTERVAL, generator))
 
 
-def profile(motion: Motion = CALIBRATION, speed: float = 1.0) -> Array:
+def profile(motion: Motion = CALIBRATION_MOTION, speed: float = 1.0) -> Array:
     """Return the rates over `TIME` of a motion that is played faster, at unchanged rates."""
     return motion.rate_at(speed * TIME)
 
@@ -133,7 +138,7 @@ def another_profile(run: Run) -> Array:
         legs += [(run.generator.uniform(2.0, 5.0),
                   run.generator.uniform(15.0, 60.0) * run.generator.choice([-1.0, 1.0])),
                  (1.0, 0.0)]
-    return run.gyro(run.follow(profile(turns(legs))))
+    return run.gyro(run.follow(profile(constant_rate_motion(legs))))
 
 
 def wrong_sign(run: Run) -> Array:
@@ -194,35 +199,35 @@ def of_scale(factor: float) -> Callable[[Run], Array]:
 
 def one_speed() -> Motion:
     """Return a profile that turns at one speed."""
-    return from_rates(np.array([0.0, 20.0]), np.full(2, 30.0 * DEGREE))
+    return motion_from_rates(np.array([0.0, 20.0]), np.full(2, 30.0 * DEGREE))
 
 
 def scaled(factor: float) -> Motion:
     """Return the profile as it is read in another unit."""
-    assert CALIBRATION.rate is not None
-    return from_rates(CALIBRATION.time, factor * CALIBRATION.rate)
+    assert CALIBRATION_MOTION.rate is not None
+    return motion_from_rates(CALIBRATION_MOTION.time, factor * CALIBRATION_MOTION.rate)
 
 
 #: What was done -> the run, the profile that is believed, and a word that the refusal must hold.
 WAYS: dict[str, tuple[Callable[[Run], Array], Motion, str]] = {
-    'good': (good, CALIBRATION, ''),
-    'good, just as the profile says': (as_the_profile_says, CALIBRATION, ''),
-    'slip of 2 to 15 deg': (slip, CALIBRATION, 'slip or a bump'),
-    'bump of 2 to 15 deg': (bump, CALIBRATION, 'slip or a bump'),
-    'early end': (early_end, CALIBRATION, 'robot stopped'),
-    'another profile': (another_profile, CALIBRATION, 'otherwise than the profile'),
-    'wrong sign': (wrong_sign, CALIBRATION, 'the other way'),
-    'twice the rate': (twice_the_rate, CALIBRATION, 'twice its rate'),
-    'twice as fast': (twice_as_fast, CALIBRATION, 'times as fast'),
-    'dead gyro': (dead, CALIBRATION, 'dead'),
-    'noise alone': (noise_alone, CALIBRATION, 'did the robot move'),
-    'twenty times the noise': (noisy, CALIBRATION, 'as noisy'),
-    'saturated gyro': (saturated, CALIBRATION, 'saturated'),
-    'half the sensitivity': (of_scale(0.5), CALIBRATION, 'half its sensitivity'),
-    'twice the sensitivity': (of_scale(2.0), CALIBRATION, 'twice its sensitivity'),
+    'good': (good, CALIBRATION_MOTION, ''),
+    'good, just as the profile says': (as_the_profile_says, CALIBRATION_MOTION, ''),
+    'slip of 2 to 15 deg': (slip, CALIBRATION_MOTION, 'slip or a bump'),
+    'bump of 2 to 15 deg': (bump, CALIBRATION_MOTION, 'slip or a bump'),
+    'early end': (early_end, CALIBRATION_MOTION, 'robot stopped'),
+    'another profile': (another_profile, CALIBRATION_MOTION, 'otherwise than the profile'),
+    'wrong sign': (wrong_sign, CALIBRATION_MOTION, 'the other way'),
+    'twice the rate': (twice_the_rate, CALIBRATION_MOTION, 'twice its rate'),
+    'twice as fast': (twice_as_fast, CALIBRATION_MOTION, 'times as fast'),
+    'dead gyro': (dead, CALIBRATION_MOTION, 'dead'),
+    'noise alone': (noise_alone, CALIBRATION_MOTION, 'did the robot move'),
+    'twenty times the noise': (noisy, CALIBRATION_MOTION, 'as noisy'),
+    'saturated gyro': (saturated, CALIBRATION_MOTION, 'saturated'),
+    'half the sensitivity': (of_scale(0.5), CALIBRATION_MOTION, 'half its sensitivity'),
+    'twice the sensitivity': (of_scale(2.0), CALIBRATION_MOTION, 'twice its sensitivity'),
     'one speed': (lambda run: run.gyro(run.follow(profile(one_speed()))), one_speed(),
                   'cannot be separated'),
-    **{f'gyro in {name}': (of_scale(factor), CALIBRATION, f'gyro is in {said}')
+    **{f'gyro in {name}': (of_scale(factor), CALIBRATION_MOTION, f'gyro is in {said}')
        for name, (factor, said) in UNITS.items()},
     **{f'profile in {name}': (good, scaled(factor), f'profile in {said}')
        for name, (factor, said) in PROFILES.items()},
@@ -271,8 +276,10 @@ def _coverage(accepted: dict[tuple[str, float], list[tuple[float, ...]]]) -> Ite
     yield '|---|---|---|---|---|'
     for (name, level), errors in accepted.items():
         s, b, probability = np.array(errors).T
-        shares = [100 * np.mean(each)
-                  for each in (np.abs(s) < 1.96, np.abs(b) < 1.96, probability < UNLIKELY)]
+        shares = [
+            100 * np.mean(each)
+            for each in (np.abs(s) < 1.96, np.abs(b) < 1.96, probability < MIN_FIT_PROBABILITY)
+        ]
         yield f'| {name} | {level:g} times | ' + ' | '.join(f'{share:.1f} %'
                                                             for share in shares) + ' |'
 

@@ -44,14 +44,18 @@ import re
 
 import bounds
 from drives import Course, COURSES, Drive, GYROS, simulate, slow_path
-from gyro_calibration.calibration.self_calibration import fit_heading, record, self_calibrate
+from gyro_calibration.calibration.self_calibration import (
+    fit_heading,
+    self_calibrate,
+    to_model_record,
+)
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
-from gyro_calibration.heading.log_compensation import in_hindsight
+from gyro_calibration.heading.log_compensation import smooth_track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
-from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.presets import Preset
 import numpy as np
@@ -89,11 +93,12 @@ def known(gyro: Preset, course: Course, generator: np.random.Generator) -> Known
     while True:
         drive = simulate(gyro, course, generator)
         try:
-            likely = self_calibrate(*drive.run, CALIBRATION, noise=gyro.model.noise)
+            likely = self_calibrate(*drive.run, CALIBRATION_MOTION, noise=gyro.model.noise)
         except DataRefused:
             continue
-        return Known(drive, record(likely, 'likelihood', '', None),
-                     record(fit_heading(*drive.run, CALIBRATION), 'heading', '', None))
+        return Known(
+            drive, to_model_record(likely, 'likelihood', '', None),
+            to_model_record(fit_heading(*drive.run, CALIBRATION_MOTION), 'heading', '', None))
 
 
 # Rows
@@ -119,7 +124,7 @@ def _tracked(known: Known, factor: float = 1.0, wheels: bool = False
     rate = np.asarray(known.likely.correct(drive.output))
     sensitivity, still = (rate_sensitivity(model, drive.output, value, 25.0)
                           for value in (rate, 0.0))
-    tracker = HeadingTracker(noise, covariance(model), Settings(), keep=True)
+    tracker = HeadingTracker(noise, uncertainty_covariance(model), Settings(), keeps_steps=True)
     looks = _looks(drive)
     heading, variance, looked = np.empty(len(rate)), [], set(looks.tolist())
     moving = drive.moving.tolist() if wheels else [None] * len(rate)
@@ -129,7 +134,7 @@ def _tracked(known: Known, factor: float = 1.0, wheels: bool = False
         heading[index] = tracker.heading
         if index in looked:
             variance.append(tracker.variance)
-    later, with_hindsight, _ = in_hindsight(tracker, drive.time, rate)
+    later, with_hindsight, _ = smooth_track(tracker, drive.time, rate)
     return Estimate(heading, np.array(variance)), Estimate(later, with_hindsight[looks])
 
 

@@ -33,7 +33,7 @@ import math
 
 from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import Settings
-from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -222,14 +222,16 @@ def program(one: Gyro, output: np.ndarray, hindsight: bool) -> tuple[np.ndarray,
     """Return headings and variances, live or with hindsight, behind a rest before the drive."""
     first = round(CALIBRATED / one.interval)
     noise = Noise(one.walk, one.instability, one.rate_walk)
-    bias, variance = float(output[:first].mean()), one.walk ** 2 / CALIBRATED + noise.floor ** 2
+    bias, variance = (float(
+        output[:first].mean()), one.walk ** 2 / CALIBRATED + noise.allan_floor ** 2)
     model = GyroModel(noise=noise, self_calibration=SelfCalibration(
         0.0, bias, ((SCALE ** 2, 0.0), (0.0, variance))))
     rest = output[first:]
     rate = np.asarray(model.self_calibration.correct(rest))
     time = np.arange(len(rest)) * one.interval
-    found = track(time, rate, rate_sensitivity(model, rest, rate, 25.0), noise, covariance(model),
-                  Settings(), None, hindsight, 0.0, rate_sensitivity(model, 0.0, 0.0, 25.0))
+    found = track(time, rate, rate_sensitivity(model, rest, rate, 25.0), noise,
+                  uncertainty_covariance(model), Settings(), None, hindsight, 0.0,
+                  rate_sensitivity(model, 0.0, 0.0, 25.0))
     return found.heading, found.variance, found.resting
 
 

@@ -30,9 +30,13 @@ from dataclasses import dataclass
 import math
 import sys
 
-from gyro_calibration.calibration.self_calibration import check_rest, rest_after, self_calibrate
+from gyro_calibration.calibration.self_calibration import (
+    check_rest,
+    find_rest_after,
+    self_calibrate,
+)
 from gyro_calibration.logs.log import DataRefused
-from gyro_calibration.model.motion import from_headings, from_rates
+from gyro_calibration.model.motion import motion_from_headings, motion_from_rates
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -226,16 +230,17 @@ def tried(kind: str, gyro: Gyro, seed: tuple[int, ...]) -> tuple[Array, Array] |
     drift = flicker(gyro.flicker, draw)
     output = ((1.0 + s) * rate + b + drift
               + gyro.white / math.sqrt(STEP) * draw.standard_normal(len(TIME)))
-    motion = from_rates(*breakpoints())
+    motion = motion_from_rates(*breakpoints())
     if kind.startswith('encoder'):
         at = np.arange(0.0, 20.5, 0.05)
         heading = np.interp(at, TIME, np.cumsum(rate) * STEP - 0.5 * STEP * rate)
         step = 0.5 * DEGREE
-        motion = from_headings(at, step * np.floor((heading + draw.uniform(0, step)) / step))
+        motion = motion_from_headings(at, step * np.floor(
+            (heading + draw.uniform(0, step)) / step))
     try:
         noise, run = Noise(gyro.white, gyro.flicker), TIME < 21.0
         fit = self_calibrate(TIME[run], output[run], motion, noise=noise)
-        rest = rest_after(TIME, output, fit, motion)
+        rest = find_rest_after(TIME, output, fit, motion)
         if rest is not None:
             fit = check_rest(TIME[rest], output[rest], fit, noise).fit
     except DataRefused as reason:

@@ -39,7 +39,7 @@ import time
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find, Sample
+from gyro_calibration.driver.protocols import find_protocol, Sample
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, rate_temperature_polynomial, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
@@ -226,7 +226,7 @@ def compare(folder: Path) -> dict[str, dict[int, list[Block]]]:
 def driver_load(rate: int, folder: Path) -> float:
     """Return the load of the driver, % of a core, at a rate of the gyro."""
     samples = (Sample(0.5, None, index / rate) for index in itertools.count())
-    with Emulator(find('kvh_dsp3000'), samples, wait_for_reader=True) as gyro, running(
+    with Emulator(find_protocol('kvh_dsp3000'), samples, wait_for_reader=True) as gyro, running(
             'driver', folder, port=gyro.path) as process:
         while not gyro.sent_bytes:
             time.sleep(0.05)

@@ -35,9 +35,19 @@ from functools import partial
 import sys
 
 from gyro_calibration.calibration.likelihood import fit_likelihood
-from gyro_calibration.calibration.motion_design import Ability, best, Forecast, plain
+from gyro_calibration.calibration.motion_design import (
+    CalibrationForecast,
+    find_best_motion,
+    plain_motion,
+    RobotLimits,
+)
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.motion import CALIBRATION, Motion, ROBOT, turns
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    constant_rate_motion,
+    Motion,
+    ROBOT_MOTION,
+)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
@@ -47,12 +57,12 @@ RATE, DRIVE = 100, 160.0
 LENGTHS = (20.0, 30.0, 60.0, 120.0)
 #: Flicker and its drift begin so long before the run, s.
 BEFORE = 160.0
-DRIVES = {'robot': ROBOT, 'ten rounds': turns([(DRIVE, 22.5)])}
-ABILITIES = {'cable, 180 deg': Ability(60.0 * DEGREE, 120.0 * DEGREE, lowest=-180.0 * DEGREE,
-                                       highest=180.0 * DEGREE),
-             'cable, 20 deg': Ability(60.0 * DEGREE, 60.0 * DEGREE, lowest=-20.0 * DEGREE,
-                                      highest=20.0 * DEGREE),
-             'free': Ability(60.0 * DEGREE, 120.0 * DEGREE)}
+DRIVES = {'robot': ROBOT_MOTION, 'ten rounds': constant_rate_motion([(DRIVE, 22.5)])}
+ABILITIES = {'cable, 180 deg': RobotLimits(60.0 * DEGREE, 120.0 * DEGREE, lowest=-180.0 * DEGREE,
+                                           highest=180.0 * DEGREE),
+             'cable, 20 deg': RobotLimits(60.0 * DEGREE, 60.0 * DEGREE, lowest=-20.0 * DEGREE,
+                                          highest=20.0 * DEGREE),
+             'free': RobotLimits(60.0 * DEGREE, 120.0 * DEGREE)}
 
 
 def followed(motion: Motion, time: Array, late: float, lag: float) -> Array:
@@ -87,13 +97,16 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
                      *(np.abs(heading).mean() for heading in headings)])
 
 
-def forecasts(duration: float) -> list[Forecast]:
-    return [Forecast(XV3500.noise, duration, drive, DRIVE, 0.0) for drive in DRIVES.values()]
+def forecasts(duration: float) -> list[CalibrationForecast]:
+    return [
+        CalibrationForecast(XV3500.noise, duration, drive, DRIVE, 0.0)
+        for drive in DRIVES.values()
+    ]
 
 
 def planned(place: str, duration: float) -> Motion:
-    return best(ABILITIES[place], forecasts(duration)[0], duration,
-                np.random.default_rng(1)).motion
+    return find_best_motion(ABILITIES[place], forecasts(duration)[0], duration,
+                            np.random.default_rng(1)).motion
 
 
 def row(pool: Executor, runs: int, name: str, motion: Motion, late: float = 0.0,
@@ -113,9 +126,9 @@ def main(runs: int) -> None:
     """Print the table."""
     twenty = LENGTHS[0]
     motions = {place: planned(place, twenty) for place in ABILITIES}
-    rows = [('built-in profile', CALIBRATION)]
+    rows = [('built-in profile', CALIBRATION_MOTION)]
     for place, motion in motions.items():
-        rows += [(f'{place}: one turn there and back', plain(ABILITIES[place], twenty)),
+        rows += [(f'{place}: one turn there and back', plain_motion(ABILITIES[place], twenty)),
                  (f'{place}: planned', motion)]
     cable = motions['cable, 180 deg']
     late = [('cable, 180 deg: planned, gyro 20 ms late', cable, 0.02),

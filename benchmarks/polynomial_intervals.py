@@ -60,14 +60,15 @@ def main(tables: int) -> None:
         dwells, output = table(np.random.default_rng(seed))
         found = fit_effects(dwells, [rate_temperature_polynomial(3, 2)])
         model = found.model
-        at = channels_of(dwells).moving(dwells.rate, output)
+        at = channels_of(dwells).with_rate(dwells.rate, output)
         sensitivity = np.array(model.terms[0].sensitivity(at))
         deviation = np.sqrt(np.einsum('ik,ij,jk->k', sensitivity, model.covariance, sensitivity))
         held_rates.append(np.abs(model.error(at) - (output - dwells.rate)) < 1.96 * deviation)
         # the true values in the convention (centre, scale) of this fit
         columns = np.array(model.terms[0].sensitivity(at)).T
         true = np.linalg.lstsq(columns, output - dwells.rate, rcond=None)[0]
-        values = np.array([model.terms[0].values[place] for place in model.terms[0].fitted])
+        values = np.array(
+            [model.terms[0].values[place] for place in model.terms[0].fitted_indices])
         reference.append(np.abs(values - true) < 1.96 * np.sqrt(np.diag(model.covariance)))
         fits.append(np.sqrt(np.diag(model.covariance)))
     by_value = 100.0 * np.mean(reference, axis=0)

@@ -26,10 +26,10 @@ from dataclasses import replace
 import os
 from pathlib import Path
 
-from gyro_calibration.calibration.dwells import Dwells, from_table, take
+from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.scatter import rms
-from gyro_calibration.calibration.selection import select_effects, TECHNOLOGIES
+from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import (
@@ -66,12 +66,12 @@ FITS = {'bias': of(BIAS), 'bias, scale factor': of(BIAS, SCALE_FACTOR_ERROR),
         'polynomial 3,2': of(rate_temperature_polynomial(3, 2)),
         'polynomial 5,2': of(rate_temperature_polynomial(5, 2)),
         **{f'default, {technology or "no technology said"}': chosen(technology)
-           for technology in (None, *TECHNOLOGIES)}}
+           for technology in (None, *TECHNOLOGY_EFFECTS)}}
 
 
 def table(data: Path) -> Dwells:
     """Return all dwells of the recording: outliers are not fitted, but tested on."""
-    return from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
+    return dwells_from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
 
 
 def error(model: GyroModel, dwells: Dwells) -> np.ndarray:
@@ -82,7 +82,8 @@ def error(model: GyroModel, dwells: Dwells) -> np.ndarray:
 
 def left_out(fit: Fit, dwells: Dwells) -> float:
     """Return the root mean square error in sweeps that were left out, rad/s."""
-    parts = [(take(dwells, dwells.sweep != number), take(dwells, dwells.sweep == number))
+    parts = [(select_dwells(dwells, dwells.sweep
+                            != number), select_dwells(dwells, dwells.sweep == number))
              for number in np.unique(dwells.sweep)]
     return rms(np.concatenate([error(fit(seen), unseen) for seen, unseen in parts]))
 
@@ -90,7 +91,7 @@ def left_out(fit: Fit, dwells: Dwells) -> float:
 def beyond(fit: Fit, dwells: Dwells) -> float:
     """Return the root mean square error at rates beyond those that were seen, rad/s."""
     slow = np.abs(dwells.rate) < SEEN
-    return rms(error(fit(take(dwells, slow)), take(dwells, ~slow)))
+    return rms(error(fit(select_dwells(dwells, slow)), select_dwells(dwells, ~slow)))
 
 
 def main() -> None:

@@ -33,12 +33,12 @@ import os
 from pathlib import Path
 import sys
 
-from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
+from gyro_calibration.calibration.likelihood import fit_likelihood, ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import fit_heading, self_calibrate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.compensation import quadratic_form
-from gyro_calibration.model.motion import from_headings
+from gyro_calibration.model.motion import motion_from_headings
 from gyro_calibration.model.presets import MPU6050
 import numpy as np
 
@@ -48,10 +48,10 @@ RECORDINGS = {'yaw_slow': -1.0, 'pitch_slow': 1.0, 'yaw_fast': -1.0}
 NOISE = MPU6050.noise
 
 
-def fits(time: Array, output: Array, heading: Array, seconds: float) -> list[Fit]:
+def fits(time: Array, output: Array, heading: Array, seconds: float) -> list[ScaleBiasFit]:
     """Return none, eq. 7 and, where it is not refused, the self-calibration."""
     run = time <= seconds
-    given = time[run], output[run], from_headings(time[run], heading[run])
+    given = time[run], output[run], motion_from_headings(time[run], heading[run])
     aligned, plain = fit_likelihood(*given, 0.25), fit_heading(*given)
     found = [replace(aligned, scale_factor_error=s, bias=b)
              for s, b in ((0.0, 0.0), (plain.scale_factor_error, plain.bias))]
@@ -61,7 +61,7 @@ def fits(time: Array, output: Array, heading: Array, seconds: float) -> list[Fit
         return found
 
 
-def follow(fit: Fit, time: Array, output: Array, heading: Array) -> tuple[Array, Array]:
+def follow(fit: ScaleBiasFit, time: Array, output: Array, heading: Array) -> tuple[Array, Array]:
     """Return the error of the heading and its stated sigma, rad, without the last second."""
     turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
     turned = np.interp(time + fit.time_offset, time,

@@ -33,9 +33,9 @@ from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import (
     compensate,
-    covariance,
     quadratic_form,
     rate_sensitivity,
+    uncertainty_covariance,
 )
 from gyro_calibration.model.effects import (
     BIAS,
@@ -138,18 +138,23 @@ def expressed(truth: GyroModel, fitted: GyroModel) -> np.ndarray:
     rate, temperature = (each.ravel() for each in np.meshgrid(np.linspace(-1.7, 1.7, 11),
                                                               np.linspace(25.0, 47.0, 7)))
     channels = Channels(rate, truth.output(rate, temperature), temperature)
-    shapes = {term.effect.name: term.values[:len(term.effect.shapes)]
+    shapes = {term.effect.name: term.values[:len(term.effect.nonlinear_parameters)]
               for term in truth.terms if term.effect is SINE_RESPONSE}
-    terms = [Term(term.effect,
-                  (*shapes.get(term.effect.name, term.values[:len(term.effect.shapes)]),
-                   *term.values[len(term.effect.shapes):])) for term in fitted.terms]
+    terms = [
+        Term(term.effect,
+             (*shapes.get(term.effect.name, term.values[:len(term.effect.nonlinear_parameters)]),
+              *term.values[len(term.effect.nonlinear_parameters):])) for term in fitted.terms
+    ]
     linear = [term for term in terms if term.effect is not SINE_RESPONSE]
     rest = truth.error(channels) - sum(term.error(channels)
                                        for term in terms if term.effect is SINE_RESPONSE)
     columns = np.column_stack([column for term in linear for column in term.columns(channels)])
     found = iter(np.linalg.lstsq(columns, rest, rcond=None)[0].tolist())
-    return np.array([value for term in terms for value in (
-        term.values[:1] if term.effect is SINE_RESPONSE else [next(found) for _ in term.fitted])])
+    return np.array([
+        value for term in terms
+        for value in (term.values[:1] if term.effect is
+                      SINE_RESPONSE else [next(found) for _ in term.fitted_indices])
+    ])
 
 
 def run(terms: Sequence[Term], table: Table,
@@ -159,13 +164,13 @@ def run(terms: Sequence[Term], table: Table,
     model = fit_effects(table.measure(truth, generator), [term.effect for term in terms]).model
     # the truth here is the mean of all sweeps, not the gyro in another run
     model = replace(model, tolerance=Tolerance())
-    found = np.array([term.values[place] for term in model.terms for place in term.fitted])
+    found = np.array([term.values[place] for term in model.terms for place in term.fitted_indices])
     errors = (found - expressed(truth, model)) / np.sqrt(np.diag(model.covariance))
     rate, temperature = (each.ravel() for each in np.meshgrid(
         np.linspace(-1.0, 1.0, 5) * table.fastest, np.array(table.temperatures)))
     output = truth.output(rate, temperature)
     given = compensate(model, output, temperature)
-    variance = quadratic_form(covariance(model),
+    variance = quadratic_form(uncertainty_covariance(model),
                               rate_sensitivity(model, output, given.rate, given.temperature))
     return errors, (given.rate - rate) / np.sqrt(variance)
 

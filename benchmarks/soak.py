@@ -46,7 +46,7 @@ from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from gyro_calibration.driver.emulator import emulate, Emulator
-from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -100,7 +100,7 @@ def settings_of(name: str, rate: float | None = None) -> Settings:
 
 def full_rate(name: str) -> float:
     """Return how many samples a second the line of a format carries."""
-    protocol = find(name)
+    protocol = find_protocol(name)
     encode, count = protocol.encoder(settings_of(name)), 16
     length = sum(len(encode(Sample(0.5, 25.0, 1000.0 + 0.001 * number, number)))
                  for number in range(count)) / count
@@ -123,7 +123,7 @@ def number_of(rate: float, last: int) -> int | None:
 
 def arriving(name: str, output: float, rate: float) -> float:
     """Return what comes of an output by a wire format, which rounds it."""
-    settings, protocol = settings_of(name, rate), find(name)
+    settings, protocol = settings_of(name, rate), find_protocol(name)
     encode, decoder = protocol.encoder(settings), protocol.decoder(settings)
     data = protocol.preamble + b''.join(encode(Sample(output, 25.0, 1.0, number))
                                         for number in range(4))
@@ -169,7 +169,7 @@ def gyro(given: argparse.Namespace) -> None:
     numbers = shared(given.folder)
     settings = settings_of(given.protocol, given.rate)
     speed = 1.0 + 1e-9 if given.patient else 1.0  # faster than real time is a replay, which waits
-    emulator = Emulator(find(given.protocol), samples_of(given, numbers), settings, speed,
+    emulator = Emulator(find_protocol(given.protocol), samples_of(given, numbers), settings, speed,
                         given.folder / 'port', wait_for_reader=True)
     signal.signal(signal.SIGINT, lambda *_: emulator.stop())
     emulate(emulator)
@@ -293,7 +293,7 @@ class Run:
         given: dict[str, object] = {}
         if self.given.protocol in SENSITIVITY:
             given['sensitivity'] = SENSITIVITY[self.given.protocol]
-        if self.given.rate != find(self.given.protocol).rate:
+        if self.given.rate != find_protocol(self.given.protocol).rate:
             given['sample_rate'] = self.given.rate
         if self.given.rate > LARGEST_RATE:
             given['samples_per_message'] = math.ceil(self.given.rate / LARGEST_RATE)

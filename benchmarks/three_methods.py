@@ -24,7 +24,7 @@ from gyro_calibration.calibration.self_calibration import METHODS
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import CALIBRATION, from_headings, Motion
+from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_from_headings
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 from scipy.signal import lfilter
@@ -41,18 +41,20 @@ def encoder(number: int) -> Motion:
     """Return the motion by an encoder with steps of 0.5 deg at 20 Hz, from a random start."""
     time, step = np.arange(401) / 20.0, 0.5 * DEGREE
     begin = np.random.default_rng([number, 1]).uniform(0.0, step)
-    return from_headings(time, np.round((CALIBRATION.heading_at(time) + begin) / step) * step)
+    return motion_from_headings(
+        time,
+        np.round((CALIBRATION_MOTION.heading_at(time) + begin) / step) * step)
 
 
 def profile(_: int) -> Motion:
     """Return the profile; it is the same in each run."""
-    return CALIBRATION
+    return CALIBRATION_MOTION
 
 
 def lagging() -> Array:
     """Return the rates of a robot that follows the profile by a first-order lag."""
     kept = np.exp(-0.01 / LAG)
-    return lfilter([1.0 - kept], [1.0, -kept], CALIBRATION.rate_at(TIME))
+    return lfilter([1.0 - kept], [1.0, -kept], CALIBRATION_MOTION.rate_at(TIME))
 
 
 def errors(true_rate: Array, reference: Callable[[int], Motion], runs: int) -> dict[str, Array]:
@@ -69,10 +71,10 @@ def errors(true_rate: Array, reference: Callable[[int], Motion], runs: int) -> d
 
 def main(runs='200'):
     cases = {
-        'as the profile says': (CALIBRATION.rate_at(TIME), profile),
-        'gyro 50 ms late': (CALIBRATION.rate_at(TIME - 0.05), profile),
+        'as the profile says': (CALIBRATION_MOTION.rate_at(TIME), profile),
+        'gyro 50 ms late': (CALIBRATION_MOTION.rate_at(TIME - 0.05), profile),
         f'robot lags by {LAG} s': (lagging(), profile),
-        'encoder, 0.5 deg, 20 Hz': (CALIBRATION.rate_at(TIME), encoder),
+        'encoder, 0.5 deg, 20 Hz': (CALIBRATION_MOTION.rate_at(TIME), encoder),
     }
     print('| run | method | rms error of s | rms error of b |\n|---|---|---|---|')
     for case, (rate, reference) in cases.items():

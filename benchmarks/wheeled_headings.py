@@ -70,12 +70,12 @@ def headings(time: Array, output: Array) -> tuple[dict[str, Array], Array, float
     rest = rest_before(time, output)
     known = rest * float(np.median(np.diff(time))) > 5.0
     bias = float(output[:rest].mean()) if known else 0.0
-    deviation = math.hypot(NOISE.angle_random_walk / math.sqrt(KNOWN), NOISE.floor) if (
+    deviation = math.hypot(NOISE.angle_random_walk / math.sqrt(KNOWN), NOISE.allan_floor) if (
         known) else UNKNOWN
     model = GyroModel(noise=NOISE, self_calibration=SelfCalibration(
         0.0, bias, ((SCALE ** 2, 0.0), (0.0, deviation ** 2))))
     follower = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), 10.0, NOW)
-    follower.use(model, NOW)
+    follower.use_calibration(model, NOW)
     found = follower.follow(time, output, NOW)
     drive = SimpleNamespace(time=time, gyro=SimpleNamespace(
         interval=float(np.median(np.diff(time)))))

@@ -34,7 +34,7 @@ from gyro_calibration.diagnosis.findings import Diagnosis, Finding
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, part, read_log
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log, select_rows
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -45,7 +45,7 @@ LAGS = np.arange(-1.5, 1.501, 0.05)
 def halves(log: Log) -> tuple[Log, Log]:
     """Return a log in two halves of the same duration."""
     middle = int(np.searchsorted(log.time, 0.5 * (log.time[0] + log.time[-1])))
-    return part(log, slice(0, middle)), part(log, slice(middle, None))
+    return select_rows(log, slice(0, middle)), select_rows(log, slice(middle, None))
 
 
 def fixes(log: Log) -> Array:

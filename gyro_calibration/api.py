@@ -26,32 +26,47 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.allan import allan_deviation, AllanChart, even_record, fit_noise, NoiseFit
-from gyro_calibration.calibration.dwells import dwells, join
-from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration, is_motion
-from gyro_calibration.calibration.likelihood import Fit as RunFit
+from gyro_calibration.allan import (
+    allan_deviation,
+    AllanChart,
+    build_rest_record,
+    fit_noise,
+    NoiseFit,
+)
+from gyro_calibration.calibration.dwells import extract_dwells, join_dwells
+from gyro_calibration.calibration.encoder import (
+    calibrate_encoder,
+    EncoderCalibration,
+    is_continuous_motion,
+)
+from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.selection import select_effects, Selection
-from gyro_calibration.calibration.self_calibration import Reference, usual_reference
+from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
 from gyro_calibration.cli import allan as allan_answer
 from gyro_calibration.cli import plots
-from gyro_calibration.cli.compensate import followed, Piece, pieces
-from gyro_calibration.cli.diagnose import diagnosed, write_diagnosis
+from gyro_calibration.cli.compensate import CompensatedBlock, integrate_log, track_log
+from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
-from gyro_calibration.cli.self_calibrate import calibrated_run, CalibratedRun, recorded
+from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
 from gyro_calibration.logs import log as logs
-from gyro_calibration.logs.log import Array, DEGREE, Log, log_from_table, unwrapped, write_log
+from gyro_calibration.logs.log import Array, DEGREE, Log, log_from_table, unwrap_heading, write_log
 from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording
 from gyro_calibration.model import model_file
-from gyro_calibration.model.effects import STEADY
+from gyro_calibration.model.effects import STATIC_EFFECTS
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
-from gyro_calibration.model.model_file import model_of, write_model
-from gyro_calibration.model.motion import from_rates, Motion, motion_by_name, motion_of
+from gyro_calibration.model.model_file import parse_model, write_model
+from gyro_calibration.model.motion import (
+    Motion,
+    motion_by_name,
+    motion_from_log,
+    motion_from_rates,
+)
 from gyro_calibration.model.motion import simulate as simulate_motion
 import numpy as np
 
@@ -62,7 +77,7 @@ __all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_l
 MotionLike = str | Path | tuple[Any, Any] | Log | Motion
 
 
-class _Answer:
+class _PrintedResult:
     """A record that prints itself in words, also in a notebook."""
 
     def __str__(self) -> str:
@@ -104,8 +119,9 @@ def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
         log = logs.read_log(source, sensitivity, rate, columns, axis)
     if not unwrap or log.reference_heading is None:
         return log
-    time, output = _in_time(log)
-    return replace(log, reference_heading=unwrapped(time, log.reference_heading, time, output)[0])
+    time, output = _require_time(log)
+    return replace(log, reference_heading=unwrap_heading(time, log.reference_heading, time,
+                                                         output)[0])
 
 
 def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
@@ -120,7 +136,7 @@ def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
     ValueError : missing, damaged, or no model; the text says where
 
     """
-    return (model_of(dict(source)) if isinstance(source, Mapping)
+    return (parse_model(dict(source)) if isinstance(source, Mapping)
             else model_file.read_model(source))
 
 
@@ -140,11 +156,11 @@ def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: flo
 
     """
     generator = None if seed is None else np.random.default_rng(seed)
-    return simulate_motion(model, _motion(motion)[0], sample_rate, generator, temperature)
+    return simulate_motion(model, _to_motion(motion)[0], sample_rate, generator, temperature)
 
 
 @dataclass(frozen=True)
-class Headings(_Answer):
+class Headings(_PrintedResult):
     """
     Rates and heading of a log, corrected by a model; nan where the output was not plausible.
 
@@ -176,7 +192,7 @@ class Headings(_Answer):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the heading, with the reference where the log has one."""
-        time, output = _in_time(self.log)
+        time, output = _require_time(self.log)
         assert self.heading is not None
         known = np.isfinite(output) & np.isfinite(self.heading)
         raw = integrate(time[known], output[known])
@@ -196,7 +212,7 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     ValueError : no row of the log is plausible
 
     """
-    return _headings(log, list(pieces([log], model, Threshold(0.0), 'the log')))
+    return _make_headings(log, list(integrate_log([log], model, Threshold(0.0), 'the log')))
 
 
 def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
@@ -217,18 +233,18 @@ def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     if not model.noise.angle_random_walk:
         raise InputError('the model has no angle random walk, by which rests are found; '
                          'allan finds it in a log at rest')
-    return _headings(log, list(followed(log, model, hindsight, 'the log')))
+    return _make_headings(log, list(track_log(log, model, hindsight, 'the log')))
 
 
-def _headings(log: Log, found: list[Piece]) -> Headings:
-    parts = [piece.rows() for piece in found]
+def _make_headings(log: Log, found: list[CompensatedBlock]) -> Headings:
+    parts = [piece.full_columns() for piece in found]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Headings(log, columns['rate_rad_s'], columns['rate_std_rad_s'],
                     columns.get('heading_rad'), columns.get('heading_std_rad'), columns)
 
 
 @dataclass(frozen=True)
-class Run(_Answer):
+class Run(_PrintedResult):
     """
     A self-calibration.
 
@@ -276,19 +292,19 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
 
     """
     model = model or GyroModel()
-    time, _ = _in_time(log)
+    time, _ = _require_time(log)
     if motion is None:
-        run = calibrated_run(log, model, *_motion(log), method, Reference())
+        run = calibrate_run(log, model, *_to_motion(log), method, ReferenceErrors())
     else:
-        driven, _ = _motion(motion)
-        run = calibrated_run(log, model, driven, time[0], method, usual_reference(driven))
-    calibration = recorded(run.fit, method, log, run.used)
+        driven, _ = _to_motion(motion)
+        run = calibrate_run(log, model, driven, time[0], method, default_reference_errors(driven))
+    calibration = make_self_calibration(run.fit, method, log, run.is_used)
     return Run(with_self_calibration(model, calibration), run.fit.scale_factor_error,
                run.fit.bias, *calibration.standard_deviations, run.fit, run)
 
 
 @dataclass(frozen=True)
-class Fitted(_Answer):
+class Fitted(_PrintedResult):
     """
     A calibration by a rate table, a turntable or a reference heading.
 
@@ -335,31 +351,31 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
     ValueError : the logs do not determine the effects, or a name is wrong
 
     """
-    if unknown := [name for name in effects or () if name not in STEADY]:
+    if unknown := [name for name in effects or () if name not in STATIC_EFFECTS]:
         raise InputError(f'{unknown[0]} is no effect that fit knows; wanted of '
-                         f'{", ".join(STEADY)}')
+                         f'{", ".join(STATIC_EFFECTS)}')
     alone = len(logs) == 1 and logs[0].time is not None and logs[0].reference_rate is None
     if method in (None, 'likelihood', 'course', 'rate') and (
             method or alone and not set(effects or ()) - {'bias', 'scale_factor_error'}):
         if len(logs) != 1:
             raise InputError('a reference heading is fitted in one log; give them one by one')
         found = calibrate_encoder(logs[0], method, technology=technology or 'mems')
-        return Fitted(_of(found.model, technology), encoder=found)
-    table = join([dwells(log, name=str(number) if len(logs) > 1 else '')
-                  for number, log in enumerate(logs)])
-    if method is None and not effects and is_motion(logs, table):
+        return Fitted(_set_technology(found.model, technology), encoder=found)
+    table = join_dwells([extract_dwells(log, name=str(number) if len(logs) > 1 else '')
+                         for number, log in enumerate(logs)])
+    if method is None and not effects and is_continuous_motion(logs, table):
         return fit(logs[0], technology=technology, method='likelihood')
-    selection = (Selection(fit_effects(table, [STEADY[name] for name in effects]), (), ())
+    selection = (Selection(fit_effects(table, [STATIC_EFFECTS[name] for name in effects]), (), ())
                  if effects else select_effects(table, technology))
-    return Fitted(_of(selection.calibration.model, technology), selection)
+    return Fitted(_set_technology(selection.calibration.model, technology), selection)
 
 
-def _of(model: GyroModel, technology: str | None) -> GyroModel:
+def _set_technology(model: GyroModel, technology: str | None) -> GyroModel:
     return replace(model, gyro={'technology': technology}) if technology else model
 
 
 @dataclass(frozen=True)
-class NoiseFigures(_Answer):
+class NoiseFigures(_PrintedResult):
     """
     The noise of a gyro at rest.
 
@@ -384,7 +400,7 @@ class NoiseFigures(_Answer):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return the Allan chart."""
-        return plots.draw_allan(path, self.chart, self.fit, allan_answer.names(self.fit))
+        return plots.draw_allan(path, self.chart, self.fit, allan_answer.figure_labels(self.fit))
 
 
 def allan(log: Log) -> NoiseFigures:
@@ -396,14 +412,14 @@ def allan(log: Log) -> NoiseFigures:
     ValueError : the gyro moved, is dead, or its stamps are uneven
 
     """
-    time, output = _in_time(log)
-    even = even_record(time, output, log.moving, log.reference_heading)
+    time, output = _require_time(log)
+    even = build_rest_record(time, output, log.moving, log.reference_heading)
     chart, found = allan_deviation(even.rate, even.interval), fit_noise(even.rate, even.interval)
-    return NoiseFigures(chart, found, tuple(allan_answer.lines(even, chart, found)))
+    return NoiseFigures(chart, found, tuple(allan_answer.answer_lines(even, chart, found)))
 
 
 @dataclass(frozen=True)
-class Diagnosed(_Answer):
+class Diagnosed(_PrintedResult):
     """
     The error of a simulation against a log, and its causes.
 
@@ -423,7 +439,7 @@ class Diagnosed(_Answer):
         return tuple(finding.effect for finding in self.found.findings)
 
     def __str__(self) -> str:
-        return '\n'.join(lines(self.found))
+        return '\n'.join(terminal_lines(self.found))
 
     def write(self, folder: str | Path) -> None:
         """Write diagnosis.json, report.html and model.yaml into a folder."""
@@ -448,22 +464,22 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
     ValueError : the logs allow no diagnosis
 
     """
-    found = diagnosed(logs, model, seed, kind)
+    found = diagnose_logs(logs, model, seed, kind)
     return Diagnosed(found.model, found)
 
 
-def _in_time(log: Log) -> tuple[Array, Array]:
+def _require_time(log: Log) -> tuple[Array, Array]:
     if log.time is None or log.output is None:
         raise InputError('the log has no time or no output, which this needs; '
                          'Log(time, output) has both')
     return log.time, log.output
 
 
-def _motion(motion: MotionLike) -> tuple[Motion, float]:
+def _to_motion(motion: MotionLike) -> tuple[Motion, float]:
     """Return a motion, and the time of its beginning in a log, s."""
     if isinstance(motion, Motion):
         return motion, 0.0
     if isinstance(motion, tuple):
         time, rate = (np.asarray(values, float) for values in motion)
-        return from_rates(time, rate), 0.0
-    return motion_of(motion) if isinstance(motion, Log) else (motion_by_name(motion), 0.0)
+        return motion_from_rates(time, rate), 0.0
+    return motion_from_log(motion) if isinstance(motion, Log) else (motion_by_name(motion), 0.0)

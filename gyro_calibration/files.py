@@ -34,16 +34,16 @@ from typing import BinaryIO
 
 #: Largest magnitude of a value that is accepted. A count of 64 bits is below it, and products of
 #: several such values do not overflow.
-LARGEST = 1e20
+MAX_MAGNITUDE = 1e20
 #: Largest ratio of decompressed to compressed size (sensor data compress to about a tenth), and
 #: the size in bytes that is allowed at any ratio.
-GROWTH, GROWN = 100, 1 << 24
+MAX_EXPANSION_RATIO, MIN_EXPANSION_BYTES = 100, 1 << 24
 #: Longest wait for a program to write to a pipe, ms.
-_PATIENCE = 900
+_PIPE_TIMEOUT_MS = 900
 
 #: File type, other than a regular file -> its name.
-_KINDS = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
-          stat.S_IFCHR: 'a device', stat.S_IFBLK: 'a device'}
+_FILE_TYPE_NAMES = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
+                    stat.S_IFCHR: 'a device', stat.S_IFBLK: 'a device'}
 #: Error number -> remedy.
 _REMEDIES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), 'make room in {folder}'),
@@ -60,10 +60,10 @@ class InputError(ValueError):
     """The input cannot be used; the message is one printable line: given, wanted, remedy."""
 
     def __init__(self, message: object = ''):
-        super().__init__(plain(message))
+        super().__init__(to_printable(message))
 
 
-def plain(text: object, kept: str = '') -> str:
+def to_printable(text: object, allowed: str = '') -> str:
     r"""
     Return a text that is safe to show in a terminal, a ROS log or a page.
 
@@ -72,32 +72,32 @@ def plain(text: object, kept: str = '') -> str:
     the characters to be kept.
 
     """
-    return ''.join(each if each.isprintable() or each in kept else
+    return ''.join(each if each.isprintable() or each in allowed else
                    each.encode('unicode_escape').decode() for each in str(text))
 
 
-def reason(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """Return the text of an error, for a sentence that already names the file."""
     if isinstance(error, OSError) and error.strerror:
         return f'{error.strerror[0].lower()}{error.strerror[1:]}'
-    return plain(' '.join(str(error).split())[:200] or type(error).__name__)
+    return to_printable(' '.join(str(error).split())[:200] or type(error).__name__)
 
 
 def remedy(error: OSError, path: str | Path) -> str:
     """Return the remedy for a file that cannot be read or written."""
     words = _REMEDIES.get(error.errno or 0, 'make {path} readable and writable, or name another')
-    return plain(words.format(path=path, folder=Path(path).parent))
+    return to_printable(words.format(path=path, folder=Path(path).parent))
 
 
-def explained(error: OSError) -> str:
+def describe_os_error(error: OSError) -> str:
     """Return an OSError as a sentence, with a remedy if it names a file."""
     if error.filename is None or not error.strerror:
-        return plain(error)
+        return to_printable(error)
     path = str(error.filename)
-    return f'{plain(path)}: {reason(error)}; {remedy(error, path)}'
+    return f'{to_printable(path)}: {describe_error(error)}; {remedy(error, path)}'
 
 
-def opened(path: str | Path, pipes: bool = False) -> BinaryIO:
+def open_regular_file(path: str | Path, allow_pipes: bool = False) -> BinaryIO:
     """
     Open a regular file for reading; on request also a pipe that has a writer.
 
@@ -107,12 +107,12 @@ def opened(path: str | Path, pipes: bool = False) -> BinaryIO:
 
     """
     # Opening a device may already have an effect; and the file may be replaced between the checks.
-    _refuse_kind(path, os.stat(path).st_mode, pipes)
+    _require_regular_file(path, os.stat(path).st_mode, allow_pipes)
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
         mode = os.fstat(handle).st_mode
-        _refuse_kind(path, mode, pipes)
-        if stat.S_ISFIFO(mode) and not _is_written_to(handle):
+        _require_regular_file(path, mode, allow_pipes)
+        if stat.S_ISFIFO(mode) and not _has_writer(handle):
             raise OSError(errno.EINVAL, 'it is a pipe without a writer', str(path))
         os.set_blocking(handle, True)
         return open(handle, 'rb')
@@ -121,29 +121,29 @@ def opened(path: str | Path, pipes: bool = False) -> BinaryIO:
         raise
 
 
-def digest(*paths: str | Path) -> str:
+def sha256_digest(*paths: str | Path) -> str:
     """Return the SHA-256 of the content of regular files, one after the other."""
     found = hashlib.sha256()
     for path in paths:
-        with opened(path) as file:
+        with open_regular_file(path) as file:
             while piece := file.read(1 << 20):
                 found.update(piece)
     return found.hexdigest()
 
 
-def _refuse_kind(path: str | Path, mode: int, pipes: bool = False) -> None:
-    if not stat.S_ISREG(mode) and not (pipes and stat.S_ISFIFO(mode)):
-        kind = _KINDS.get(stat.S_IFMT(mode), 'of another kind')
+def _require_regular_file(path: str | Path, mode: int, allow_pipes: bool = False) -> None:
+    if not stat.S_ISREG(mode) and not (allow_pipes and stat.S_ISFIFO(mode)):
+        kind = _FILE_TYPE_NAMES.get(stat.S_IFMT(mode), 'of another kind')
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
-        wanted = 'a file or a pipe' if pipes else 'a file'
+        wanted = 'a file or a pipe' if allow_pipes else 'a file'
         raise OSError(number, f'it is {kind}, where {wanted} is wanted', str(path))
 
 
-def _is_written_to(handle: int) -> bool:
+def _has_writer(handle: int) -> bool:
     """Tell whether a pipe has a writer, or gets one within the timeout."""
     waiting = select.poll()
     waiting.register(handle, select.POLLIN)
-    if waiting.poll(_PATIENCE):
+    if waiting.poll(_PIPE_TIMEOUT_MS):
         return True
     try:
         os.read(handle, 1)
@@ -152,20 +152,20 @@ def _is_written_to(handle: int) -> bool:
     return False
 
 
-def read_bytes(path: str | Path, most: int) -> bytes:
+def read_bytes(path: str | Path, max_size: int) -> bytes:
     """
     Read a regular file whole.
 
     Raises
     ------
     OSError : as `opened`
-    ValueError : it has more bytes than `most`
+    ValueError : it has more bytes than `max_size`
 
     """
-    with opened(path) as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise ValueError(f'it has more than {most} bytes')
+    with open_regular_file(path) as file:
+        data = file.read(max_size + 1)
+    if len(data) > max_size:
+        raise ValueError(f'it has more than {max_size} bytes')
     return data
 
 
@@ -179,16 +179,16 @@ def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
 
     Raises
     ------
-    OSError : as `replacing`; the old file is unchanged
+    OSError : as `open_replacement`; the old file is unchanged
 
     """
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         file.write(data)
         file.flush()
-        return version(file.fileno())
+        return file_version(file.fileno())
 
 
-def version(file: str | Path | int) -> tuple[int, int]:
+def file_version(file: str | Path | int) -> tuple[int, int]:
     """
     Return an identifier that differs after each write of a file, given by path or descriptor.
 
@@ -202,7 +202,7 @@ def version(file: str | Path | int) -> tuple[int, int]:
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[BinaryIO]:
+def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
     """
     Give a temporary file to write to, which replaces `path` in one step at the end.
 
@@ -216,11 +216,11 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     path, temporary = Path(path), None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        old = _replaceable(path)
+        old = _stat_replaceable(path)
         remove_leftovers(path)
         # A replacement is readable by its owner alone until it gets the mode of the old file; a
         # new file gets the mode that the umask allows.
-        handle, temporary = _created(path, 0o644 if old is None else 0o600)
+        handle, temporary = _create_temporary(path, 0o644 if old is None else 0o600)
         try:
             with os.fdopen(handle, 'wb') as file:
                 yield file
@@ -243,10 +243,10 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def _created(path: Path, mode: int) -> tuple[int, str]:
+def _create_temporary(path: Path, mode: int) -> tuple[int, str]:
     """Return a new temporary file in the folder of another, open and locked, and its path."""
     while True:
-        temporary = str(path.parent / f'{_stem(path)}{secrets.token_hex(4)}')
+        temporary = str(path.parent / f'{_temporary_prefix(path)}{secrets.token_hex(4)}')
         handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
         with suppress(OSError):  # without locks, leftovers of killed writers may remain
             # locked until it is closed or the process ends
@@ -256,7 +256,7 @@ def _created(path: Path, mode: int) -> tuple[int, str]:
         os.close(handle)  # another writer removed it as a leftover before it was locked
 
 
-def _replaceable(path: str | Path) -> os.stat_result | None:
+def _stat_replaceable(path: str | Path) -> os.stat_result | None:
     """
     Return the status of a regular file that is to be replaced; None for a new file or a link.
 
@@ -271,11 +271,11 @@ def _replaceable(path: str | Path) -> os.stat_result | None:
         mode = os.stat(path).st_mode
     except FileNotFoundError:  # also a link without a target
         return None
-    _refuse_kind(path, mode)
+    _require_regular_file(path, mode)
     return None
 
 
-def _stem(path: Path) -> str:
+def _temporary_prefix(path: Path) -> str:
     """Return the prefix of the names of temporary files; a long name is shortened."""
     return f'.{os.fsdecode(os.fsencode(path.name)[:200])}.'
 
@@ -283,12 +283,12 @@ def _stem(path: Path) -> str:
 def remove_leftovers(path: str | Path) -> None:
     """Remove the temporary files of killed writers, except those that are locked by a writer."""
     path = Path(path)
-    leftover = re.compile(re.escape(_stem(path)) + '[a-z0-9_]{8}')
+    leftover = re.compile(re.escape(_temporary_prefix(path)) + '[a-z0-9_]{8}')
     # a folder that cannot be read or written to is reported when the file is written
     with suppress(OSError):
         for found in [each for each in path.parent.iterdir() if leftover.fullmatch(each.name)]:
             with suppress(OSError):
                 if stat.S_ISREG(os.lstat(found).st_mode):
-                    with opened(found) as file:
+                    with open_regular_file(found) as file:
                         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                         os.unlink(found)

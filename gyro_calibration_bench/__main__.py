@@ -26,11 +26,11 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
-from gyro_calibration_bench.cases import Case, cases, made, PARTS, source
+from gyro_calibration_bench.cases import Case, make_logs, part_cases, PARTS, random_source
 from gyro_calibration_bench.hidden import FORMS
-from gyro_calibration_bench.hidden.effects import AGAINST_A_MODEL
+from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
 from gyro_calibration_bench.methods import METHODS
-from gyro_calibration_bench.scores import interval, scored, summary, table
+from gyro_calibration_bench.scores import markdown_table, score_case, summarize, wilson_interval
 import numpy as np
 from tqdm import tqdm
 
@@ -72,7 +72,7 @@ def make(given: argparse.Namespace) -> None:
     generator = np.random.default_rng(given.seed)
     drawn: list[Case] = []
     for part in given.part:
-        every = list(cases(part, given.cases))
+        every = list(part_cases(part, given.cases))
         drawn += [every[place] for place in generator.choice(len(every), given.cases,
                                                              replace=False)]
     given.folder.mkdir(parents=True, exist_ok=True)
@@ -81,14 +81,14 @@ def make(given: argparse.Namespace) -> None:
     for number, place in enumerate(tqdm(generator.permutation(len(drawn)), 'logs are made',
                                         disable=None)):
         case, name = drawn[place], f'{number:04d}'
-        logs = made(case, source(case, given.seed))
+        logs = make_logs(case, random_source(case, given.seed))
         paths = [each.write(given.folder / f'{name}{"ab"[run] if len(logs) > 1 else ""}.csv.gz')
                  for run, each in enumerate(logs)]
         causes = logs[0].truth.gyro.causes
-        wanted = case.against_a_model or any(each.name in AGAINST_A_MODEL for each in causes)
+        wanted = case.has_model or any(each.name in MODEL_FINDINGS for each in causes)
         public[name] = {'logs': [path.name for path in paths],
                         'model': dict(logs[0].truth.expected) if wanted else None}
-        truth[name] = {'case': str(case), 'part': case.part, 'look_alikes': case.twins,
+        truth[name] = {'case': str(case), 'part': case.part, 'look_alikes': case.look_alikes,
                        'allowed': case.allowed, 'causes': [asdict(each) for each in causes]}
     effects = {name: form.unit for name, form in FORMS.items()}
     _write(given.folder / 'cases.json', CASES, seed=given.seed, effects=effects, cases=public)
@@ -124,16 +124,22 @@ def score(given: argparse.Namespace) -> None:
     unknown = set(answers) - set(truth)
     if unknown:
         raise ValueError(f'{given.answers}: no such cases: {", ".join(sorted(unknown)[:5])}')
-    found = summary([scored(each, answers.get(name, {})) for name, each in sorted(
+    found = summarize([score_case(each, answers.get(name, {})) for name, each in sorted(
         truth.items(), key=lambda item: PARTS.index(item[1]['part']))])
     if given.json:
-        print(json.dumps({row: {column: {'good': good, 'of': count,
-                                         'interval': interval(good, count) if count else None}
-                                for column, (good, count) in counts.items()}
-                          for row, counts in found.items()}))
+        print(
+            json.dumps({
+                row: {
+                    column: {
+                        'good': good,
+                        'of': count,
+                        'interval': wilson_interval(good, count) if count else None
+                    } for column, (good, count) in counts.items()
+                } for row, counts in found.items()
+            }))
         return
     print(f'{said.get("method", "")}: {len(answers)} answers to {len(truth)} cases; %, with '
-          f'Wilson intervals of 95 %\n\n{table(found)}')
+          f'Wilson intervals of 95 %\n\n{markdown_table(found)}')
 
 
 def _write(path: Path, schema: str, **content: Any) -> None:

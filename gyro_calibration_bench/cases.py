@@ -23,23 +23,31 @@ from dataclasses import dataclass
 import math
 import zlib
 
-from gyro_calibration_bench.hidden import FORMS, HiddenLog, hide, OUTSIDE, part, twin, TWINS
-from gyro_calibration_bench.hidden.effects import AGAINST_A_MODEL
-from gyro_calibration_bench.hidden.reference import hide_beside, Imperfect
+from gyro_calibration_bench.hidden import (
+    FORMS,
+    HiddenLog,
+    hide,
+    hide_look_alike,
+    LOOK_ALIKES,
+    OUTSIDE_CATALOGUE,
+    record_separating,
+)
+from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
+from gyro_calibration_bench.hidden.reference import hide_with_reference, ImperfectReference
 import numpy as np
 
 #: In the order of the tables.
 PARTS = ('nothing', 'effects', 'pairs', 'triples', 'outside', 'sets', 'separated', 'references')
-MULTIPLES = (1.2, 2.0, 5.0)
+SIZE_MULTIPLES = (1.2, 2.0, 5.0)
 #: Noises in which false alarms are counted.
-ALARMS = ('white', 'walk', 'flicker')
+ALARM_NOISES = ('white', 'walk', 'flicker')
 NOISES = ('mixed', 'walk', 'flicker', 'white', 'gauss_markov')
 #: References in turn: a rate, a heading, and the heading of an encoder.
 REFERENCES = ('rate', 'heading', 'rate', 'encoder')
 ENCODER_STEP = 2.0 * math.pi / 65536
 #: References with errors, and the effects that are hidden in logs with them in turn.
-IMPERFECT = {
-    f'{kind}_{size:g}': Imperfect(kind, size)
+IMPERFECT_REFERENCES = {
+    f'{kind}_{size:g}': ImperfectReference(kind, size)
     for kind, sizes in (
         ('rate', (0.1, 0.3, 0.5)),
         ('capture', (0.02, 0.05, 0.1)),
@@ -48,7 +56,7 @@ IMPERFECT = {
     )
     for size in sizes
 }
-BESIDE = (
+COMPANION_EFFECTS = (
     'scale_factor_asymmetry',
     'cubic_nonlinearity',
     'heading_sensitivity',
@@ -63,11 +71,11 @@ BESIDE = (
     'acceleration_sensitivity',
 )
 #: Correct findings on references that were not hidden.
-TRUE = {'encoder': ('reference_quantization',), 'course': ('time_offset',)}
+TRUE_OF_REFERENCE = {'encoder': ('reference_quantization',), 'course': ('time_offset',)}
 #: Effects that are not combined: findings against a model, and a wrong unit, which changes sizes.
-ALONE = {*AGAINST_A_MODEL, 'unit_error'}
+NOT_COMBINED = {*MODEL_FINDINGS, 'unit_error'}
 #: Least share of the multiple of an effect that is independent of the others.
-LEFT = 0.8
+MIN_REMAINING_SHARE = 0.8
 
 
 @dataclass(frozen=True)
@@ -80,27 +88,28 @@ class Case:
     noise: str
     reference: str
     number: int
-    twins: tuple[str, str] | None = None
+    look_alikes: tuple[str, str] | None = None
 
     def __str__(self) -> str:
         what = '+'.join(self.names) or ('random' if self.multiple else 'nothing')
-        beside = '' if self.twins is None else f'({"|".join(self.twins)})'
+        beside = '' if self.look_alikes is None else f'({"|".join(self.look_alikes)})'
         return (f'{self.part}/{what}{beside}/{self.multiple:g}/{self.noise}/{self.reference}/'
                 f'{self.number}')
 
     @property
-    def against_a_model(self) -> bool | None:
+    def has_model(self) -> bool | None:
         """Whether a model is given because of what the case is; None: what is hidden decides."""
         floor = self.part == 'references' and self.noise == 'floor'
-        return floor or self.twins is not None and TWINS[self.twins].against_a_model or None
+        return (floor or self.look_alikes is not None and LOOK_ALIKES[self.look_alikes].needs_model
+                or None)
 
     @property
     def allowed(self) -> tuple[str, ...]:
         """Return the correct findings on the reference that were not hidden."""
-        return TRUE.get(self.reference.partition('_')[0], ())
+        return TRUE_OF_REFERENCE.get(self.reference.partition('_')[0], ())
 
     @property
-    def row(self) -> str:
+    def table_row(self) -> str:
         """Return the row of the table that it belongs to."""
         if self.part == 'references':
             kind, beside = self.reference, ', with a model' if self.noise == 'floor' else ''
@@ -114,64 +123,71 @@ class Case:
                 'separated': 'look-alikes, and a log that separates them'}[self.part]
 
 
-def cases(part: str, logs: int) -> Iterator[Case]:
+def part_cases(part: str, repetitions: int) -> Iterator[Case]:
     """Go through the cases of a part."""
     if part == 'nothing':
-        yield from (Case(part, (), 0.0, noise, _turn(REFERENCES, number), number)
-                    for number in range(logs) for noise in ALARMS)
+        yield from (Case(part, (), 0.0, noise, _choose_in_turn(REFERENCES, number), number)
+                    for number in range(repetitions) for noise in ALARM_NOISES)
     elif part in ('sets', 'separated'):
         yield from (Case(part, (name,), 0.0, 'white', 'rate', number, pair)
-                    for number in range(logs) for pair in TWINS for name in pair
-                    if part == 'sets' or TWINS[pair].apart is not None)
+                    for number in range(repetitions) for pair in LOOK_ALIKES for name in pair
+                    if part == 'sets' or LOOK_ALIKES[pair].separating_conditions is not None)
     elif part == 'references':
-        for place, reference in enumerate(IMPERFECT):
-            for number in range(logs):
-                yield Case(part, (), 0.0, _turn(NOISES, number), reference, number)
+        for place, reference in enumerate(IMPERFECT_REFERENCES):
+            for number in range(repetitions):
+                yield Case(part, (), 0.0, _choose_in_turn(NOISES, number), reference, number)
                 yield Case(part, (), 0.0, 'floor', reference, number)
-                for multiple in MULTIPLES:
-                    name = _turn(BESIDE, number * len(IMPERFECT) + place)
-                    yield Case(part, (name,), multiple, _turn(NOISES, number), reference, number)
+                for multiple in SIZE_MULTIPLES:
+                    name = _choose_in_turn(COMPANION_EFFECTS,
+                                           number * len(IMPERFECT_REFERENCES) + place)
+                    yield Case(part, (name, ), multiple, _choose_in_turn(NOISES, number),
+                               reference, number)
     else:
-        multiples = (3.0,) if part == 'outside' else MULTIPLES
-        names: Sequence[tuple[str, ...]] = (
-            [(name,) for name in {'effects': FORMS, 'outside': OUTSIDE}.get(part, ())] or [()])
-        yield from (Case(part, each, multiple, _turn(NOISES, number + place),
-                         _reference(each, number + place), number) for number in range(logs)
-                    for multiple in multiples for place, each in enumerate(names))
+        multiples = (3.0,) if part == 'outside' else SIZE_MULTIPLES
+        names: Sequence[tuple[str, ...]] = ([(name, ) for name in {
+            'effects': FORMS,
+            'outside': OUTSIDE_CATALOGUE
+        }.get(part, ())] or [()])
+        yield from (Case(part, each, multiple, _choose_in_turn(NOISES, number + place),
+                         _choose_reference(each, number + place), number)
+                    for number in range(repetitions) for multiple in multiples
+                    for place, each in enumerate(names))
 
 
-def _turn(choices: Sequence[str], number: int) -> str:
+def _choose_in_turn(choices: Sequence[str], number: int) -> str:
     return choices[number % len(choices)]
 
 
-def _reference(names: Sequence[str], number: int) -> str:
+def _choose_reference(names: Sequence[str], number: int) -> str:
     """Choose a reference; figures of the noise are sized without encoder steps."""
     return 'rate' if any(name in FORMS and FORMS[name].stage == 'noise'
-                         for name in names) else _turn(REFERENCES, number)
+                         for name in names) else _choose_in_turn(REFERENCES, number)
 
 
-def source(case: Case, seed: int) -> np.random.Generator:
+def random_source(case: Case, seed: int) -> np.random.Generator:
     """Return the source of all that is random in a case."""
     return np.random.default_rng([seed, zlib.crc32(str(case).encode())])
 
 
-def made(case: Case, generator: np.random.Generator) -> list[HiddenLog]:
+def make_logs(case: Case, generator: np.random.Generator) -> list[HiddenLog]:
     """Hide what a case asks for; two logs of one gyro where the second separates look-alikes."""
     if case.part == 'references':
         noise = 'gauss_markov' if case.noise == 'floor' else case.noise
-        return [hide_beside(
-            case.names, case.multiple, generator, IMPERFECT[case.reference], noise)]
-    if case.twins is not None:
-        log = twin(case.twins, case.names[0], generator)
-        return [log] if case.part == 'sets' else [log, part(case.twins, log, generator)]
+        return [hide_with_reference(
+            case.names, case.multiple, generator, IMPERFECT_REFERENCES[case.reference], noise)]
+    if case.look_alikes is not None:
+        log = hide_look_alike(case.look_alikes, case.names[0], generator)
+        return ([log] if case.part == 'sets' else
+                [log, record_separating(case.look_alikes, log, generator)])
     step = ({'reference': 'heading', 'encoder_step': ENCODER_STEP} if case.reference == 'encoder'
             else {'reference': case.reference})
     if case.part not in ('pairs', 'triples'):
         return hide(case.names, case.multiple, generator, noise=case.noise, **step)
-    choices = [name for name in FORMS if name not in ALONE]
+    choices = [name for name in FORMS if name not in NOT_COMBINED]
     while True:
         names = [str(name) for name in generator.choice(choices, 2 if case.part == 'pairs' else 3,
                                                         replace=False)]
         logs = hide(names, case.multiple, generator, noise=case.noise, **step)
-        if all(not cause.apart < LEFT * cause.multiple for cause in logs[0].truth.gyro.causes):
+        if all(not cause.apart < MIN_REMAINING_SHARE * cause.multiple
+               for cause in logs[0].truth.gyro.causes):
             return logs

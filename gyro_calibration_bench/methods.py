@@ -30,43 +30,43 @@ from typing import Any
 from gyro_calibration_bench.hidden import FORMS, Session
 from gyro_calibration_bench.hidden.effects import Shapes, WITHOUT_COLUMN
 from gyro_calibration_bench.hidden.motion import Motion
-from gyro_calibration_bench.scores import Named
+from gyro_calibration_bench.scores import NamedCause
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 #: Bias, scale_factor_error, angle_random_walk, bias_instability and rate_random_walk, in SI.
-Known = Mapping[str, float]
-Answer = tuple[list[Named], bool]
+KnownModel = Mapping[str, float]
+Answer = tuple[list[NamedCause], bool]
 
 #: Single events, which one log cannot establish.
-ONCE = ('bias_step', 'reference_slip')
+SINGLE_EVENTS = ('bias_step', 'reference_slip')
 
 #: Length of the means, s.
-BLOCK = 0.5
+BLOCK_DURATION = 0.5
 #: Small sizes at which nonlinear effects are proportional to their size.
-SMALL = {'time_offset': 0.02, 'bandwidth': 0.02, 'clock_rate': 1e-4}
+LINEAR_SIZES = {'time_offset': 0.02, 'bandwidth': 0.02, 'clock_rate': 1e-4}
 #: Columns with a larger correlation are ambiguous.
-ALIKE = 0.99
-WITHOUT = {*WITHOUT_COLUMN, 'saturation', 'interference_tone', 'reference_slip'}
-FOLDS = 5
+AMBIGUOUS_CORRELATION = 0.99
+WITHOUT_CANDIDATES = {*WITHOUT_COLUMN, 'saturation', 'interference_tone', 'reference_slip'}
+FOLD_COUNT = 5
 
 
 # gyro_calibration
 
-def named(finding: Any) -> Named:
+def answer_of_finding(finding: Any) -> NamedCause:
     """Return a finding of gyro_calibration as an answer of the bench."""
     size = finding.parameters.get(finding.effect)
-    return Named(finding.effect, tuple(finding.ambiguous_with), size and size.estimate,
-                 size and tuple(size.interval))
+    return NamedCause(finding.effect, tuple(finding.ambiguous_with), size and size.estimate,
+                      size and tuple(size.interval))
 
 
-def reported(findings: Sequence[Any]) -> list[Any]:
+def reported_findings(findings: Sequence[Any]) -> list[Any]:
     """Return the established findings, and suspected single events."""
     return [each for each in findings if each.status == 'established'
-            or each.effect in ONCE and each.p_value < 0.01]
+            or each.effect in SINGLE_EVENTS and each.p_value < 0.01]
 
 
-def known_model(known: Known) -> Any:
+def known_model(known: KnownModel) -> Any:
     """Return what is known of a gyro as a model."""
     from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
     from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -77,13 +77,14 @@ def known_model(known: Known) -> Any:
                                         known['rate_random_walk']))
 
 
-def gyro_calibration(logs: Sequence[Path], known: Known | None) -> Answer:
+def gyro_calibration(logs: Sequence[Path], known: KnownModel | None) -> Answer:
     """Diagnose."""
     from gyro_calibration import read_log
     from gyro_calibration.diagnosis.pipeline import diagnose
     found = diagnose([read_log(path) for path in logs], np.random.default_rng(0),
                      None if known is None else known_model(known))
-    return [named(each) for each in reported(found.findings)], bool(found.unexplained)
+    return ([answer_of_finding(each) for each in reported_findings(found.findings)],
+            bool(found.unexplained))
 
 
 # the baselines
@@ -108,7 +109,7 @@ class Problem:
     nuisances: int
 
 
-def recorded(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
+def read_session(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
     """Return the conditions of a log at even times, means of the error, and which are valid."""
     columns: Any = np.genfromtxt(path, delimiter=',', names=True)
     stamps = columns['time_s']
@@ -124,7 +125,7 @@ def recorded(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
         missing = np.zeros(len(time), dtype=bool)
     else:
         heading = evenly('reference_heading_rad')
-        rate = uniform_filter1d(np.gradient(heading, interval), round(BLOCK / interval))
+        rate = uniform_filter1d(np.gradient(heading, interval), round(BLOCK_DURATION / interval))
         missing = np.interp(time, stamps, columns['reference_heading_rad']) != heading
     force = evenly('acceleration_mps2')
     slow = uniform_filter1d(force, round(1.0 / interval))
@@ -132,17 +133,17 @@ def recorded(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
     moving = np.abs(rate) > 1e-9
     each = Session(motion, time - time[0], rate, heading, evenly('temperature_degc'),
                    evenly('supply_v'), slow, force - slow, moving)
-    error = blocks(evenly('gyro_rad_s') - rate, interval)
-    return each, error, blocks(missing.astype(float), interval) == 0.0
+    error = block_means(evenly('gyro_rad_s') - rate, interval)
+    return each, error, block_means(missing.astype(float), interval) == 0.0
 
 
-def blocks(values: np.ndarray, interval: float) -> np.ndarray:
+def block_means(values: np.ndarray, interval: float) -> np.ndarray:
     """Return means over `BLOCK`."""
-    size = round(BLOCK / interval)
+    size = round(BLOCK_DURATION / interval)
     return values[:len(values) // size * size].reshape(-1, size).mean(axis=1)
 
 
-def choices(each: Session) -> list[tuple[str, float, Shapes, float]]:
+def propose_candidates(each: Session) -> list[tuple[str, float, Shapes, float]]:
     """Return candidates: effect, size, shapes, and the size of coefficient 1, nan if none."""
     duration, top = float(each.time[-1]), float(np.abs(each.rate).max())
     found: list[tuple[str, float, Shapes, float]] = []
@@ -154,33 +155,36 @@ def choices(each: Session) -> list[tuple[str, float, Shapes, float]]:
         'bias_step': [{'run': 0, 'step_time': part * duration}
                       for part in np.linspace(0.15, 0.85, 29)]}
     for name in FORMS:
-        if name in WITHOUT:
+        if name in WITHOUT_CANDIDATES:
             continue
         if name == 'dead_zone':
             found += [(name, part * top, {}, math.nan) for part in (0.003, 0.01, 0.03, 0.1, 0.3)]
         elif name == 'sine_response':
             found.append((name, 1.0 / top, {}, math.nan))
         else:
-            size = SMALL.get(name, 1.0)
+            size = LINEAR_SIZES.get(name, 1.0)
             # a wave has two columns, and shapes are not on the grid: no size is estimated
             found += [(name, size, shapes, math.nan if shapes else size)
                       for shapes in grids.get(name, [{}])]
     return found
 
 
-def problem(logs: Sequence[Path], known: Known | None) -> Problem:
+def build_problem(logs: Sequence[Path], known: KnownModel | None) -> Problem:
     """Read the logs of a case; with a model, its bias and scale are candidates like others."""
-    read = [recorded(path) for path in logs]
-    wanted = choices(read[0][0])
+    read = [read_session(path) for path in logs]
+    wanted = propose_candidates(read[0][0])
     tables, errors = [], []
     for number, (each, error, kept) in enumerate(read):
-        columns = [FORMS[name].error(each, each.rate, size, shapes) * (
-                       not (number and FORMS[name].once)) for name, size, shapes, _ in wanted]
-        plain = [blocks(each.rate, each.interval), np.ones(len(error))]
+        columns = [
+            FORMS[name].error(each, each.rate, size, shapes) *
+            (not (number and FORMS[name].is_single_event)) for name, size, shapes, _ in wanted
+        ]
+        plain = [block_means(each.rate, each.interval), np.ones(len(error))]
         own = [plain[0]] + [plain[1] * (place == number) for place in range(len(read))]
         if known is not None:
             error = error - known['bias'] - known['scale_factor_error'] * plain[0]
-        table = np.column_stack([*own, *(blocks(column, each.interval) for column in columns)])
+        table = np.column_stack(
+            [*own, *(block_means(column, each.interval) for column in columns)])
         tables.append(table[kept])
         errors.append(error[kept])
     table, error = np.concatenate(tables), np.concatenate(errors)
@@ -199,87 +203,97 @@ def problem(logs: Sequence[Path], known: Known | None) -> Problem:
         owner for owner, each in zip(owners, seen) if each), count)
 
 
-def greedy(logs: Sequence[Path], known: Known | None) -> Answer:
+def select_greedily(logs: Sequence[Path], known: KnownModel | None) -> Answer:
     """Add the column that lowers the Bayesian information criterion most, until none does."""
-    given = problem(logs, known)
-    count = len(given.error)
+    problem_to_solve = build_problem(logs, known)
+    count = len(problem_to_solve.error)
     chosen: list[int] = []
-    best = count * math.log(float(given.error @ given.error) / count)
+    best = count * math.log(float(problem_to_solve.error @ problem_to_solve.error) / count)
     while True:
         scores = []
-        for place in set(range(given.columns.shape[1])) - set(chosen):
-            columns = given.columns[:, [*chosen, place]]
-            left = given.error - columns @ np.linalg.lstsq(columns, given.error, rcond=None)[0]
+        for place in set(range(problem_to_solve.columns.shape[1])) - set(chosen):
+            columns = problem_to_solve.columns[:, [*chosen, place]]
+            left = (problem_to_solve.error
+                    - columns @ np.linalg.lstsq(columns, problem_to_solve.error, rcond=None)[0])
             scores.append((count * math.log(float(left @ left) / count)
                            + (len(chosen) + 1) * math.log(count), place))
         if not scores or min(scores)[0] >= best:
-            return answered(given, chosen), False
+            return answers_of_columns(problem_to_solve, chosen), False
         best, place = min(scores)
         chosen.append(place)
 
 
-def lasso(logs: Sequence[Path], known: Known | None) -> Answer:
+def select_by_lasso(logs: Sequence[Path], known: KnownModel | None) -> Answer:
     """Take the largest penalty whose error is within a standard error of the least."""
-    given = problem(logs, known)
-    columns = given.columns / np.linalg.norm(given.columns, axis=0) * math.sqrt(len(given.error))
-    fold = np.arange(len(given.error)) * FOLDS // len(given.error)
-    top = float(np.abs(columns.T @ given.error).max()) / len(given.error)
+    problem_to_solve = build_problem(logs, known)
+    columns = (problem_to_solve.columns / np.linalg.norm(problem_to_solve.columns, axis=0)
+               * math.sqrt(len(problem_to_solve.error)))
+    fold = np.arange(len(problem_to_solve.error)) * FOLD_COUNT // len(problem_to_solve.error)
+    top = float(np.abs(columns.T @ problem_to_solve.error).max()) / len(problem_to_solve.error)
     penalties = top * np.geomspace(1.0, 1e-3, 25)
     errors = []
-    for out in range(FOLDS):
+    for out in range(FOLD_COUNT):
         inside, outside = fold != out, fold == out
-        errors.append([np.mean((given.error[outside] - columns[outside] @ weights) ** 2)
-                       for weights in descend(columns[inside], given.error[inside], penalties)])
-    mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0) / math.sqrt(FOLDS)
+        errors.append([
+            np.mean((problem_to_solve.error[outside] - columns[outside] @ weights) ** 2)
+            for weights in lasso_path(columns[inside], problem_to_solve.error[inside], penalties)
+        ])
+    mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0) / math.sqrt(FOLD_COUNT)
     least = int(np.argmin(mean))
     place = int(np.flatnonzero(mean <= mean[least] + spread[least])[0])
-    weights = descend(columns, given.error, penalties[:place + 1])[-1]
-    return answered(given, list(np.flatnonzero(weights))), False
+    weights = lasso_path(columns, problem_to_solve.error, penalties[:place + 1])[-1]
+    return answers_of_columns(problem_to_solve, list(np.flatnonzero(weights))), False
 
 
-def descend(columns: np.ndarray, error: np.ndarray, penalties: np.ndarray) -> list[np.ndarray]:
+def lasso_path(columns: np.ndarray, error: np.ndarray, penalties: np.ndarray) -> list[np.ndarray]:
     """Return the weights of the lasso at falling penalties, by coordinate descent."""
-    gram, toward = columns.T @ columns / len(error), columns.T @ error / len(error)
-    weights, path = np.zeros(len(toward)), []
+    gram, correlations = columns.T @ columns / len(error), columns.T @ error / len(error)
+    weights, path = np.zeros(len(correlations)), []
     for penalty in penalties:
         for _ in range(300):
             before = weights.copy()
             # a step has no column in a fold that does not hold it
             for place in np.flatnonzero(np.diag(gram) > 1e-9):
-                pull = toward[place] - gram[place] @ weights + gram[place, place] * weights[place]
-                weights[place] = (math.copysign(max(abs(pull) - penalty, 0.0), pull)
-                                  / gram[place, place])
+                partial_correlation = (correlations[place] - gram[place] @ weights
+                                       + gram[place, place] * weights[place])
+                weights[place] = (math.copysign(max(abs(partial_correlation) - penalty, 0.0),
+                                                partial_correlation) / gram[place, place])
             if np.abs(weights - before).max() < 1e-3 * penalties[0]:
                 break
         path.append(weights.copy())
     return path
 
 
-def answered(given: Problem, chosen: Sequence[int]) -> list[Named]:
+def answers_of_columns(least_squares: Problem, chosen: Sequence[int]) -> list[NamedCause]:
     """Name each chosen effect once, with size and interval by least squares of all chosen."""
     if not chosen:
         return []
-    columns = given.columns[:, chosen]
+    columns = least_squares.columns[:, chosen]
     inverse = np.linalg.pinv(columns.T @ columns)
-    weights = inverse @ columns.T @ given.error
-    left = given.error - columns @ weights
-    variance = float(left @ left) / max(1, len(left) - len(chosen) - given.nuisances)
+    weights = inverse @ columns.T @ least_squares.error
+    left = least_squares.error - columns @ weights
+    variance = float(left @ left) / max(1, len(left) - len(chosen) - least_squares.nuisances)
     deviations = np.sqrt(variance * np.diag(inverse))
-    unit = given.columns / np.linalg.norm(given.columns, axis=0)
+    unit_columns = least_squares.columns / np.linalg.norm(least_squares.columns, axis=0)
     effects: dict[str, list[int]] = {}
     for place in np.argsort(-np.abs(weights) / deviations):
-        effects.setdefault(given.owners[chosen[place]][0], []).append(int(place))
+        effects.setdefault(least_squares.owners[chosen[place]][0], []).append(int(place))
     answer = []
     for name, places in effects.items():
         first = places[0]
-        like = np.abs(unit.T @ unit[:, chosen[first]]) > ALIKE
-        others = {owner for (owner, _), each in zip(given.owners, like) if each} - set(effects)
-        size = given.owners[chosen[first]][1] * weights[first]
-        half = 1.96 * abs(given.owners[chosen[first]][1]) * deviations[first]
+        is_alike = np.abs(unit_columns.T @ unit_columns[:, chosen[first]]) > AMBIGUOUS_CORRELATION
+        others = ({owner for (owner, _), each in zip(least_squares.owners, is_alike) if each}
+                  - set(effects))
+        size = least_squares.owners[chosen[first]][1] * weights[first]
+        half = 1.96 * abs(least_squares.owners[chosen[first]][1]) * deviations[first]
         sized = math.isfinite(size)
-        answer.append(Named(name, tuple(sorted(others)), size if sized else None,
-                            (size - half, size + half) if sized else None))
+        answer.append(NamedCause(name, tuple(sorted(others)), size if sized else None,
+                                 (size - half, size + half) if sized else None))
     return answer
 
 
-METHODS = {'gyro_calibration': gyro_calibration, 'greedy': greedy, 'lasso': lasso}
+METHODS = {
+    'gyro_calibration': gyro_calibration,
+    'greedy': select_greedily,
+    'lasso': select_by_lasso
+}

@@ -23,7 +23,12 @@ from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_rate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE, Progress
-from gyro_calibration.model.motion import CALIBRATION, from_headings, Motion, turns
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    constant_rate_motion,
+    Motion,
+    motion_from_headings,
+)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_reproduction.finding import (
     Comparison,
@@ -38,11 +43,12 @@ from scipy.stats import t as student
 
 TITLE = 'Bot Thoughts: gyro calibration of an L3G4200D (blog)'
 #: Turns a minute of a record player, and the nominal and the measured frequency of the strobe, Hz.
-SPEEDS, STROBE, MEASURED_STROBE = (0.0, 100.0 / 3.0, 45.0), 60.0, 59.8
+TURNS_PER_MINUTE, STROBE_FREQUENCY, MEASURED_STROBE_FREQUENCY = (
+    (0.0, 100.0 / 3.0, 45.0), 60.0, 59.8)
 #: Means at these speeds, counts.
-MEANS = (2.5654, -2854.5, -3857.9)
+MEAN_COUNTS = (2.5654, -2854.5, -3857.9)
 #: From the three speeds: counts a deg/s, and deg/s; the same by the solver on the encoder's rate.
-SCALE_FACTOR, NULL, SOLVED_SCALE, SOLVED_OFFSET = -14.309, -0.1793, -14.49787, -0.20168
+SCALE_FACTOR, NULL_RATE, SOLVED_SCALE, SOLVED_OFFSET = -14.309, -0.1793, -14.49787, -0.20168
 #: deg/s/K of the data sheet.
 BIAS_TEMPERATURE = 0.04
 #: deg/s a count at full scale 2000 deg/s, data sheet of the L3G4200D.
@@ -51,8 +57,8 @@ ENCODER_STEP, SAMPLE_RATE = 2.0 * DEGREE, 50.0
 #: Of the data sheet: 0.03 deg/s/sqrt(Hz), a one-sided density, which is sqrt(2) N.
 NOISE = Noise(0.03 * DEGREE / math.sqrt(2.0))
 #: Turns by hand at varying rates.
-BY_HAND = turns([(5, 0), (8, 60), (8, -120), (8, 200), (5, 0), (8, -200), (8, 120), (8, -60),
-                 (5, 0)], 1.0)
+HAND_MOTION = constant_rate_motion([(5, 0), (8, 60), (8, -120), (8, 200), (5, 0), (8, -200),
+                                    (8, 120), (8, -60), (5, 0)], 1.0)
 ASSUMED = (
     'The log of the encoder turntable is not published; 63 s of turning by hand up to 200 deg/s '
     'are simulated, with the noise of the L3G4200D (0.03 deg/s/sqrt(Hz)), an encoder of 2 deg '
@@ -64,44 +70,46 @@ def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
     """Reproduce the numbers of the blog."""
     found = np.array([encoder_errors(generator) for _ in progress(range(runs))])
-    return Reproduction(TITLE, ASSUMED, (*_three_speeds(), *_solver(found)),
-                        (*_slopes(), *_code(), _strobe(), _method(found)))
+    return Reproduction(TITLE, ASSUMED, (*_compare_three_speeds(), *_compare_solver(found)),
+                        (*_slope_contradictions(), *_code_contradictions(),
+                         _strobe_contradiction(), _method_contradiction(found)))
 
 
 # three speeds of a record player
 
-def slopes() -> tuple[float, float]:
+def segment_slopes() -> tuple[float, float]:
     """Return the slopes from 0 to 200 and from 200 to 270 deg/s, counts a deg/s."""
-    rates = np.array(SPEEDS) * 6.0
-    first, second = np.diff(MEANS) / np.diff(rates)
+    rates = np.array(TURNS_PER_MINUTE) * 6.0
+    first, second = np.diff(MEAN_COUNTS) / np.diff(rates)
     return float(first), float(second)
 
 
-def line() -> tuple[float, float, float, float]:
+def fit_line() -> tuple[float, float, float, float]:
     """Return slope, its 95 % interval either way, count at rest, and error of the middle point."""
-    rates, means = np.array(SPEEDS) * 6.0, np.array(MEANS)
+    rates, means = np.array(TURNS_PER_MINUTE) * 6.0, np.array(MEAN_COUNTS)
     fit = linregress(rates, means)
     interval = float(student.ppf(0.975, len(rates) - 2) * fit.stderr)
     return (float(fit.slope), interval, float(fit.intercept),
             float(means[1] - fit.intercept - fit.slope * rates[1]))
 
 
-def _three_speeds() -> list[Comparison]:
-    (first, second), (slope, interval, rest, _) = slopes(), line()
+def _compare_three_speeds() -> list[Comparison]:
+    (first, second), (slope, interval, rest, _) = segment_slopes(), fit_line()
     return [
-        from_own_figures('33 1/3 turns a minute', 'deg/s', 6.0 * SPEEDS[1], '200', 'part 1'),
-        from_own_figures('45 turns a minute', 'deg/s', 6.0 * SPEEDS[2], '270', 'part 1'),
+        from_own_figures('33 1/3 turns a minute', 'deg/s', 6.0 * TURNS_PER_MINUTE[1], '200',
+                         'part 1'),
+        from_own_figures('45 turns a minute', 'deg/s', 6.0 * TURNS_PER_MINUTE[2], '270', 'part 1'),
         from_own_figures('slope from 0 to 200 deg/s', 'counts/(deg/s)', first, '-14.285',
                          'part 1'),
         from_own_figures('slope from 200 to 270 deg/s', 'counts/(deg/s)', second, '-14.334',
                          'part 1'),
         from_own_figures('SF, mean of the slopes', 'counts/(deg/s)', (first + second) / 2.0,
                          '-14.309', 'part 1', 'cut off, not rounded'),
-        from_own_figures('N', 'deg/s', MEANS[0] / SCALE_FACTOR, '-0.1793', 'part 1'),
-        from_own_figures('strobe at 59.8 Hz', '%', 100.0 * (1.0 - MEASURED_STROBE / STROBE),
-                         '0.33', 'part 1'),
-        from_own_figures('solver and turntable differ by', '%',
-                         100.0 * (1.0 - SCALE_FACTOR / SOLVED_SCALE), '1.30', 'part 2',
+        from_own_figures('N', 'deg/s', MEAN_COUNTS[0] / SCALE_FACTOR, '-0.1793', 'part 1'),
+        from_own_figures('strobe at 59.8 Hz', '%', 100.0 *
+                         (1.0 - MEASURED_STROBE_FREQUENCY / STROBE_FREQUENCY), '0.33', 'part 1'),
+        from_own_figures('solver and turntable differ by', '%', 100.0 *
+                         (1.0 - SCALE_FACTOR / SOLVED_SCALE), '1.30', 'part 2',
                          note="of the solver's scale"),
         from_own_figures('temperature coefficient', 'deg/h/K', 3600.0 * BIAS_TEMPERATURE, '144',
                          'temperature'),
@@ -113,10 +121,10 @@ def _three_speeds() -> list[Comparison]:
     ]
 
 
-def _slopes() -> list[Contradiction]:
-    (first, second), (slope, interval, _, off) = slopes(), line()
-    rates = np.array(SPEEDS) * 6.0
-    null = MEANS[1] - second * rates[1] - MEANS[0]
+def _slope_contradictions() -> list[Contradiction]:
+    (first, second), (slope, interval, _, off) = segment_slopes(), fit_line()
+    rates = np.array(TURNS_PER_MINUTE) * 6.0
+    null = MEAN_COUNTS[1] - second * rates[1] - MEAN_COUNTS[0]
     return [
         Contradiction({'first': first, 'second': second, 'percent': 100.0 * (second / first - 1.0),
                        'off': abs(off / slope), 'null': abs(null / slope),
@@ -133,9 +141,9 @@ def _slopes() -> list[Contradiction]:
                        'rounded': (round(first, 3) + round(second, 3)) / 2.0},
                       'Part 1: the mean of the slopes is {mean:.4f}, and that of the printed '
                       'slopes {rounded:.4f}; the printed mean is -14.309.'),
-        Contradiction({'wrong': 2.0 * abs(MEANS[0] / SCALE_FACTOR),
-                       'offsets': abs(SOLVED_OFFSET - NULL),
-                       'hour': 3600.0 * abs(SOLVED_OFFSET - NULL)},
+        Contradiction({'wrong': 2.0 * abs(MEAN_COUNTS[0] / SCALE_FACTOR),
+                       'offsets': abs(SOLVED_OFFSET - NULL_RATE),
+                       'hour': 3600.0 * abs(SOLVED_OFFSET - NULL_RATE)},
                       'Part 2: the solver subtracts its offset, so the initial value [-14.309, '
                       '0.1793] has the wrong sign, an error of {wrong:.2f} deg/s. The fitted '
                       'offset and N of part 1 differ by {offsets:.3f} deg/s, {hour:.0f} deg/h.'),
@@ -144,7 +152,7 @@ def _slopes() -> list[Contradiction]:
 
 def gyro_rate(count: float) -> float:
     """Return the rate, deg/s, by the first function of the blog, for a signed count."""
-    return (count - MEANS[0]) / SCALE_FACTOR
+    return (count - MEAN_COUNTS[0]) / SCALE_FACTOR
 
 
 def gyro_rate_by_null(count: float) -> float:
@@ -152,10 +160,10 @@ def gyro_rate_by_null(count: float) -> float:
     return count / SCALE_FACTOR + 0.1793
 
 
-def _code() -> list[Contradiction]:
-    unsigned = float(round(MEANS[1]) % 2 ** 32)
-    difference = max(abs(gyro_rate(count) - gyro_rate_by_null(count)) for count in MEANS)
-    return [Contradiction({'difference': difference, 'right': gyro_rate(round(MEANS[1])),
+def _code_contradictions() -> list[Contradiction]:
+    unsigned = float(round(MEAN_COUNTS[1]) % 2 ** 32)
+    difference = max(abs(gyro_rate(count) - gyro_rate_by_null(count)) for count in MEAN_COUNTS)
+    return [Contradiction({'difference': difference, 'right': gyro_rate(round(MEAN_COUNTS[1])),
                            'unsigned': gyro_rate(unsigned)},
                           'Part 1: the two ways to compute the rate agree to {difference:.0e} '
                           'deg/s. But the function takes an unsigned int, and at 200 deg/s the '
@@ -163,9 +171,10 @@ def _code() -> list[Contradiction]:
                           '32 bits.')]
 
 
-def _strobe() -> Contradiction:
-    off, (first, second) = 100.0 * (1.0 - MEASURED_STROBE / STROBE), slopes()
-    corrected = SCALE_FACTOR * STROBE / MEASURED_STROBE
+def _strobe_contradiction() -> Contradiction:
+    off, (first, second) = (100.0 *
+                            (1.0 - MEASURED_STROBE_FREQUENCY / STROBE_FREQUENCY), segment_slopes())
+    corrected = SCALE_FACTOR * STROBE_FREQUENCY / MEASURED_STROBE_FREQUENCY
     numbers = {'off': off, 'slopes': 100.0 * (second / first - 1.0), 'corrected': corrected,
                'crystal': 100.0 * 80e-6, 'left': 100.0 * (1.0 - corrected / SOLVED_SCALE),
                'nominal': 100.0 * (-SENSITIVITY * first - 1.0)}
@@ -180,13 +189,13 @@ def _strobe() -> Contradiction:
 
 # an encoder of 2 deg
 
-def encoder_log(generator: np.random.Generator, late: float = 0.0) -> tuple[Array, Array, Motion]:
+def encoder_log(generator: np.random.Generator, delay: float = 0.0) -> tuple[Array, Array, Motion]:
     """Return time, s, rates of a gyro with noise only, rad/s, and the motion by the encoder."""
-    time = np.arange(round(BY_HAND.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
-    rate = BY_HAND.rate_at(time - late) + simulate_noise(
+    time = np.arange(round(HAND_MOTION.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
+    rate = HAND_MOTION.rate_at(time - delay) + simulate_noise(
         NOISE, len(time), 1.0 / SAMPLE_RATE, generator)
-    steps = np.floor(BY_HAND.heading_at(time) / ENCODER_STEP + generator.uniform())
-    return time, rate, from_headings(time, steps * ENCODER_STEP)
+    steps = np.floor(HAND_MOTION.heading_at(time) / ENCODER_STEP + generator.uniform())
+    return time, rate, motion_from_headings(time, steps * ENCODER_STEP)
 
 
 def encoder_errors(generator: np.random.Generator) -> tuple[float, ...]:
@@ -208,7 +217,7 @@ def encoder_errors(generator: np.random.Generator) -> tuple[float, ...]:
             float(reverse), float(np.abs(heading - motion.heading).max()))
 
 
-def _solver(found: Array) -> list[Comparison]:
+def _compare_solver(found: Array) -> list[Comparison]:
     means, deviations = found.mean(axis=0), found.std(axis=0, ddof=1)
     return [
         Comparison("scale by the solver's way on a gyro with this SF", 'counts/(deg/s)',
@@ -216,7 +225,7 @@ def _solver(found: Array) -> list[Comparison]:
                    3.0 * abs(SCALE_FACTOR) * deviations[0],
                    'not by the method; a scale error of encoder, strobe or time'),
         Comparison("offset by the solver's way on a gyro with this N", 'deg/s',
-                   NULL + means[1] / DEGREE, '-0.20168', 'part 2',
+                   NULL_RATE + means[1] / DEGREE, '-0.20168', 'part 2',
                    3.0 * deviations[1] / DEGREE, 'not by the method; possibly another null'),
         Comparison("error of scale, solver's way: mean", '%', 100.0 * means[0]),
         Comparison("error of scale, solver's way: standard deviation", '%', 100.0 * deviations[0]),
@@ -231,13 +240,13 @@ def _solver(found: Array) -> list[Comparison]:
     ]
 
 
-def _method(found: Array) -> Contradiction:
+def _method_contradiction(found: Array) -> Contradiction:
     means, deviations = 100.0 * found.mean(axis=0), 100.0 * found.std(axis=0, ddof=1)
     return Contradiction({'solver': means[0], 'solver_scatter': deviations[0], 'likely': means[2],
                           'likely_scatter': deviations[2], 'reverse': means[4],
-                          'slow': 100.0 * error_by_increments(CALIBRATION),
+                          'slow': 100.0 * increment_scale_error(CALIBRATION_MOTION),
                           'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0),
-                          'late': late_enough()},
+                          'late': explaining_delay()},
                          "Part 2: the two methods differ by {turntable:.2f} % of the turntable's"
                          ' SF. Fitting the gradient of a 2 deg encoder at 50 Hz errs by '
                          '{solver:.4f} +- {solver_scatter:.4f} % only, the likelihood by '
@@ -248,18 +257,18 @@ def _method(found: Array) -> Contradiction:
                          '{slow:.0f} %.')
 
 
-def error_by_increments(motion: Motion) -> float:
+def increment_scale_error(motion: Motion) -> float:
     """Return the error of scale, 1, of increments of an ideal gyro, fitted to the encoder's."""
     heading = motion.heading_at(np.arange(round(motion.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE)
     return float(linregress(np.diff(np.floor(heading / ENCODER_STEP) * ENCODER_STEP),
                             np.diff(heading)).slope) - 1.0
 
 
-def late_enough() -> float:
+def explaining_delay() -> float:
     """Return the delay of the gyro, s, that explains the difference of solver and turntable."""
-    time = np.arange(round(BY_HAND.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
+    time = np.arange(round(HAND_MOTION.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
 
-    def missing(late: float) -> float:
-        return fit_rate(time, BY_HAND.rate_at(time - late), BY_HAND).scale_factor_error - (
+    def scale_mismatch(late: float) -> float:
+        return fit_rate(time, HAND_MOTION.rate_at(time - late), HAND_MOTION).scale_factor_error - (
             SOLVED_SCALE / SCALE_FACTOR - 1.0)
-    return float(brentq(missing, 0.0, 1.0))
+    return float(brentq(scale_mismatch, 0.0, 1.0))

@@ -49,26 +49,28 @@ class Comparison:
     own_figures: bool = False
 
     @property
-    def value(self) -> float:
+    def published_value(self) -> float:
         """Return the published number; nan where there is none."""
         return float(self.published.lstrip('<~ ')) if self.published else math.nan
 
     @property
-    def agrees(self) -> bool:
+    def is_reproduced(self) -> bool:
         """Return whether both numbers agree within last digit and uncertainty."""
         if self.published.startswith('<'):
-            return self.ours + self.uncertainty < self.value
+            return self.ours + self.uncertainty < self.published_value
         if self.published.startswith('~'):
-            return self.ours * self.value > 0.0 and round(math.log10(self.ours / self.value)) == 0
-        return (abs(self.ours - self.value)
-                <= 0.5 * 10.0 ** -_decimals(self.published) * (1.0 + 1e-9) + self.uncertainty)
+            return (self.ours * self.published_value > 0.0
+                    and round(math.log10(self.ours / self.published_value)) == 0)
+        return (abs(self.ours - self.published_value)
+                <= 0.5 * 10.0 ** -_count_decimals(self.published) *
+                (1.0 + 1e-9) + self.uncertainty)
 
     @property
     def verdict(self) -> str:
         """Return the result of the comparison; '' where nothing is published."""
         if not self.published:
             return ''
-        if self.agrees:
+        if self.is_reproduced:
             return 'reproduced'
         return 'contradicts itself' if self.own_figures else 'differs'
 
@@ -78,24 +80,27 @@ class Comparison:
 
     def cells(self) -> tuple[str, ...]:
         """Return quantity, unit, place, published, ours and verdict as words for people."""
-        ours = _rounded(self.ours, self.uncertainty, self.published)
-        verdict = '; '.join(filter(None, [
-            ': '.join(filter(None, [self.verdict, '' if self.agrees else self.why])), self.note]))
+        ours = _format_rounded(self.ours, self.uncertainty, self.published)
+        verdict = '; '.join(
+            filter(None, [
+                ': '.join(filter(None, [self.verdict, '' if self.is_reproduced else self.why])),
+                self.note
+            ]))
         return self.quantity, self.unit, self.place, self.published or '-', ours, verdict
 
 
-def _rounded(ours: float, uncertainty: float, published: str) -> str:
+def _format_rounded(ours: float, uncertainty: float, published: str) -> str:
     """Return a number with two digits of its uncertainty, or one digit more than published."""
     if uncertainty:
         digits = max(0, 1 - math.floor(math.log10(uncertainty)))
         return f'{ours:.{digits}f} +- {uncertainty:.{digits}f}'
     if not published or published.startswith('<'):
         return f'{ours:#.4g}' if abs(ours) > 1e-6 else '0'
-    digits = _decimals(published) + 1 if '.' in published or ours != round(ours) else 0
+    digits = _count_decimals(published) + 1 if '.' in published or ours != round(ours) else 0
     return f'{ours:.{digits}f}'
 
 
-def _decimals(number: str) -> int:
+def _count_decimals(number: str) -> int:
     return len(number.partition('.')[2])
 
 

@@ -21,11 +21,16 @@ from __future__ import annotations
 import math
 
 from gyro_calibration.calibration.likelihood import fit_likelihood
-from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, record
+from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, to_model_record
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
 from gyro_calibration.logs.log import Array, DEGREE, Progress
 from gyro_calibration.model.gyro_model import SelfCalibration
-from gyro_calibration.model.motion import CALIBRATION, from_rates, Motion, ROBOT
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    Motion,
+    motion_from_rates,
+    ROBOT_MOTION,
+)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 from gyro_calibration_reproduction.finding import (
@@ -39,15 +44,15 @@ import numpy as np
 TITLE = ('Hong and Park: Minimal-drift heading measurement using a MEMS gyro for indoor mobile '
          'robots, Sensors 8, 2008')
 #: Scale factor error, 1, and bias, rad/s, of the simulations of section 3.1.
-S, B = -0.1, 0.1
+TRUE_SCALE_ERROR, TRUE_BIAS = -0.1, 0.1
 #: Sampling rates of reference and gyro in section 4.1, Hz.
-REFERENCE_RATE, GYRO_RATE = 20.0, 100.0
+REFERENCE_SAMPLE_RATE, GYRO_SAMPLE_RATE = 20.0, 100.0
 #: Sections 3.2 and 4.2: deg/s, deg/s as printed (deg/min is taken, see `_bias_unit`), s.
-THRESHOLD, PRINTED_BIAS, DRIVE = 0.3, 0.75, 160.0
+THRESHOLD, PRINTED_BIAS, DRIVE_DURATION = 0.3, 0.75, 160.0
 #: Table 1: mean and standard deviation of the heading error, deg.
 TABLE_1 = {'pure integration': (1.6675, 1.5075), 'self-calibration': (1.1511, 1.1675),
            'threshold filter': (0.7768, 1.2653), 'both': (0.5985, 1.2998)}
-PURE, CALIBRATED, FILTERED, PROPOSED = TABLE_1.values()
+PURE_ROW, CALIBRATED_ROW, FILTERED_ROW, PROPOSED_ROW = TABLE_1.values()
 ASSUMED = (
     'The motions of figures 6 and 7 are not published; a rest of 2 s and one turn with ramps of '
     '0.25 s is taken, its speed and length being those that give the two errors.',
@@ -61,10 +66,12 @@ def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
     """Reproduce the numbers of the paper."""
     errors = np.array([drive_errors(generator) for _ in progress(range(runs))])
-    return Reproduction(TITLE, ASSUMED, (*_self_calibration(), *_own_figures(), *_table(errors)),
-                        (_rectangle_rule(), _short_move(), _exchanged_columns(),
-                         _efficiency(generator, runs, progress), _bias_unit(), _percentages(),
-                         _half_an_hour(), _noise_over_threshold(errors), _slow_turns()))
+    return Reproduction(
+        TITLE, ASSUMED,
+        (*_compare_self_calibration(), *_compare_own_figures(), *_compare_table_1(errors)),
+        (_rectangle_rule(), _short_move(), _exchanged_columns(),
+         _efficiency(generator, runs, progress), _bias_unit(), _percentages(), _half_an_hour(),
+         _noise_over_threshold(errors), _slow_turns()))
 
 
 # figures 6 and 7
@@ -76,36 +83,36 @@ def one_turn(speed: float, duration: float) -> Motion:
     The second ramp begins `duration` s after the first one.
 
     """
-    return from_rates(np.array([0.0, 2.0, 2.25, 2.0 + duration, 2.25 + duration]),
-                      np.array([0.0, 0.0, speed, speed, 0.0]))
+    return motion_from_rates(np.array([0.0, 2.0, 2.25, 2.0 + duration, 2.25 + duration]),
+                             np.array([0.0, 0.0, speed, speed, 0.0]))
 
 
-def samples(motion: Motion) -> tuple[Array, Array]:
+def noiseless_output(motion: Motion) -> tuple[Array, Array]:
     """Return time, s, and output, rad/s, of the gyro of section 3.1, without noise."""
-    time = np.arange(round(motion.duration * REFERENCE_RATE) + 1) / REFERENCE_RATE
-    return time, (1.0 + S) * motion.rate_at(time) + B
+    time = np.arange(round(motion.duration * REFERENCE_SAMPLE_RATE) + 1) / REFERENCE_SAMPLE_RATE
+    return time, (1.0 + TRUE_SCALE_ERROR) * motion.rate_at(time) + TRUE_BIAS
 
 
-def _errors(scale_factor_error: float, bias: float) -> tuple[float, float]:
+def _percent_errors(scale_factor_error: float, bias: float) -> tuple[float, float]:
     """Return the errors of s and b, per cent of the true ones."""
-    return 100.0 * (scale_factor_error / S - 1.0), 100.0 * (bias / B - 1.0)
+    return 100.0 * (scale_factor_error / TRUE_SCALE_ERROR - 1.0), 100.0 * (bias / TRUE_BIAS - 1.0)
 
 
-def errors_by_rectangles(motion: Motion, late: int = 0) -> tuple[float, float]:
-    """Return the errors of s and b, %, by eq. 4 to 7; `late` is a delay of the gyro, intervals."""
-    time, rate = samples(motion)
-    fit = fit_heading(time[:len(time) - late], rate[late:], motion)
-    return _errors(fit.scale_factor_error, fit.bias)
+def errors_by_rectangles(motion: Motion, delay_samples: int = 0) -> tuple[float, float]:
+    """Return the errors of s and b, %, by eq. 4 to 7; the gyro lags by `delay_samples`."""
+    time, rate = noiseless_output(motion)
+    fit = fit_heading(time[:len(time) - delay_samples], rate[delay_samples:], motion)
+    return _percent_errors(fit.scale_factor_error, fit.bias)
 
 
 def errors_by_trapezoids(motion: Motion) -> tuple[float, float]:
     """Return the errors of s and b, %, by eq. 5 to 7 with the trapezoid rule for eq. 4."""
-    time, rate = samples(motion)
-    scale, offset = _cumulative(integrate(time, rate), time, motion.heading_at(time))
-    return _errors(1.0 / scale - 1.0, -offset / scale)
+    time, rate = noiseless_output(motion)
+    scale, offset = _solve_equation_7(integrate(time, rate), time, motion.heading_at(time))
+    return _percent_errors(1.0 / scale - 1.0, -offset / scale)
 
 
-def _cumulative(integral: Array, time: Array, heading: Array) -> Array:
+def _solve_equation_7(integral: Array, time: Array, heading: Array) -> Array:
     """Return s̄ and b̄ by eq. 7."""
     return np.linalg.lstsq(np.column_stack([integral, time]), heading, rcond=None)[0]
 
@@ -118,33 +125,39 @@ def published_motion() -> Motion:
     trapezoid rule is exact.
 
     """
-    durations = np.arange(60, 120) / REFERENCE_RATE
+    durations = np.arange(60, 120) / REFERENCE_SAMPLE_RATE
     duration = min(durations, key=lambda length: abs(
         errors_by_rectangles(one_turn(1.0, length))[0] + 4.8))
     return one_turn(20.26 / -errors_by_rectangles(one_turn(1.0, duration))[1], duration)
 
 
-def _self_calibration() -> list[Comparison]:
+def _compare_self_calibration() -> list[Comparison]:
     motion = published_motion()
-    time, rate = samples(motion)
+    time, rate = noiseless_output(motion)
     by_rate, likely = fit_rate(time, rate, motion), fit_likelihood(time, rate, motion)
-    ways = (('heading reference, rectangle rule of eq. 4', errors_by_rectangles(motion),
-             ('4.8', '20.26'), 'fig. 6', 'by a turn made to fit'),
-            ('heading reference, trapezoid rule', errors_by_trapezoids(motion), ('', ''), '', ''),
-            ('rate reference', _errors(by_rate.scale_factor_error, by_rate.bias), ('0', '0'),
-             'fig. 7', ''),
-            ('likelihood', _errors(likely.scale_factor_error, likely.bias), ('', ''), '', ''))
-    rows = [Comparison(f'error of {name}, {way}', '%', abs(error), published, place, note=note)
-            for way, errors, texts, place, note in ways
-            for name, error, published in zip('sb', errors, texts)]
-    return [Comparison('s_bar for s = -10 %', '1', 1.0 / (1.0 + S), '1.111', 'section 3.1'),
-            Comparison('b_bar for b = 0.1 rad/s', 'rad/s', -B / (1.0 + S), '-0.111',
-                       'section 3.1'), *rows]
+    estimators = (('heading reference, rectangle rule of eq. 4', errors_by_rectangles(motion),
+                   ('4.8', '20.26'), 'fig. 6', 'by a turn made to fit'),
+                  ('heading reference, trapezoid rule', errors_by_trapezoids(motion), ('', ''), '',
+                   ''), ('rate reference', _percent_errors(by_rate.scale_factor_error,
+                                                           by_rate.bias), ('0', '0'), 'fig. 7',
+                         ''), ('likelihood', _percent_errors(likely.scale_factor_error,
+                                                             likely.bias), ('', ''), '', ''))
+    rows = [
+        Comparison(f'error of {name}, {estimator}', '%', abs(error), published, place, note=note)
+        for estimator, errors, texts, place, note in estimators
+        for name, error, published in zip('sb', errors, texts)
+    ]
+    return [
+        Comparison('s_bar for s = -10 %', '1', 1.0 / (1.0 + TRUE_SCALE_ERROR), '1.111',
+                   'section 3.1'),
+        Comparison('b_bar for b = 0.1 rad/s', 'rad/s', -TRUE_BIAS / (1.0 + TRUE_SCALE_ERROR),
+                   '-0.111', 'section 3.1'), *rows
+    ]
 
 
 def equation_8(motion: Motion, as_printed: bool) -> Array:
     """Return [s̄, b̄] by eq. 8, with its columns as they are printed or exchanged."""
-    time, measured = samples(motion)
+    time, measured = noiseless_output(motion)
     true = motion.rate_at(time)
     matrix = np.array([[measured.sum(), measured @ measured], [len(measured), measured.sum()]])
     return np.linalg.solve(matrix if as_printed else matrix[:, ::-1],
@@ -153,7 +166,8 @@ def equation_8(motion: Motion, as_printed: bool) -> Array:
 
 def _rectangle_rule() -> Contradiction:
     motion = published_motion()
-    (s, b), (late_s, late_b) = errors_by_rectangles(motion), errors_by_rectangles(motion, late=1)
+    (s, b), (late_s, late_b) = (errors_by_rectangles(motion),
+                                errors_by_rectangles(motion, delay_samples=1))
     numbers = {'speed': float(motion.rate_at(np.array([4.0]))[0]), 'turn': motion.duration - 2.25,
                's': s, 'b': b, 'late_s': late_s, 'late_b': late_b,
                'trapezoid': max(map(abs, errors_by_trapezoids(motion)))}
@@ -167,12 +181,16 @@ def _rectangle_rule() -> Contradiction:
 
 
 def _short_move() -> Contradiction:
-    motion = from_rates(np.array([0.0, 0.95, 2.85, 3.8]), np.array([0.0, 0.4, 0.4, 0.0]))
-    fit = fit_heading(*samples(motion), motion)
+    motion = motion_from_rates(np.array([0.0, 0.95, 2.85, 3.8]), np.array([0.0, 0.4, 0.4, 0.0]))
+    fit = fit_heading(*noiseless_output(motion), motion)
     found, (s, b) = (SelfCalibration(fit.scale_factor_error, fit.bias),
-                     _errors(fit.scale_factor_error, fit.bias))
-    numbers = {'s_bar': 100.0 * (found.scale * (1.0 + S) - 1.0),
-               'b_bar': 100.0 * (found.offset * (1.0 + S) / -B - 1.0), 's': s, 'b': b}
+                     _percent_errors(fit.scale_factor_error, fit.bias))
+    numbers = {
+        's_bar': 100.0 * (found.scale * (1.0 + TRUE_SCALE_ERROR) - 1.0),
+        'b_bar': 100.0 * (found.offset * (1.0 + TRUE_SCALE_ERROR) / -TRUE_BIAS - 1.0),
+        's': s,
+        'b': b
+    }
     return Contradiction(numbers,
                          'Figure 6: a trapezoid of 3.8 s up to 0.4 rad/s errs by {s_bar:.2f} % in '
                          's_bar and {b_bar:.2f} % in b_bar, which is {s:.1f} % in s and {b:.1f} % '
@@ -180,7 +198,8 @@ def _short_move() -> Contradiction:
 
 
 def _exchanged_columns() -> Contradiction:
-    printed, exchanged = equation_8(CALIBRATION, True), equation_8(CALIBRATION, False)
+    printed, exchanged = (equation_8(CALIBRATION_MOTION,
+                                     True), equation_8(CALIBRATION_MOTION, False))
     return Contradiction({'first': printed[0], 'second': printed[1], 'right_first': exchanged[0],
                           'right_second': exchanged[1]},
                          'Eq. 8: the columns of the matrix are exchanged. The printed form gives'
@@ -195,7 +214,7 @@ def drift_in_half_an_hour() -> tuple[float, float]:
     return XV3500.bias_instability * 0.5, XV3500.angle_random_walk * math.sqrt(0.5)
 
 
-def _own_figures() -> list[Comparison]:
+def _compare_own_figures() -> list[Comparison]:
     drift = drift_in_half_an_hour()
     return [
         from_own_figures('scale factor error of 2.53 %, after one revolution', 'deg',
@@ -204,23 +223,24 @@ def _own_figures() -> list[Comparison]:
                          'section 1', note='deviations do not add so'),
         from_own_figures('drift in 30 min, root of the sum of squares', 'deg', math.hypot(*drift),
                          '11', 'section 1', 'called a standard deviation'),
-        from_own_figures('off pure integration, self-calibration', '%', _off(CALIBRATED[0]), '41',
-                         'section 4.2', 'so says table 1'),
-        from_own_figures('off pure integration, threshold filter', '%', _off(FILTERED[0]), '53',
-                         'section 4.2'),
-        from_own_figures('off pure integration, both', '%', _off(PROPOSED[0]), '64',
-                         'section 4.2'),
+        from_own_figures('off pure integration, self-calibration', '%',
+                         _percent_reduction(CALIBRATED_ROW[0]), '41', 'section 4.2',
+                         'so says table 1'),
+        from_own_figures('off pure integration, threshold filter', '%',
+                         _percent_reduction(FILTERED_ROW[0]), '53', 'section 4.2'),
+        from_own_figures('off pure integration, both', '%', _percent_reduction(PROPOSED_ROW[0]),
+                         '64', 'section 4.2'),
     ]
 
 
-def _off(mean: float) -> float:
+def _percent_reduction(mean: float) -> float:
     """Return the reduction of the error of pure integration, table 1, %."""
-    return 100.0 - 100.0 * mean / PURE[0]
+    return 100.0 - 100.0 * mean / PURE_ROW[0]
 
 
 def _bias_unit() -> Contradiction:
-    drift = PRINTED_BIAS * DRIVE
-    return Contradiction({'drift': drift, 'mean': drift / 2.0, 'published': PURE[0],
+    drift = PRINTED_BIAS * DRIVE_DURATION
+    return Contradiction({'drift': drift, 'mean': drift / 2.0, 'published': PURE_ROW[0],
                           'fits': drift / 60.0},
                          'Section 4.2: b = 0.75 deg/s drifts by {drift:.0f} deg in 160 s, with a'
                          ' mean of {mean:.0f} deg; table 1 has a mean error of {published:.2f} '
@@ -228,12 +248,15 @@ def _bias_unit() -> Contradiction:
 
 
 def _percentages() -> Contradiction:
-    return Contradiction({'table': _off(CALIBRATED[0]), 'mean': _off(PROPOSED[0]),
-                          'deviation': 100.0 - 100.0 * PROPOSED[1] / PURE[1]},
-                         'Section 4.2: the text states that self-calibration reduces the error '
-                         'by 41 %, table 1 by {table:.0f} %. Both methods together reduce the '
-                         'mean error by {mean:.0f} %, and its standard deviation by '
-                         '{deviation:.0f} %.')
+    return Contradiction(
+        {
+            'table': _percent_reduction(CALIBRATED_ROW[0]),
+            'mean': _percent_reduction(PROPOSED_ROW[0]),
+            'deviation': 100.0 - 100.0 * PROPOSED_ROW[1] / PURE_ROW[1]
+        }, 'Section 4.2: the text states that self-calibration reduces the error '
+        'by 41 %, table 1 by {table:.0f} %. Both methods together reduce the '
+        'mean error by {mean:.0f} %, and its standard deviation by '
+        '{deviation:.0f} %.')
 
 
 def _half_an_hour() -> Contradiction:
@@ -249,57 +272,61 @@ def _half_an_hour() -> Contradiction:
 #: The filters of table 1: single samples as published, and the mean of 0.2 s.
 FILTERS = {'single samples': Threshold(THRESHOLD * DEGREE, 0.0),
            'mean of 0.2 s': Threshold(THRESHOLD * DEGREE, 0.2)}
-_FILTER = ('below the noise of a sample', 'the exact times of rest give no more',
-           's and b act during turns')
-_OTHER = 'their error held more than s, b and noise'
+_FILTER_REASONS = ('below the noise of a sample', 'the exact times of rest give no more',
+                   's and b act during turns')
+_OTHER_REASON = 'their error held more than s, b and noise'
 #: The methods of `drive_errors`: name, the row of table 1, its reduction of the error of pure
 #: integration, %, and the reason of the difference here, where only s, b and noise are simulated.
 METHODS = (
-    ('pure integration', PURE, '', ''),
-    ('self-calibration by eq. 7', CALIBRATED, '31', _OTHER),
-    ('self-calibration by likelihood', CALIBRATED, '31', _OTHER),
-    ('threshold filter, single samples', FILTERED, '53', _FILTER[0]),
-    ('threshold filter, mean of 0.2 s', FILTERED, '53', _FILTER[1]),
-    ('rest known exactly', FILTERED, '53', _FILTER[2]),
-    ('eq. 7 and filter, single samples', PROPOSED, '64', _OTHER),
-    ('eq. 7 and filter, mean of 0.2 s', PROPOSED, '64', _OTHER),
-    ('likelihood and filter, single samples', PROPOSED, '64', _OTHER),
-    ('likelihood and filter, mean of 0.2 s', PROPOSED, '64', _OTHER),
+    ('pure integration', PURE_ROW, '', ''),
+    ('self-calibration by eq. 7', CALIBRATED_ROW, '31', _OTHER_REASON),
+    ('self-calibration by likelihood', CALIBRATED_ROW, '31', _OTHER_REASON),
+    ('threshold filter, single samples', FILTERED_ROW, '53', _FILTER_REASONS[0]),
+    ('threshold filter, mean of 0.2 s', FILTERED_ROW, '53', _FILTER_REASONS[1]),
+    ('rest known exactly', FILTERED_ROW, '53', _FILTER_REASONS[2]),
+    ('eq. 7 and filter, single samples', PROPOSED_ROW, '64', _OTHER_REASON),
+    ('eq. 7 and filter, mean of 0.2 s', PROPOSED_ROW, '64', _OTHER_REASON),
+    ('likelihood and filter, single samples', PROPOSED_ROW, '64', _OTHER_REASON),
+    ('likelihood and filter, mean of 0.2 s', PROPOSED_ROW, '64', _OTHER_REASON),
 )
 # Both motions in sequence, joined at rest.
-BOTH = Motion(np.append(CALIBRATION.time, CALIBRATION.duration + ROBOT.time[1:]),
-              np.append(CALIBRATION.heading, CALIBRATION.heading[-1] + ROBOT.heading[1:]),
-              np.append(CALIBRATION.rate_at(CALIBRATION.time), ROBOT.rate_at(ROBOT.time)[1:]))
+FULL_MOTION = Motion(
+    np.append(CALIBRATION_MOTION.time, CALIBRATION_MOTION.duration + ROBOT_MOTION.time[1:]),
+    np.append(CALIBRATION_MOTION.heading,
+              CALIBRATION_MOTION.heading[-1] + ROBOT_MOTION.heading[1:]),
+    np.append(CALIBRATION_MOTION.rate_at(CALIBRATION_MOTION.time),
+              ROBOT_MOTION.rate_at(ROBOT_MOTION.time)[1:]))
 
 
-def output_of(motion: Motion, noise: Noise, generator: np.random.Generator) -> tuple[Array, Array]:
+def noisy_output(motion: Motion, noise: Noise,
+                 generator: np.random.Generator) -> tuple[Array, Array]:
     """Return time, s, and output, rad/s, of the gyro of section 4."""
-    time = np.arange(round(motion.duration * GYRO_RATE) + 1) / GYRO_RATE
+    time = np.arange(round(motion.duration * GYRO_SAMPLE_RATE) + 1) / GYRO_SAMPLE_RATE
     return time, XV3500.model.output(motion.rate_at(time), 25.0) + simulate_noise(
-        noise, len(time), 1.0 / GYRO_RATE, generator)
+        noise, len(time), 1.0 / GYRO_SAMPLE_RATE, generator)
 
 
 def drive_errors(generator: np.random.Generator) -> Array:
     """Return the mean absolute heading error of a simulated drive, deg, by each of `METHODS`."""
-    time, output = output_of(BOTH, XV3500.noise, generator)
-    run = time <= CALIBRATION.duration
-    fits = (fit_heading(time[run], output[run], CALIBRATION),
-            fit_likelihood(time[run], output[run], CALIBRATION, 0.1))
-    rates = [output, *(record(fit, '', '', None).correct(output) for fit in fits)]
+    time, output = noisy_output(FULL_MOTION, XV3500.noise, generator)
+    run = time <= CALIBRATION_MOTION.duration
+    fits = (fit_heading(time[run], output[run], CALIBRATION_MOTION),
+            fit_likelihood(time[run], output[run], CALIBRATION_MOTION, 0.1))
+    rates = [output, *(to_model_record(fit, '', '', None).correct(output) for fit in fits)]
     filtered = [[filter_rates(settings, time, rate) for settings in FILTERS.values()]
                 for rate in rates]
-    known = np.where(BOTH.rate_at(time) == 0.0, 0.0, output)
+    known = np.where(FULL_MOTION.rate_at(time) == 0.0, 0.0, output)
     return np.array([_mean_error(time, rate)
                      for rate in (*rates, *filtered[0], known, *filtered[1], *filtered[2])])
 
 
 def _mean_error(time: Array, rate: Array) -> float:
-    drive = time >= CALIBRATION.duration
-    true = ROBOT.heading_at(time[drive] - CALIBRATION.duration)
+    drive = time >= CALIBRATION_MOTION.duration
+    true = ROBOT_MOTION.heading_at(time[drive] - CALIBRATION_MOTION.duration)
     return float(np.abs(integrate(time[drive], rate[drive]) - true).mean()) / DEGREE
 
 
-def _table(errors: Array) -> list[Comparison]:
+def _compare_table_1(errors: Array) -> list[Comparison]:
     rows, means = [], errors.mean(axis=0)
     for number, (name, (published, _), percent, why) in enumerate(METHODS):
         uncertainty = 3.0 * _standard_error(errors[:, number])
@@ -322,14 +349,18 @@ def _standard_error(values: Array) -> float:
 # the threshold filter
 
 def _noise_over_threshold(errors: Array) -> Contradiction:
-    off = dict(zip((method[0] for method in METHODS),
-                   100.0 - 100.0 * errors.mean(axis=0) / errors[:, 0].mean()))
-    sigma = math.sqrt(XV3500.noise.rate_variance(1.0 / GYRO_RATE)) / DEGREE
-    numbers = {'sigma': sigma, 'ratio': THRESHOLD / sigma,
-               'passes': 100.0 * math.erfc(THRESHOLD / sigma / math.sqrt(2.0)),
-               'single': off['threshold filter, single samples'],
-               'mean': off['threshold filter, mean of 0.2 s'], 'known': off['rest known exactly'],
-               'both': off['likelihood and filter, mean of 0.2 s']}
+    reductions = dict(zip((method[0] for method in METHODS),
+                          100.0 - 100.0 * errors.mean(axis=0) / errors[:, 0].mean()))
+    sigma = math.sqrt(XV3500.noise.rate_variance(1.0 / GYRO_SAMPLE_RATE)) / DEGREE
+    numbers = {
+        'sigma': sigma,
+        'ratio': THRESHOLD / sigma,
+        'passes': 100.0 * math.erfc(THRESHOLD / sigma / math.sqrt(2.0)),
+        'single': reductions['threshold filter, single samples'],
+        'mean': reductions['threshold filter, mean of 0.2 s'],
+        'known': reductions['rest known exactly'],
+        'both': reductions['likelihood and filter, mean of 0.2 s']
+    }
     return Contradiction(numbers,
                          'Eq. 12: 2.5 deg/sqrt(h) is {sigma:.3f} deg/s in a white sample at 100 '
                          'Hz, so 0.3 deg/s is {ratio:.2f} sigma, and {passes:.0f} % of the '
@@ -349,7 +380,7 @@ def _slow_turns() -> Contradiction:
 
 def _kept_heading(part: float) -> float:
     """Return the heading, deg, of a minute of turning at a part of the threshold, no noise."""
-    time = np.arange(6001) / GYRO_RATE
+    time = np.arange(6001) / GYRO_SAMPLE_RATE
     rate = np.full(len(time), part * THRESHOLD * DEGREE)
     return float(integrate(time, filter_rates(FILTERS['single samples'], time, rate))[-1]) / DEGREE
 
@@ -360,13 +391,14 @@ def _efficiency(generator: np.random.Generator, runs: int, progress: Progress) -
     """Return the scatter of eq. 7 and of the likelihood over the Cramér-Rao bound, white noise."""
     white, found = Noise(XV3500.noise.angle_random_walk), []
     for _ in progress(range(runs)):
-        time, rate = output_of(CALIBRATION, white, generator)
-        scale, offset = _cumulative(integrate(time, rate), time, CALIBRATION.heading_at(time))
-        likely = fit_likelihood(time, rate, CALIBRATION, 0.1)
+        time, rate = noisy_output(CALIBRATION_MOTION, white, generator)
+        scale, offset = _solve_equation_7(integrate(time, rate), time,
+                                          CALIBRATION_MOTION.heading_at(time))
+        likely = fit_likelihood(time, rate, CALIBRATION_MOTION, 0.1)
         found.append((1.0 / scale, -offset / scale, 1.0 + likely.scale_factor_error, likely.bias))
-    columns = np.column_stack([CALIBRATION.rate_at(time), np.ones(len(time))])
+    columns = np.column_stack([CALIBRATION_MOTION.rate_at(time), np.ones(len(time))])
     bound = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns))
-                    * white.rate_variance(1.0 / GYRO_RATE))
+                    * white.rate_variance(1.0 / GYRO_SAMPLE_RATE))
     ratios = np.std(found, axis=0, ddof=1).reshape(2, 2) / bound
     return Contradiction({'s': ratios[0, 0], 'b': ratios[0, 1], 'likely_s': ratios[1, 0],
                           'likely_b': ratios[1, 1]},

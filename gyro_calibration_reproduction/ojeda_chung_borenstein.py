@@ -47,18 +47,20 @@ TITLE = ('Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyr
          'mobile robot navigation, ICRA 2000')
 #: Table I: deg/s; % over all temperatures, p-p; % rms; deg/s; deg/s over all temperatures, p-p;
 #: (deg/h)/√Hz; and from section 4, Hz.
-FULL_SCALE, SCALE_OVER_TEMPERATURE, NONLINEARITY, STABILITY = 100.0, 2.0, 0.5, 0.002
+FULL_SCALE, SCALE_OVER_TEMPERATURE, NONLINEARITY, BIAS_STABILITY = 100.0, 2.0, 0.5, 0.002
 BIAS_OVER_TEMPERATURE, ANGLE_RANDOM_WALK, OUTPUT_RATE = 0.2, 5.0, 10.0
 #: Section 3: samples of a data set, orders p and q, degC.
-SAMPLES, RATE_ORDER, TEMPERATURE_ORDER, COLDEST, WARMEST = 100, 3, 2, 25.0, 45.0
+SAMPLES_PER_SET, RATE_ORDER, TEMPERATURE_ORDER, MIN_TEMPERATURE, MAX_TEMPERATURE = (
+    100, 3, 2, 25.0, 45.0)
 #: Assumed: K from the coldest to the warmest of Table I; s, so that a turn at 100 deg/s reads
 #: half a deg/s less.
-ALL_TEMPERATURES, SAGNAC = 115.0, 0.1
+TEMPERATURE_SPAN, SINE_CONSTANT = 115.0, 0.1
 #: Assumed for comparison: a shaking table, deg/s, and the sine of another open-loop gyro, s.
-VIBRATION, STRONG_SAGNAC = 1.0, 0.25
+VIBRATION_RATE, STRONG_SINE_CONSTANT = 1.0, 0.25
 LATITUDE, EARTH_RATE = 42.28, 15.04  # of Ann Arbor, deg, and deg/h
 POLYNOMIAL = rate_temperature_polynomial(RATE_ORDER, TEMPERATURE_ORDER)
-PHYSICAL = (BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE)
+PHYSICAL_EFFECTS = ((BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, SCALE_FACTOR_TEMPERATURE,
+                     SINE_RESPONSE))
 #: Rates and temperatures of a campaign: the fewest, those of p = q = 11, and every 10 deg/s.
 CAMPAIGNS = ((4, 3), (11, 11), (21, 11))
 ASSUMED = (
@@ -73,53 +75,56 @@ ASSUMED = (
 )
 
 
-def rd2100(sagnac: float = SAGNAC) -> GyroModel:
+def rd2100(sine_constant: float = SINE_CONSTANT) -> GyroModel:
     """Return a gyro like the KVH E-Core RD2100, with the sine response of a given k, s."""
     terms = (Term(BIAS, (0.02 * DEGREE,)),
              Term(BIAS_TEMPERATURE,
-                  (COLDEST, BIAS_OVER_TEMPERATURE * DEGREE / ALL_TEMPERATURES)),
+                  (MIN_TEMPERATURE, BIAS_OVER_TEMPERATURE * DEGREE / TEMPERATURE_SPAN)),
              Term(SCALE_FACTOR_TEMPERATURE,
-                  (COLDEST, SCALE_OVER_TEMPERATURE / 100.0 / ALL_TEMPERATURES)),
-             Term(SINE_RESPONSE, (sagnac, 1.0)))
-    return GyroModel(terms, noise=Noise(ANGLE_RANDOM_WALK * DEGREE / 3600.0, STABILITY * DEGREE))
+                  (MIN_TEMPERATURE, SCALE_OVER_TEMPERATURE / 100.0 / TEMPERATURE_SPAN)),
+             Term(SINE_RESPONSE, (sine_constant, 1.0)))
+    return GyroModel(terms, noise=Noise(ANGLE_RANDOM_WALK * DEGREE / 3600.0,
+                                        BIAS_STABILITY * DEGREE))
 
 
 def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
     """Reproduce the numbers of the paper."""
     found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
-    return Reproduction(TITLE, ASSUMED, (*_own_figures(), *_instrument(), *_results(found)),
-                        (_index(), _data_sets(), _condition(), _regressor(generator),
-                         _sine(generator, len(found), progress), _order_of_magnitude(found),
-                         _percent(found), _full_turn(), _earth()))
+    return Reproduction(
+        TITLE, ASSUMED,
+        (*_compare_own_figures(), *_compare_instrument(), *_compare_results(found)),
+        (_index(), _data_sets(), _condition(), _regressor(generator),
+         _sine(generator, len(found),
+               progress), _order_of_magnitude(found), _percent(found), _full_turn(), _earth()))
 
 
 # a rate table
 
-def grid(rates: Array, temperatures: Array) -> tuple[Array, Array]:
+def rate_temperature_grid(rates: Array, temperatures: Array) -> tuple[Array, Array]:
     """Return every rate at every temperature, temperature by temperature."""
     return np.tile(rates, len(temperatures)), np.repeat(temperatures, len(rates))
 
 
-def rate_table(gyro: GyroModel, rates: Array, temperatures: Array,
-               generator: np.random.Generator) -> Dwells:
+def simulate_rate_table(gyro: GyroModel, rates: Array, temperatures: Array,
+                        generator: np.random.Generator) -> Dwells:
     """Return averaged data sets (eq. 5 to 7) for rates, rad/s, and temperatures, degC."""
-    rate, temperature = grid(rates, temperatures)
-    noise = simulate_noise(gyro.noise, len(rate) * SAMPLES, 1.0 / OUTPUT_RATE,
-                           generator).reshape(len(rate), SAMPLES)
+    rate, temperature = rate_temperature_grid(rates, temperatures)
+    noise = simulate_noise(gyro.noise, len(rate) * SAMPLES_PER_SET, 1.0 / OUTPUT_RATE,
+                           generator).reshape(len(rate), SAMPLES_PER_SET)
     return Dwells(rate, gyro.output(rate, temperature) + noise.mean(axis=1), temperature,
                   np.full(len(rate), np.nan),
                   np.repeat(np.arange(len(temperatures)), len(rates)), ('',) * len(rate))
 
 
-def fit(dwells: Dwells, effects: Sequence[Effect]) -> GyroModel:
+def fit_model(dwells: Dwells, effects: Sequence[Effect]) -> GyroModel:
     """Return the model by least squares with equal weights of all data sets (eq. 9)."""
-    alike = Scatter(dwell=1.0, dwell_scale=0.0, sweep_bias=0.0, sweep_scale=0.0,
-                    kept=np.ones(len(dwells), bool))
-    return fit_effects(dwells, effects, alike).model
+    equal_scatter = Scatter(dwell_bias=1.0, dwell_scale=0.0, sweep_bias=0.0, sweep_scale=0.0,
+                            inliers=np.ones(len(dwells), bool))
+    return fit_effects(dwells, effects, equal_scatter).model
 
 
-def spread(count: int) -> Array:
+def full_range_rates(count: int) -> Array:
     """Return rates over the whole range, rad/s."""
     return np.linspace(-FULL_SCALE, FULL_SCALE, count) * DEGREE
 
@@ -135,19 +140,22 @@ def calibrate_and_turn(generator: np.random.Generator) -> Array:
 
     """
     gyro = rd2100()
-    tables = (rate_table(gyro, spread(rates), np.linspace(COLDEST, WARMEST, temperatures),
-                         generator) for rates, temperatures in CAMPAIGNS)
-    models = [GyroModel(), *(fit(table, [POLYNOMIAL]) for table in tables)]
+    tables = (simulate_rate_table(gyro, full_range_rates(rates),
+                                  np.linspace(MIN_TEMPERATURE, MAX_TEMPERATURE, temperatures),
+                                  generator) for rates, temperatures in CAMPAIGNS)
+    models = [GyroModel(), *(fit_model(table, [POLYNOMIAL]) for table in tables)]
     speeds = np.arange(5.0, FULL_SCALE + 1.0, 5.0) * DEGREE
-    rates, temperatures = grid(np.concatenate([-speeds[::-1], speeds]),
-                               np.arange(COLDEST, WARMEST + 1.0, 2.0))
-    errors, durations = simulated_turns(gyro, models, rates, temperatures, generator)
+    rates, temperatures = rate_temperature_grid(
+        np.concatenate([-speeds[::-1], speeds]),
+        np.arange(MIN_TEMPERATURE, MAX_TEMPERATURE + 1.0, 2.0))
+    errors, durations = simulate_turn_errors(gyro, models, rates, temperatures, generator)
     return np.column_stack([np.sqrt(np.mean((errors / durations) ** 2, axis=1)),
                             np.abs(errors).max(axis=1)])
 
 
-def simulated_turns(gyro: GyroModel, models: Sequence[GyroModel], rates: Array,
-                    temperatures: Array, generator: np.random.Generator) -> tuple[Array, Array]:
+def simulate_turn_errors(gyro: GyroModel, models: Sequence[GyroModel], rates: Array,
+                         temperatures: Array,
+                         generator: np.random.Generator) -> tuple[Array, Array]:
     """
     Return the errors of full turns, each after a rest, rad, and the durations of the turns, s.
 
@@ -156,7 +164,7 @@ def simulated_turns(gyro: GyroModel, models: Sequence[GyroModel], rates: Array,
     """
     turning = np.round(2.0 * math.pi / np.abs(rates) * OUTPUT_RATE).astype(int)
     # of rest and turn in turn
-    lengths = np.column_stack([np.full(len(rates), SAMPLES), turning]).ravel()
+    lengths = np.column_stack([np.full(len(rates), SAMPLES_PER_SET), turning]).ravel()
     rate = np.repeat(np.column_stack([np.zeros(len(rates)), rates]).ravel(), lengths)
     temperature = np.repeat(np.repeat(temperatures, 2), lengths)
     output = gyro.output(rate, temperature) + simulate_noise(
@@ -170,14 +178,15 @@ def simulated_turns(gyro: GyroModel, models: Sequence[GyroModel], rates: Array,
 
 # Table I and the synthetic gyro
 
-def _own_figures() -> list[Comparison]:
+def _compare_own_figures() -> list[Comparison]:
     sets = (len(np.arange(-FULL_SCALE, FULL_SCALE + 1.0, 10.0))
-            * len(np.arange(COLDEST, WARMEST + 1.0, 2.0)))
+            * len(np.arange(MIN_TEMPERATURE, MAX_TEMPERATURE + 1.0, 2.0)))
     return [
-        from_own_figures('drift of 0.002 deg/s', 'deg/min', 60.0 * STABILITY, '0.12', 'section 1'),
-        from_own_figures('drift of 0.002 deg/s in an hour', 'deg/h', 3600.0 * STABILITY, '7.2',
+        from_own_figures('drift of 0.002 deg/s', 'deg/min', 60.0 * BIAS_STABILITY, '0.12',
                          'section 1'),
-        from_own_figures('drift of 0.002 deg/s in 10 min', 'deg', 600.0 * STABILITY, '1.2',
+        from_own_figures('drift of 0.002 deg/s in an hour', 'deg/h', 3600.0 * BIAS_STABILITY,
+                         '7.2', 'section 1'),
+        from_own_figures('drift of 0.002 deg/s in 10 min', 'deg', 600.0 * BIAS_STABILITY, '1.2',
                          'section 1'),
         from_own_figures('angle random walk of 5 (deg/h)/sqrt(Hz)', 'deg/sqrt(h)',
                          ANGLE_RANDOM_WALK / 60.0, '0.08', 'table I'),
@@ -189,12 +198,12 @@ def _own_figures() -> list[Comparison]:
     ]
 
 
-def _instrument() -> list[Comparison]:
-    rates, gyro = spread(201), rd2100()
-    line = gyro.output(rates, COLDEST)
+def _compare_instrument() -> list[Comparison]:
+    rates, gyro = full_range_rates(201), rd2100()
+    line = gyro.output(rates, MIN_TEMPERATURE)
     left = line - np.polyval(np.polyfit(rates, line, 1), rates)
     slopes = [np.polyfit(rates, gyro.output(rates, temperature), 1)
-              for temperature in (COLDEST, WARMEST)]
+              for temperature in (MIN_TEMPERATURE, MAX_TEMPERATURE)]
     (cold_slope, cold_bias), (warm_slope, warm_bias) = slopes
     return [
         Comparison('synthetic: error at 100 deg/s, 25 degC', 'deg/s',
@@ -208,7 +217,7 @@ def _instrument() -> list[Comparison]:
     ]
 
 
-def _results(found: Array) -> list[Comparison]:
+def _compare_results(found: Array) -> list[Comparison]:
     means, uncertainties = (found.mean(axis=0),
                             3.0 * found.std(axis=0, ddof=1) / math.sqrt(len(found)))
     percent = 100.0 / (2.0 * math.pi)
@@ -278,8 +287,9 @@ def _index() -> Contradiction:
 
 
 def _data_sets() -> Contradiction:
-    rates, temperatures = (len(np.arange(low, high + 1.0, step)) for low, high, step in
-                           ((-FULL_SCALE, FULL_SCALE, 10.0), (COLDEST, WARMEST, 2.0)))
+    rates, temperatures = (len(np.arange(low, high + 1.0, step))
+                           for low, high, step in ((-FULL_SCALE, FULL_SCALE, 10.0),
+                                                   (MIN_TEMPERATURE, MAX_TEMPERATURE, 2.0)))
     return Contradiction({'rates': rates, 'temperatures': temperatures,
                           'sets': rates * temperatures, 'step': 2.0 * FULL_SCALE / 10.0},
                          'Section 3.3: steps of 10 deg/s over +-100 deg/s give {rates:d} rates, '
@@ -290,8 +300,10 @@ def _data_sets() -> Contradiction:
 
 def condition_numbers() -> tuple[float, float]:
     """Return the condition numbers for deg/s and degC, raw, and centred and scaled to +-1."""
-    rates, temperatures = grid(spread(21) / DEGREE, np.linspace(COLDEST, WARMEST, 11))
-    middle, half = (COLDEST + WARMEST) / 2.0, (WARMEST - COLDEST) / 2.0
+    rates, temperatures = rate_temperature_grid(
+        full_range_rates(21) / DEGREE, np.linspace(MIN_TEMPERATURE, MAX_TEMPERATURE, 11))
+    middle, half = ((MIN_TEMPERATURE + MAX_TEMPERATURE) / 2.0,
+                    (MAX_TEMPERATURE - MIN_TEMPERATURE) / 2.0)
     raw, scaled = (
         np.linalg.cond(np.column_stack([rate ** i * temperature ** j
                                         for j in range(TEMPERATURE_ORDER + 1)
@@ -311,8 +323,8 @@ def _condition() -> Contradiction:
                          ' is all.')
 
 
-def error_by_regressor(deviation: float, averaged: int, generator: np.random.Generator,
-                       samples: int = 20_000) -> float:
+def regressor_error(deviation: float, averaged: int, generator: np.random.Generator,
+                    samples: int = 20_000) -> float:
     """
     Return the error of eq. 3 at 100 deg/s if it is fitted over noisy outputs, rad/s.
 
@@ -323,8 +335,8 @@ def error_by_regressor(deviation: float, averaged: int, generator: np.random.Gen
     samples : at each rate
 
     """
-    rates = np.repeat(spread(21), samples // averaged)
-    clean = rd2100().output(rates, COLDEST)
+    rates = np.repeat(full_range_rates(21), samples // averaged)
+    clean = rd2100().output(rates, MIN_TEMPERATURE)
     noisy = clean + generator.standard_normal(len(rates)) * deviation / math.sqrt(averaged)
     wrong, right = (np.polynomial.Polynomial.fit(output, noisy - rates, RATE_ORDER)
                     for output in (noisy, clean))
@@ -333,10 +345,10 @@ def error_by_regressor(deviation: float, averaged: int, generator: np.random.Gen
 
 def _regressor(generator: np.random.Generator) -> Contradiction:
     white = math.sqrt(rd2100().noise.rate_variance(1.0 / OUTPUT_RATE))
-    numbers = {'white': white / DEGREE, 'vibration': VIBRATION}
-    for name, deviation in (('white', white), ('vibration', VIBRATION * DEGREE)):
-        for kind, averaged in (('single', 1), ('mean', SAMPLES)):
-            numbers[f'{name}_{kind}'] = error_by_regressor(deviation, averaged, generator) / DEGREE
+    numbers = {'white': white / DEGREE, 'vibration': VIBRATION_RATE}
+    for name, deviation in (('white', white), ('vibration', VIBRATION_RATE * DEGREE)):
+        for kind, averaged in (('single', 1), ('mean', SAMPLES_PER_SET)):
+            numbers[f'{name}_{kind}'] = regressor_error(deviation, averaged, generator) / DEGREE
     return Contradiction(numbers,
                          'Eq. 9: the regressor is the output, which contains the same noise as '
                          'the error. With samples that scatter by {white:.4f} deg/s the error at'
@@ -345,35 +357,44 @@ def _regressor(generator: np.random.Generator) -> Contradiction:
                          ' {vibration_single:.3f} and {vibration_mean:.4f} deg/s.')
 
 
-def extrapolation(sagnac: float, generator: np.random.Generator) -> tuple[float, float]:
+def extrapolation_errors(sine_constant: float,
+                         generator: np.random.Generator) -> tuple[float, float]:
     """
     Return the rms errors of the rate from 70 to 100 deg/s, by polynomial and by sine, rad/s.
 
     The calibration is up to 60 deg/s.
 
     """
-    gyro, temperatures = rd2100(sagnac), np.linspace(COLDEST, WARMEST, 11)
-    table = rate_table(gyro, np.arange(-60.0, 61.0, 10.0) * DEGREE, temperatures, generator)
+    gyro, temperatures = rd2100(sine_constant), np.linspace(MIN_TEMPERATURE, MAX_TEMPERATURE, 11)
+    table = simulate_rate_table(gyro,
+                                np.arange(-60.0, 61.0, 10.0) * DEGREE, temperatures, generator)
     beyond = np.arange(70.0, 101.0, 10.0) * DEGREE
-    rate, temperature = grid(np.concatenate([-beyond, beyond]), temperatures)
+    rate, temperature = rate_temperature_grid(np.concatenate([-beyond, beyond]), temperatures)
     output = gyro.output(rate, temperature)
     polynomial, sine = (
-        float(np.sqrt(np.mean((fit(table, effects).rate(output, temperature) - rate) ** 2)))
-        for effects in ([POLYNOMIAL], PHYSICAL))
+        float(np.sqrt(np.mean((fit_model(table, effects).rate(output, temperature) - rate) ** 2)))
+        for effects in ([POLYNOMIAL], PHYSICAL_EFFECTS))
     return polynomial, sine
 
 
 def _sine(generator: np.random.Generator, runs: int, progress: Progress) -> Contradiction:
-    found = [[extrapolation(sagnac, generator) for sagnac in (SAGNAC, STRONG_SAGNAC)]
-             for _ in progress(range(runs))]
+    found = [[
+        extrapolation_errors(sagnac, generator) for sagnac in (SINE_CONSTANT, STRONG_SINE_CONSTANT)
+    ] for _ in progress(range(runs))]
     (weak, weak_sine), (strong, strong_sine) = np.mean(found, axis=0) / DEGREE
-    return Contradiction({'k': SAGNAC, 'weak': weak, 'weak_sine': weak_sine,
-                          'strong_k': STRONG_SAGNAC, 'strong': strong, 'strong_sine': strong_sine},
-                         'Eq. 3: a cubic approximates a sine at low rates only. Calibrated up to'
-                         ' 60 deg/s, the polynomial (3, 2) errs between 70 and 100 deg/s by '
-                         '{weak:.4f} deg/s, five effects with a sine by {weak_sine:.4f} (k = '
-                         '{k:.2f} s); with k = {strong_k:.2f} s by {strong:.3f} and '
-                         '{strong_sine:.4f}.')
+    return Contradiction(
+        {
+            'k': SINE_CONSTANT,
+            'weak': weak,
+            'weak_sine': weak_sine,
+            'strong_k': STRONG_SINE_CONSTANT,
+            'strong': strong,
+            'strong_sine': strong_sine
+        }, 'Eq. 3: a cubic approximates a sine at low rates only. Calibrated up to'
+        ' 60 deg/s, the polynomial (3, 2) errs between 70 and 100 deg/s by '
+        '{weak:.4f} deg/s, five effects with a sine by {weak_sine:.4f} (k = '
+        '{k:.2f} s); with k = {strong_k:.2f} s by {strong:.3f} and '
+        '{strong_sine:.4f}.')
 
 
 def _full_turn() -> Contradiction:
@@ -389,8 +410,8 @@ def _full_turn() -> Contradiction:
 
 def _earth() -> Contradiction:
     earth = EARTH_RATE * math.sin(LATITUDE * DEGREE)
-    return Contradiction({'earth': earth, 'stability': 3600.0 * STABILITY,
-                          'ratio': earth / (3600.0 * STABILITY)},
+    return Contradiction({'earth': earth, 'stability': 3600.0 * BIAS_STABILITY,
+                          'ratio': earth / (3600.0 * BIAS_STABILITY)},
                          'Eq. 1: the static bias includes the rate of the Earth, {earth:.1f} '
                          'deg/h on a level floor in Ann Arbor, {ratio:.1f} times the bias '
                          'stability of {stability:.1f} deg/h.')

@@ -20,9 +20,9 @@ from gyro_calibration.logs.log import COLUMNS, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration_bench import scores
 from gyro_calibration_bench.hidden import Cause, HiddenLog
-from gyro_calibration_bench.hidden.effects import AGAINST_A_MODEL, WITHOUT_COLUMN
-from gyro_calibration_bench.methods import known_model, named
-from gyro_calibration_bench.scores import Judged, judged
+from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS, WITHOUT_COLUMN
+from gyro_calibration_bench.methods import answer_of_finding, known_model
+from gyro_calibration_bench.scores import judge_answer, Judgement
 import numpy as np
 
 #: A diagnosis holds out one of so many blocks, of so many s.
@@ -43,20 +43,21 @@ def model_of(hidden: HiddenLog) -> GyroModel:
 def diagnosis_of(hidden: Sequence[HiddenLog], generator: np.random.Generator,
                  with_model: bool | None = None) -> Diagnosis:
     """Diagnose hidden logs, with a model where the hidden cause is found only against one."""
-    wanted = (bool(set(hidden[0].truth.names) & set(AGAINST_A_MODEL)) if with_model is None
+    wanted = (bool(set(hidden[0].truth.names) & set(MODEL_FINDINGS)) if with_model is None
               else with_model)
     return diagnose([log_of(each) for each in hidden], generator,
                     model_of(hidden[0]) if wanted else None)
 
 
 def judged_findings(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str] = (),
-                    allowed: Collection[str] = ()) -> Judged:
+                    allowed: Collection[str] = ()) -> Judgement:
     """Compare findings with the truth."""
-    return judged(hidden.truth.gyro.causes, [named(each) for each in findings], beyond, allowed)
+    return judge_answer(hidden.truth.gyro.causes, [answer_of_finding(each) for each in findings],
+                        beyond, allowed)
 
 
 def judged_diagnosis(hidden: HiddenLog, found: Diagnosis,
-                     allowed: Collection[str] = ()) -> Judged:
+                     allowed: Collection[str] = ()) -> Judgement:
     """Compare a diagnosis with the truth."""
     return judged_findings(hidden, found.findings, [each.along for each in found.unexplained],
                            allowed)
@@ -65,7 +66,8 @@ def judged_diagnosis(hidden: HiddenLog, found: Diagnosis,
 def held(causes: Iterable[Cause], findings: Sequence[Finding],
          deviations: float = 1.96) -> dict[str, bool]:
     """Return for each cause named with a number whether its interval holds the truth."""
-    return scores.held(causes, [named(each) for each in findings], deviations)
+    return scores.interval_holds(causes, [answer_of_finding(each) for each in findings],
+                                 deviations)
 
 
 def won(hidden: HiddenLog, found: Diagnosis) -> dict[str, tuple[float, float]]:
@@ -93,7 +95,7 @@ def _knowing(hidden: HiddenLog) -> dict[str, tuple[float, float]]:
 
     """
     truth, output, stamps, good = (hidden.truth, hidden.columns['gyro_rad_s'],
-                                   hidden.columns['time_s'], hidden.truth.good)
+                                   hidden.columns['time_s'], hidden.truth.is_good)
     length = min(BLOCK, (stamps[-1] - stamps[0]) / 6.0)
     number = np.floor((stamps - stamps[0]) / length).astype(int)
     out = (number % EVERY == 1) & (number < int((stamps[-1] - stamps[0]) / length + 1e-9))
@@ -110,8 +112,9 @@ def _knowing(hidden: HiddenLog) -> dict[str, tuple[float, float]]:
 def _predicted(hidden: HiddenLog) -> np.ndarray:
     """Return the output to expect; that of a noisy gyro has no steps."""
     truth, gyro = hidden.truth, hidden.truth.gyro
-    limit = gyro.value('saturation') or np.inf
-    return np.clip(truth.rate + truth.added, -limit, limit) * (gyro.value('unit_error') or 1.0)
+    limit = gyro.size_of('saturation') or np.inf
+    return (np.clip(truth.rate + truth.added_rate, -limit, limit) *
+            (gyro.size_of('unit_error') or 1.0))
 
 
 def _squares(both: Sequence[Sequence[float]]) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import itertools
 import math
 
 from gyro_calibration.driver.connection import Connection, PortError
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 
 BEGIN = 100.0  # s
 STEP = 0.1  # s; what `SerialPort.read` waits for a first byte
@@ -81,7 +81,8 @@ class World:
 
     def gyro(self, protocol, outputs=None, settings=None, rate=100.0, **when):
         """Be a gyro with a protocol, whose outputs may be given, rad/s."""
-        encode, numbers = find(protocol).encoder(settings or Settings()), itertools.count()
+        encode, numbers = (find_protocol(protocol).encoder(settings
+                                                           or Settings()), itertools.count())
         outputs = itertools.repeat(0.5) if outputs is None else outputs
         self.send((encode(Sample(output, 31.5, number / rate, number, specific_force=9.81))
                    for output, number in zip(outputs, numbers)), rate=rate, **when)

@@ -34,17 +34,17 @@ import struct
 import tempfile
 import zlib
 
-from gyro_calibration.cli.main import _parser
+from gyro_calibration.cli.main import _make_parser
 from gyro_calibration.cli.plan import read_limits, write_motion
 from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.protocols.listening import recognize
+from gyro_calibration.driver.protocols.listening import recognize_protocol
 from gyro_calibration.driver.protocols.protocol import LineSplitter, Splitter
 from gyro_calibration.driver.timestamps import SampleClock
-from gyro_calibration.files import LARGEST
+from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.heading.bias_table import (
     BiasTable,
-    propagated,
+    propagate_calibration,
     read_bias_table,
     write_bias_table,
 )
@@ -61,8 +61,8 @@ from gyro_calibration.logs.recording import read_recording, Topics
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
-from gyro_calibration.model.model_file import model_text, ModelError, read_model, write_model
-from gyro_calibration.model.motion import CALIBRATION, MotionError, read_motion
+from gyro_calibration.model.model_file import format_model, ModelError, read_model, write_model
+from gyro_calibration.model.motion import CALIBRATION_MOTION, MotionError, read_motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from recordings import channel, chunk, database, MCAP, record, text
@@ -112,7 +112,7 @@ def _check_message(error: Exception | str, path: object = '') -> None:
 def settings_of(protocol: Protocol) -> Settings:
     """Return settings that suffice for a protocol."""
     try:
-        protocol.check(Settings())
+        protocol.check_settings(Settings())
     except ValueError:
         return Settings(sensitivity=1e-5)
     return Settings()
@@ -151,7 +151,7 @@ def check_decoder(wire: _Wire, data: bytes) -> int:
     whole, in_pieces = (wire.protocol.decoder(wire.settings) for _ in range(2))
     samples = whole.feed(data)
     assert [sample for piece in pieces(data) for sample in in_pieces.feed(piece)] == samples
-    counts = [(each.discarded_bytes, each.faults, each.refused_samples)
+    counts = [(each.discarded_bytes, each.device_faults, each.refused_samples)
               for each in (whole, in_pieces)]
     assert counts[0] == counts[1], counts
     for sample in samples:
@@ -159,7 +159,7 @@ def check_decoder(wire: _Wire, data: bytes) -> int:
                    *sample.health.values())
         assert (all(number is None or math.isfinite(number) for number in numbers)
                 and sample.missing >= 0), sample
-    _check_account(wire, data, len(samples) + whole.faults + whole.refused_samples)
+    _check_account(wire, data, len(samples) + whole.device_faults + whole.refused_samples)
     after = [(sample.output, sample.missing) for sample in whole.feed(b''.join(wire.frames))]
     assert after[-len(wire.rates) + 2:] == [(rate, 0) for rate in wire.rates[2:]], (
         'not right again after two frames')
@@ -183,7 +183,7 @@ def _check_account(wire: _Wire, data: bytes, used: int) -> None:
     assert framed + splitter.discarded_bytes + ends == len(data), (
         framed, splitter.discarded_bytes, ends, len(data))
     assert (splitter.discarded_bytes - before <= HELD
-            and sum(frame.garbage for frame in frames) <= before and used <= len(frames))
+            and sum(frame.skipped_bytes for frame in frames) <= before and used <= len(frames))
 
 
 def _clean(wire: _Wire) -> Splitter:
@@ -209,9 +209,9 @@ def _parts(wire: _Wire) -> tuple[bytes, ...]:
 
 
 def check_listening(data: bytes) -> bool:
-    found = recognize(data)
-    assert 0.0 <= found.explained <= 1.0 and found.words
-    _check_message(found.words)
+    found = recognize_protocol(data)
+    assert 0.0 <= found.explained_share <= 1.0 and found.summary
+    _check_message(found.summary)
     return found.protocol is not None
 
 
@@ -236,14 +236,14 @@ def check_clock(data: bytes) -> int:
         samples = [sample for sample in samples if math.isfinite(sample.time)]
         if missing == 255:
             clock.interrupt()
-        stamps = clock.stamp(samples, arrival)
+        stamps = clock.stamp_samples(samples, arrival)
         assert len(stamps) == len(samples)
         for stamp in stamps:
             assert math.isfinite(stamp) and stamp > last, (stamp, last)
             last = stamp
     assert (math.isfinite(clock.period) and clock.period > 0.0
             and math.isfinite(sum(clock.jitter)))
-    assert isinstance(clock.lost, int) and clock.lost >= 0, clock.lost
+    assert isinstance(clock.lost_count, int) and clock.lost_count >= 0, clock.lost_count
     return len(data)
 
 
@@ -285,7 +285,7 @@ def check_log(data: bytes, suffix: str = '.csv') -> bool:
     assert log is not None, 'refused as a whole only'
     assert np.array_equal(np.concatenate([_values(block) for block in blocks], axis=1),
                           _values(log), equal_nan=True)
-    assert not (np.abs(_values(log)) > LARGEST).any()
+    assert not (np.abs(_values(log)) > MAX_MAGNITUDE).any()
     assert all(np.isfinite(values).all()
                for values in (log.time, log.temperature, log.specific_force, log.supply)
                if values is not None)
@@ -327,18 +327,18 @@ def check_model(data: bytes) -> bool:
         return False
     noise, values = (vars(model.noise).values(),
                      [value for term in model.terms for value in term.values])
-    assert all(abs(value) <= LARGEST
+    assert all(abs(value) <= MAX_MAGNITUDE
                for value in (*noise, *values, model.reference_temperature)), values
-    text = model_text(model)
+    text = format_model(model)
     again = path_of('_again.yaml')
     write_model(again, model)
-    assert model_text(read_model(again)) == text
+    assert format_model(read_model(again)) == text
     with np.errstate(all='ignore'):
-        if not model.looks_around:
+        if not model.needs_history:
             compensate(model, np.array([-1.0, 0.0, 1.0]), np.array([-20.0, 20.0, 60.0]))
         model.noise.heading_variance(60.0)
     if model.self_calibration is not None:
-        json.dumps([str(model.self_calibration), model.self_calibration.figures()],
+        json.dumps([str(model.self_calibration), model.self_calibration.to_dict()],
                    allow_nan=False)
     return True
 
@@ -348,7 +348,9 @@ def _model_seeds() -> list[bytes]:
                      Term(CATALOGUE['sine_response'], (1.0, 0.01))))
     by_hand = (b'effects: {rate_temperature_polynomial: {matrix_dps: [[1, 2], [3, 4]]}}\n'
                b'self_calibration: {scale_factor_error: 0, bias: 0}')
-    return [*(model_text(model).encode() for model in (_full_model(), GyroModel(), lag)), by_hand]
+    return [
+        *(format_model(model).encode() for model in (_full_model(), GyroModel(), lag)), by_hand
+    ]
 
 
 def check_bias_table(data: bytes) -> bool:
@@ -360,10 +362,11 @@ def check_bias_table(data: bytes) -> bool:
         return False
     with np.errstate(all='ignore'):
         bias, variance = table.predict(25.0, 1.7e9)
-        change, spread = table.difference(10.0, 30.0, 1.7e9)
-        now = propagated(SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0),
-                         table, 3600.0, 1.7e9, 25.0)
-    assert (all(map(math.isfinite, (bias, change, spread, now.change))) and variance > 0.0
+        change, spread = table.bias_difference(10.0, 30.0, 1.7e9)
+        now = propagate_calibration(
+            SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0), table,
+            3600.0, 1.7e9, 25.0)
+    assert (all(map(math.isfinite, (bias, change, spread, now.bias_change))) and variance > 0.0
             and spread >= 0.0)
     table.add(24.0, bias, 1e-8, 1.7e9)
     write_bias_table(path, table, 1.7e9)
@@ -395,7 +398,7 @@ def check_profile(data: bytes) -> bool:
 
 def _profile_seeds() -> list[bytes]:
     path = path_of('_seed.csv')
-    write_motion(str(path), CALIBRATION)
+    write_motion(str(path), CALIBRATION_MOTION)
     return [path.read_bytes(), b'\xef\xbb\xbftime_s,heading_deg\r\n0,0\r\n1,90\r\n2,0\r\n']
 
 
@@ -499,7 +502,7 @@ def _parameter_seeds() -> list[bytes]:
     return [bytes([place]) + value for place in range(0, 60, 4) for value in values]
 
 
-_program = cache(_parser)
+_program = cache(_make_parser)
 
 
 def check_arguments(data: bytes) -> bool:

@@ -44,12 +44,13 @@ def opened(folder):
 
 def write(memory, number):
     """Write a calibration, and each second time a bias table as well, as the node does."""
-    memory.keep(SelfCalibration(0.01 + 1e-6 * number, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)),
-                                '2026-01-01T00:00:00+00:00', 25.0, 'rest'))
+    memory.store_calibration(
+        SelfCalibration(0.01 + 1e-6 * number, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)),
+                        '2026-01-01T00:00:00+00:00', 25.0, 'rest'))
     if number % 2:
         return
     memory.table.add(10.0 + number % 32, 1e-3 + 1e-5 * (number % 7), 1e-10, BEGIN + STEP * number)
-    memory.keep_table(BEGIN + STEP * number, ending=True)
+    memory.store_table(BEGIN + STEP * number, is_final=True)
 
 
 def lines_of(memory, number, on_line=lambda line: None):
@@ -108,7 +109,7 @@ def main():
                 found['new' if content == new[place] else 'old'][place] += 1
         found['half_written'] += len(os.listdir(folder / 'robot')) > len(KEPT)
     memory = opened(folder / 'robot')
-    print(json.dumps(found | {'hints': memory.hint + memory.table_hint,
+    print(json.dumps(found | {'hints': memory.calibration_hint + memory.table_hint,
                               'left': sorted(os.listdir(folder / 'robot'))}))
 
 

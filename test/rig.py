@@ -19,7 +19,7 @@ is what the compensation node does in the interval of one sample.
 import math
 
 from gyro_calibration.ros.calibration_session import PROFILE
-from gyro_calibration.ros.parameters import record
+from gyro_calibration.ros.parameters import parameter_values
 from gyro_calibration.ros.pipeline import PARAMETERS, Pipeline
 from gyro_calibration.ros.wheels import Velocity
 from robot import INTERVAL, Robot
@@ -101,7 +101,7 @@ class Rig:
         names = {each.attribute: each.name for each in PARAMETERS}
         self._given = {names[attribute]: value for attribute, value in parameters.items()}
         self.calibration_file = calibration_file or folder / 'calibration.yaml'
-        self.pipeline = Pipeline(record(PARAMETERS, self._given), self.calibration_file,
+        self.pipeline = Pipeline(parameter_values(PARAMETERS, self._given), self.calibration_file,
                                  self.clock, self._send)
         self._timers, self.speed = {}, 1.0
         self.session, self.journal = self.pipeline.session, self.pipeline.journal
@@ -116,7 +116,7 @@ class Rig:
         """Set parameters while it runs."""
         names = {each.attribute: each.name for each in PARAMETERS}
         self._given.update({names[attribute]: value for attribute, value in parameters.items()})
-        self.pipeline.set(record(PARAMETERS, self._given))
+        self.pipeline.use_parameters(parameter_values(PARAMETERS, self._given))
 
     def stamp(self, reading):
         """Return the stamp of a reading, ns."""
@@ -133,10 +133,10 @@ class Rig:
         if self.clock.ros:
             self.clock.ros += INTERVAL * self.ros_speed
         for _ in range(len(self._echoes)):
-            self.pipeline.command(Velocity(angular=(0.0, 0.0, self._echoes.pop(0))))
+            self.pipeline.add_command(Velocity(angular=(0.0, 0.0, self._echoes.pop(0))))
         if self.other is not None and self._steps % 5 == 0:
             self.robot.command(self.other)
-            self.pipeline.command(Velocity(angular=(0.0, 0.0, self.other)))
+            self.pipeline.add_command(Velocity(angular=(0.0, 0.0, self.other)))
         reading = self.robot.step()
         stamp = self.stamp(reading)
         self.odometry(stamp, reading)
@@ -147,12 +147,12 @@ class Rig:
     def odometry(self, stamp, reading):
         """Let the odometry arrive."""
         heading = math.remainder(reading.heading, math.tau)
-        self.pipeline.odometry(stamp, heading, Velocity(angular=(0.0, 0.0, reading.rate)))
+        self.pipeline.add_odometry(stamp, heading, Velocity(angular=(0.0, 0.0, reading.rate)))
 
     def sample(self, stamp, output, heading=math.nan):
         """Let a sample arrive, and return what comes out."""
         self.truth[stamp] = heading
-        found = self.pipeline.sample(stamp, output, receivers=self.receivers)
+        found = self.pipeline.add_sample(stamp, output, receivers=self.receivers)
         if found is not None:
             self.outputs.append(found)
         return found
@@ -160,12 +160,12 @@ class Rig:
     def guards(self):
         """Look as the timers of the node do: every 20 ms during a drive, else every 0.2 s."""
         if self._is_due('look', 0.2):
-            self.pipeline.publishers(self.publishers)
-            self.session.see_callers(self.callers)
-        if self._is_due('watch', 0.02 if self.session.drives else 0.2):
-            self.pipeline.watch(self.receivers)
+            self.pipeline.update_publishers(self.publishers)
+            self.session.update_callers(self.callers)
+        if self._is_due('watch', 0.02 if self.session.is_driving else 0.2):
+            self.pipeline.poll(self.receivers)
         if self._is_due('learn', 1.0):
-            self.pipeline.learn()
+            self.pipeline.run_periodic_tasks()
 
     def _is_due(self, timer, period):
         due = self.clock.now > self._timers.get(timer, -math.inf) + period - 1e-6
@@ -207,10 +207,10 @@ class Rig:
             stamp = self.fed
             if temperature is not None:
                 each = temperature if isinstance(temperature, float) else temperature[number]
-                self.pipeline.temperature(stamp, float(each))
+                self.pipeline.add_temperature(stamp, float(each))
             if moving is not None:
-                self.pipeline.odometry(stamp, 0.0, Velocity(angular=(0.0, 0.0, moving)))
-            found.append(self.pipeline.sample(stamp, float(output), force, self.receivers))
+                self.pipeline.add_odometry(stamp, 0.0, Velocity(angular=(0.0, 0.0, moving)))
+            found.append(self.pipeline.add_sample(stamp, float(output), force, self.receivers))
             self.outputs += [found[-1]] if found[-1] else []
             self.guards()
         return found
@@ -223,14 +223,14 @@ class Rig:
     def begin(self, kind=PROFILE):
         """Call a calibration; return '' or why it was refused."""
         drive = self.pipeline.values.calibration_drive and kind == PROFILE
-        obstacle = self.pipeline.obstacle() if drive else ''
+        obstacle = self.pipeline.find_obstacle() if drive else ''
         return self.session.begin(kind, self.pipeline.values, obstacle)
 
     @property
     def ended(self):
         """Tell whether a run has ended, and only its answer is left."""
         run = self.session.run
-        return run is None or run.reason is not None
+        return run is None or run.end_reason is not None
 
     def calibrate(self, kind=PROFILE, seconds=60.0):
         """Calibrate while the robot goes on, and return success and message."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import re
 import shlex
 
-from gyro_calibration.cli.main import _parser
+from gyro_calibration.cli.main import _make_parser
 from gyro_calibration.driver.protocols import PROTOCOLS
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import read_log
@@ -66,7 +66,7 @@ def test_every_command_of_the_documents_is_understood(capsys):
     for document, command in [*found_in_documents(COMMAND), *found_in_documents(IN_PROSE)]:
         words = shlex.split(command)
         try:
-            _parser(words[0]).parse_args(words)
+            _make_parser(words[0]).parse_args(words)
         except SystemExit:
             pytest.fail(f'{document}: {command}\n{capsys.readouterr().err}')
 

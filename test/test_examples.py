@@ -49,7 +49,7 @@ def test_an_example_runs_and_says_something(ran, name):
 def test_the_written_model_can_be_read(ran):
     folder, _ = ran('write_a_model.py')
     model = read_model(folder / 'model.yaml')
-    assert model.temperature_range == (25.0, 45.0) and model.looks_at('temperature')
+    assert model.temperature_range == (25.0, 45.0) and model.uses_channel('temperature')
 
 
 def test_the_self_calibration_is_in_the_written_model(ran):

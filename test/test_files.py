@@ -12,7 +12,7 @@
 
 import os
 
-from gyro_calibration.files import read_bytes, reason, write_atomically
+from gyro_calibration.files import describe_error, read_bytes, write_atomically
 import pytest
 
 
@@ -35,7 +35,7 @@ def test_what_is_no_regular_file_is_refused_and_not_left_open(tmp_path, kind):
     before = os.listdir('/proc/self/fd')
     with pytest.raises(OSError) as raised:
         read_bytes(tmp_path / 'a', 10)
-    assert reason(raised.value) == f'it is a {kind}, where a file is wanted'
+    assert describe_error(raised.value) == f'it is a {kind}, where a file is wanted'
     assert len(os.listdir('/proc/self/fd')) == len(before)
 
 

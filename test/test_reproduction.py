@@ -17,10 +17,10 @@ import math
 from pathlib import Path
 
 from gyro_calibration.cli.main import main
-from gyro_calibration.cli.reproduce import page
+from gyro_calibration.cli.reproduce import render_page
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.motion import CALIBRATION, ROBOT
+from gyro_calibration.model.motion import CALIBRATION_MOTION, ROBOT_MOTION
 from gyro_calibration_reproduction import bot_thoughts, hong_park, SOURCES
 from gyro_calibration_reproduction import ojeda_chung_borenstein as ojeda
 from gyro_calibration_reproduction.finding import Comparison
@@ -75,17 +75,17 @@ def test_a_verdict_is_what_the_last_digit_allows(published, value, verdict):
 
 
 def test_the_uncertainty_of_ours_counts():
-    assert (Comparison('', '', 5.0, '4.8', uncertainty=0.2).agrees
-            and not Comparison('', '', 5.0, '4.8', uncertainty=0.1).agrees)
-    assert not Comparison('', '', 1.9, '< 2', uncertainty=0.2).agrees
+    assert (Comparison('', '', 5.0, '4.8', uncertainty=0.2).is_reproduced
+            and not Comparison('', '', 5.0, '4.8', uncertainty=0.1).is_reproduced)
+    assert not Comparison('', '', 1.9, '< 2', uncertainty=0.2).is_reproduced
 
 
 @one_source
 def test_a_wrong_published_value_does_not_come_out(source):
-    wrong = [replace(each, published=f'{3.0 * each.value + 7.0:.3f}')
+    wrong = [replace(each, published=f'{3.0 * each.published_value + 7.0:.3f}')
              for each in reproduced(source, FEW).comparisons
              if each.verdict == 'reproduced' and each.published[0] not in '<~']
-    assert len(wrong) > 2 and not [each for each in wrong if each.agrees]
+    assert len(wrong) > 2 and not [each for each in wrong if each.is_reproduced]
 
 
 @pytest.mark.parametrize('source, contradicting', [
@@ -113,7 +113,7 @@ def test_every_number_of_a_contradiction_is_in_its_sentence(source):
 @one_source
 def test_the_page_holds_what_the_program_prints(source):
     shown = (ROOT / 'docs/explanation/reproduction.md').read_text()
-    assert page(reproduced(source, MANY)) in shown, (
+    assert render_page(reproduced(source, MANY)) in shown, (
         'run gyro_calibration reproduce and put it there')
 
 
@@ -172,8 +172,8 @@ def test_the_error_before_is_that_of_scale_and_sine():
 def test_a_full_turn_errs_by_the_error_of_the_rate_times_its_time():
     gyro = replace(ojeda.rd2100(), noise=GyroModel().noise)
     rates, temperatures = np.array([36.0, -90.0]) * DEGREE, np.array([25.0, 45.0])
-    errors, durations = ojeda.simulated_turns(gyro, [GyroModel(), gyro], rates, temperatures,
-                                              np.random.default_rng(0))
+    errors, durations = ojeda.simulate_turn_errors(gyro, [GyroModel(), gyro], rates, temperatures,
+                                                   np.random.default_rng(0))
     wanted = ((gyro.output(rates, temperatures) - gyro.output(0.0 * rates, temperatures) - rates)
               * [10.0, 4.0])
     np.testing.assert_allclose(durations, [10.0, 4.0])
@@ -270,7 +270,7 @@ def test_eq_8_as_printed_gives_both_in_each_others_place():
 
 def test_pure_integration_errs_by_s_and_b_alone():
     time = np.arange(0, 160, 0.01)
-    error = 0.0373 * ROBOT.heading_at(time) / DEGREE + 0.75 / 60 * time
+    error = 0.0373 * ROBOT_MOTION.heading_at(time) / DEGREE + 0.75 / 60 * time
     assert ours('hong_park', 'mean error, pure integration').ours == pytest.approx(
         np.abs(error).mean(), rel=0.1)
 
@@ -313,8 +313,8 @@ def test_single_samples_pass_the_threshold_as_often_as_drawn_ones():
 def test_eq_7_is_as_far_from_the_bound_as_its_covariance_says(runs, error):
     """Of a standard deviation, four standard errors of few runs, three of many."""
     time = np.arange(2001) / 100
-    rate = CALIBRATION.rate_at(time)
-    columns, bound = (np.column_stack([CALIBRATION.heading_at(time), time]),
+    rate = CALIBRATION_MOTION.rate_at(time)
+    columns, bound = (np.column_stack([CALIBRATION_MOTION.heading_at(time), time]),
                       np.column_stack([rate, np.ones(2001)]))
     # a sum of white noise at the times t and u has the covariance min(t, u)
     estimator = np.linalg.inv(columns.T @ columns) @ columns.T
@@ -340,7 +340,7 @@ def test_the_other_numbers_of_hong_and_park_follow_by_hand():
 
 def test_the_slopes_come_out_of_the_means():
     first, second = (2.5654 + 2854.5) / -200, (-3857.9 + 2854.5) / 70
-    assert bot_thoughts.slopes() == pytest.approx((first, second))
+    assert bot_thoughts.segment_slopes() == pytest.approx((first, second))
     slope, rest = np.polyfit([0, 200, 270], [2.5654, -2854.5, -3857.9], 1)
     assert ours('bot_thoughts', 'SF, line through three points').ours == pytest.approx(slope)
     assert ours('bot_thoughts', 'N, line through three points').ours == pytest.approx(rest / slope)
@@ -353,7 +353,7 @@ def test_the_slopes_come_out_of_the_means():
 
 def test_each_cause_that_is_named_makes_the_slopes_equal():
     found = numbers('bot_thoughts', 'An error of the strobe')
-    first, second = bot_thoughts.slopes()
+    first, second = bot_thoughts.segment_slopes()
     assert (-2854.5 - 2.5654 + first * found['null']) / 200 == pytest.approx(second, rel=1e-4), (
         'the null')
     assert (-3857.9 + 2854.5) / (70 + found['speed']) == pytest.approx(first, rel=1e-4), (

@@ -70,7 +70,7 @@ def test_what_is_imported_late_is_named_in_the_code():
     late = {path.name: path for path in FILES if 'importlib.import_module' in calls(path)}
     assert set(late) <= {'ros_bag.py', 'recorder_node.py', 'main.py'}
     asked = [node.args[0] for node in ast.walk(ast.parse(late['ros_bag.py'].read_text()))
-             if isinstance(node, ast.Call) and ast.unparse(node.func) == '_library']
+             if isinstance(node, ast.Call) and ast.unparse(node.func) == '_import_library']
     assert asked and all(isinstance(name, ast.Constant) for name in asked)
 
 
@@ -78,9 +78,9 @@ def test_what_is_imported_late_is_named_in_the_code():
                                   'sensor_msgs/srv/SetCameraInfo', ''])
 def test_a_kind_of_message_chooses_no_module_that_a_recorder_imports(kind):
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
-    from gyro_calibration.ros.recorder_node import load
+    from gyro_calibration.ros.recorder_node import load_message_class
     with pytest.raises(ImportError, match='no kind of messages'):
-        load(kind)
+        load_message_class(kind)
 
 
 def test_yaml_is_read_as_plain_data_at_one_place():
@@ -196,7 +196,7 @@ def test_the_policy_allows_a_node_exactly_what_it_has(hold_node, wait_until, tmp
 
 
 def test_the_policy_allows_a_recording_exactly_what_it_takes(ros, wait_until):
-    from gyro_calibration.cli.record import _TOPICS
+    from gyro_calibration.cli.record import _DEFAULT_TOPICS
     from gyro_calibration.ros.recorder_node import RecorderNode
     import rclpy
     for topic, kind in {'imu/data_raw': Imu, 'imu/temperature': Temperature,
@@ -204,11 +204,12 @@ def test_the_policy_allows_a_recording_exactly_what_it_takes(ros, wait_until):
         ros.publisher(kind, topic)
     context = rclpy.Context()
     rclpy.init(args=[], context=context)
-    node = RecorderNode([*_TOPICS.values(), 'odom'], False, print, context)
+    node = RecorderNode([*_DEFAULT_TOPICS.values(), 'odom'], False, print, context)
 
     def has_all():
         node.poll()
-        return not node.missing and really(ros.node, node.get_name(), '/') == allowed('record')
+        return (not node.missing_topics
+                and really(ros.node, node.get_name(), '/') == allowed('record'))
     try:
         wait_until(has_all, what='all of it')
     finally:
@@ -268,7 +269,7 @@ def test_only_a_session_that_may_drive_sends_commands(tmp_path):
     assert not rig.begin()
     rig.robot.command(0.7)
     rig.go(10.0)
-    assert not rig.commands and not rig.session.drives
+    assert not rig.commands and not rig.session.is_driving
 
 
 def test_the_node_is_no_publisher_of_commands_before_it_may_drive(hold_node, tmp_path):

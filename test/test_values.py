@@ -73,7 +73,7 @@ def models(draw, largest=1e20, around=True):
     polynomial = rate_temperature_polynomial(draw(st.integers(0, 4)), draw(st.integers(0, 3)))
     effects = [polynomial, *(
         each for each in CATALOGUE.values()
-        if around or each.looks_at <= {'rate', 'output', 'temperature'})]
+        if around or each.inputs <= {'rate', 'output', 'temperature'})]
     chosen = draw(st.lists(st.sampled_from(effects), min_size=1, max_size=4,
                            unique_by=lambda each: each.name))
     terms = tuple(Term(each, tuple(draw(value(parameter, largest))
@@ -100,8 +100,8 @@ EXTREMES = [0.5, -1.5, 30.0, -30.0, 99.0, 500.0, 1e16, -1e155, 1e308, -1.7e308]
 def test_every_effect_alone_gives_finite_rates():
     for model, output, temperature in itertools.product(
             every_effect_alone(), EXTREMES, (None, 25.0, -1e308, 1e308)):
-        around = (model.history().follow(0.0, temperature, 9.8, 5.0)
-                  if model.looks_around else None)
+        around = (model.start_history().update(0.0, temperature, 9.8, 5.0)
+                  if model.needs_history else None)
         done = compensate(model, output, temperature, around)
         assert (math.isfinite(done.rate) and math.isfinite(done.temperature)
                 and (done.beyond_range or abs(output) < 100.0)), (model, output, temperature)
@@ -113,15 +113,15 @@ def test_every_effect_alone_gives_finite_rates():
 def test_every_output_gives_a_finite_rate(model, samples):
     output, temperature = np.array(samples).T
     time = np.arange(len(output)) * INTERVAL
-    around = (model.history().follow(time, temperature, 0.0 * time + 9.8)
-              if model.looks_around else None)
+    around = (model.start_history().update(time, temperature, 0.0 * time + 9.8)
+              if model.needs_history else None)
     done = compensate(model, output, temperature, around)
-    assert (np.isfinite(done.rate).all() and np.isfinite(done.modelled).all()
+    assert (np.isfinite(done.rate).all() and np.isfinite(done.model_rate).all()
             and np.isfinite(done.temperature).all())
     assert np.broadcast_to(done.beyond_range, len(output))[np.abs(output) > model.rate_limit].all()
-    for one, degc in samples if not model.looks_around else ():
+    for one, degc in samples if not model.needs_history else ():
         single = compensate(model, one, degc)
-        assert math.isfinite(single.rate) and math.isfinite(single.modelled)
+        assert math.isfinite(single.rate) and math.isfinite(single.model_rate)
 
 
 @tries(150)
@@ -136,9 +136,10 @@ def test_a_sample_alone_is_compensated_as_in_a_log_and_what_is_not_marked_is_inv
         assert single.rate == pytest.approx(many.rate[index], rel=1e-9, abs=1e-9)
         assert bool(single.beyond_range) == bool(many.beyond_range[index])
         if not single.beyond_range:
-            modelled = Channels(single.modelled, one, single.temperature)
-            error = sum(term.error(modelled) for term in model.terms if not term.effect.undone)
-            assert single.modelled + error == pytest.approx(one, rel=1e-8, abs=1e-8)
+            modelled = Channels(single.model_rate, one, single.temperature)
+            error = sum(
+                term.error(modelled) for term in model.terms if not term.effect.not_compensated)
+            assert single.model_rate + error == pytest.approx(one, rel=1e-8, abs=1e-8)
 
 
 # streams
@@ -157,7 +158,8 @@ def estimator(model, **settings):
 
 def is_sound(live):
     """Tell whether all that is published is a number."""
-    shown = live.heading, live.variance, live.rate, live.rate_variance, live.deleted, *live.bias
+    shown = (live.heading, live.variance, live.rate, live.rate_variance, live.deleted_heading,
+             *live.bias)
     return all(map(math.isfinite, shown)) and live.variance >= 0.0
 
 
@@ -174,10 +176,10 @@ def test_no_stream_leaves_an_estimator_with_something_that_is_no_number(
     for step, output, degc, force in samples:
         time = time + step if math.isfinite(time + step) else step
         if degc is not None:
-            live.take_temperature(time, degc)
+            live.add_temperature(time, degc)
         live.add(time, output, NOW, force)
-        assert is_sound(live.tracker) and math.isfinite(live.corrected)
-    live.learn(NOW, ending=True)
+        assert is_sound(live.tracker) and math.isfinite(live.corrected_rate)
+    live.update_table(NOW, ending=True)
     begin = time if abs(time) < 1e9 else 0.0
     for index in range(100):
         live.add(begin + INTERVAL * (index + 1), 0.0, NOW)
@@ -201,10 +203,10 @@ def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(
     rate = 0.5 * np.sin(np.arange(1500) * INTERVAL) + REST
     for place, output in enumerate((rate + 1e-3 * rate ** 3).tolist()):
         other, degc, temperature_alone = places.get(place, (output, 25.0, False))
-        live.take_temperature(INTERVAL * place, 25.0 if degc is None else degc)
+        live.add_temperature(INTERVAL * place, 25.0 if degc is None else degc)
         live.add(INTERVAL * place, output if temperature_alone else other, NOW)
-    assert (live.refused == sum(not each[2] for each in places.values())
-            and live.tracker.rebuilt == 0)
+    assert (live.refused_count == sum(not each[2] for each in places.values())
+            and live.tracker.rebuild_count == 0)
     turned = 0.5 * (1.0 - math.cos(INTERVAL * 1499))
     rest_for_a_minute(lambda time, output: live.add(time, output, NOW), INTERVAL * 1499)
     assert abs(live.tracker.heading - turned) < 4.5 * math.sqrt(live.tracker.variance)
@@ -219,10 +221,10 @@ def test_a_state_that_is_not_finite_is_reported_and_built_anew_with_the_last_hea
     if place == 'sensitivity':
         said.append(tracker.add(INTERVAL * 500, 0.3, np.array([math.nan, -1.0])))
     else:
-        getattr(tracker._drift, place)[1] = math.nan
+        getattr(tracker._state, place)[1] = math.nan
     said += [tracker.add(INTERVAL * (501 + index), 0.3, np.array([-0.3, -1.0]))
              for index in range(200)]
-    assert tracker.rebuilt == 1 and sum(map(bool, said)) == 1 and is_sound(tracker)
+    assert tracker.rebuild_count == 1 and sum(map(bool, said)) == 1 and is_sound(tracker)
     assert (abs(tracker.heading - heading - 0.3 * INTERVAL * 201) < 0.5
             and tracker.variance > variance + 1.0)
 
@@ -234,11 +236,11 @@ def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk)
     settings = Threshold(0.3 * DEGREE, window, walk)
     live, time = ThresholdFilter(settings), np.cumsum([step for step, _ in samples])
     rate = np.array([0.1 * each if abs(each) < 3.0 else each for _, each in samples])
-    found = [live.filter(*sample) for sample in zip(time.tolist(), rate.tolist())]
+    found = [live.apply(*sample) for sample in zip(time.tolist(), rate.tolist())]
     for index, at in enumerate(time):
         begin = min(int(np.searchsorted(time, at - window, side='right')), index)
         fresh = ThresholdFilter(settings)
-        alone = [fresh.filter(*sample)
+        alone = [fresh.apply(*sample)
                  for sample in zip(time[begin:index + 1].tolist(), rate[begin:index + 1].tolist())]
         assert found[index] == alone[-1]
     assert filter_rates(settings, time, rate).tolist() == found
@@ -252,13 +254,13 @@ def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
     for step, output, rate in samples:
         time = time + step if math.isfinite(time + step) else step
         if check.add(time, output, rate):
-            check.examine(1e-8, 0.0)
+            check.examine_stretch(1e-8, 0.0)
     check.restart()
     complete = []
-    rest_for_a_minute(lambda at, rate: complete.append(check.examine(1e-8, 0.0))
+    rest_for_a_minute(lambda at, rate: complete.append(check.examine_stretch(1e-8, 0.0))
                       if check.add(at, rate, rate) else None, 0.0)
     assert len(complete) == 5 and all(rest is not None and math.isfinite(rest.noise_ratio)
-                                      and rest.noise_fits for rest in complete)
+                                      and rest.is_noise_normal for rest in complete)
 
 
 @tries(60)
@@ -271,7 +273,7 @@ def test_a_bias_table_stays_finite(rests, temperature, time):
         table.add(degc, bias, variance, when)
     bias, variance = table.predict(temperature, time)
     assert math.isfinite(bias) and (variance >= 0.0 if table.entries else variance == math.inf)
-    assert all(map(math.isfinite, table.difference(temperature, 25.0, time)))
+    assert all(map(math.isfinite, table.bias_difference(temperature, 25.0, time)))
 
 
 # verbs

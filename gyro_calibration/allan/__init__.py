@@ -30,18 +30,20 @@ from gyro_calibration.allan.deviation import (
     allan_deviation,
     AllanChart,
     averaging_sizes,
-    even_record,
+    build_rest_record,
     Floor,
-    Record,
+    RestRecord,
 )
-from gyro_calibration.allan.noise_fit import Figure, fit_noise, NoiseFit
-from gyro_calibration.model.noise import Part, PARTS
+from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
+from gyro_calibration.model.noise import NOISE_TERMS, NoiseTerm
 
-__all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record',
-           'allan_deviation', 'averaging_sizes', 'even_record', 'fit_noise']
+__all__ = [
+    'NOISE_TERMS', 'AllanChart', 'NoiseFigure', 'Floor', 'NoiseFit', 'NoiseTerm', 'RestRecord',
+    'allan_deviation', 'averaging_sizes', 'build_rest_record', 'fit_noise'
+]
 
 
-class _Folder(ModuleType):
+class _CallableModule(ModuleType):
     """
     This package, which can be called as `gyro_calibration.api.allan`.
 
@@ -54,4 +56,4 @@ class _Folder(ModuleType):
         return import_module('gyro_calibration.api').allan(*arguments, **named)
 
 
-sys.modules[__name__].__class__ = _Folder
+sys.modules[__name__].__class__ = _CallableModule

@@ -26,16 +26,16 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
-from gyro_calibration.calibration.likelihood import CHANCE
+from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS
 from gyro_calibration.logs.log import Array, DataRefused, Mask
-from gyro_calibration.logs.quality import robust_deviation, runs
-from gyro_calibration.logs.stamps import Integers, LONG, number_stamps, Stamps
+from gyro_calibration.logs.quality import find_runs, robust_deviation
+from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
     ANGLE_RANDOM_WALK,
     FLICKER,
     GaussMarkov,
-    Part,
-    PARTS,
+    NOISE_TERMS,
+    NoiseTerm,
     QUANTIZATION,
     RATE_RAMP,
     RATE_RANDOM_WALK,
@@ -46,18 +46,18 @@ from scipy.special import chdtri
 from scipy.stats import pearsonr
 
 #: Least number of samples for a noise figure.
-FEWEST = 100
+MIN_ALLAN_SAMPLES = 100
 #: Largest share of lost samples in a window; it is also the largest change of the variance.
-_LOST_SHARE = 0.01
+_MAX_LOST_PER_WINDOW = 0.01
 #: Least number of spans in the test whether a reference turns with the output, and its level: the
 #: probability of such a correlation by chance at rest.
-_SPANS, _FOLLOWS = 8, 1e-4
+_MIN_SPANS, _CORRELATION_P_VALUE = 8, 1e-4
 #: Largest share of a record that may be lost.
-_MOST_LOST = 0.3
+_MAX_LOST_SHARE = 0.3
 
 
 @dataclass(frozen=True)
-class Record:
+class RestRecord:
     """
     Samples of a gyro at rest at even intervals.
 
@@ -74,8 +74,8 @@ class Record:
     remarks: tuple[str, ...] = ()
 
 
-def even_record(time: Array, output: Array, moving: Array | None = None,
-                heading: Array | None = None) -> Record:
+def build_rest_record(time: Array, output: Array, moving: Array | None = None,
+                      heading: Array | None = None) -> RestRecord:
     """
     Put samples on an even grid; lost ones are nan.
 
@@ -95,11 +95,12 @@ def even_record(time: Array, output: Array, moving: Array | None = None,
     _refuse_few(len(output))
     known = np.isfinite(output) if moving is None else np.isfinite(output) & (moving == 0.0)
     _refuse_dead(time[known], output[known])
-    stamps = number_stamps(time)
-    rate = np.full(int(stamps.number[-1]) + 1, np.nan)
-    rate[stamps.number[known]] = output[known]
+    stamps = fit_stamp_grid(time)
+    rate = np.full(int(stamps.grid_index[-1]) + 1, np.nan)
+    rate[stamps.grid_index[known]] = output[known]
     remarks = [*stamps.burst_remarks,
-               *(f'{remark} Windows with more than {100 * _LOST_SHARE:g} % lost are not used.'
+               *(f'{remark} Windows with more than {100 * _MAX_LOST_PER_WINDOW:g} % lost are not '
+                 'used.'
                  for remark in stamps.loss_remarks)]
     left_out = int(np.count_nonzero(~known))
     if left_out:
@@ -110,21 +111,23 @@ def even_record(time: Array, output: Array, moving: Array | None = None,
         _refuse_turning(time, output, heading)
     # long gaps are cut, since no window crosses them
     kept = np.ones(len(rate), dtype=bool)
-    for gap in runs(np.isnan(rate)):
-        kept[gap.start + stamps.longest_gap:gap.stop] = False
+    for gap in find_runs(np.isnan(rate)):
+        kept[gap.start + stamps.max_gap:gap.stop] = False
     rate = rate[kept]
     share = float(np.isnan(rate).mean())
-    if share > _MOST_LOST:
+    if share > _MAX_LOST_SHARE:
         raise DataRefused(f'{100 * share:.0f} % of the samples are lost or without output; wanted '
-                          f'at most {100 * _MOST_LOST:.0f} %: record again, or give --rate where '
+                          f'at most {100 * _MAX_LOST_SHARE:.0f} %: record again, or give --rate '
+                          'where '
                           'the stamps are wrong')
-    return Record(rate, stamps.interval, tuple(remarks))
+    return RestRecord(rate, stamps.interval, tuple(remarks))
 
 
 def _refuse_few(count: int, samples: str = 'samples') -> None:
     """Refuse fewer samples than a noise figure needs."""
-    if count < FEWEST:
-        raise DataRefused(f'{count} {samples}; an Allan deviation needs at least {FEWEST}: '
+    if count < MIN_ALLAN_SAMPLES:
+        raise DataRefused(f'{count} {samples}; an Allan deviation needs at least '
+                          f'{MIN_ALLAN_SAMPLES}: '
                           'record longer')
 
 
@@ -132,16 +135,17 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
     """Refuse a record whose reference heading correlates with the output at some span."""
     sums = np.concatenate([[0.0], np.nancumsum(output)])
     duration = time[-1] - time[0]
-    shortest, longest = max(1.0, duration / len(time)), duration / _SPANS
+    shortest, longest = max(1.0, duration / len(time)), duration / _MIN_SPANS
     for span in np.geomspace(shortest, longest, 1 + int(np.log2(max(longest / shortest, 1.0)))):
         ends = np.searchsorted(time, np.arange(time[0], time[-1], span))
         mean, change = np.diff(sums[ends]) / np.maximum(np.diff(ends), 1), np.diff(heading[ends])
         known = np.isfinite(change)
         both = np.stack([mean[known], change[known]])
-        if known.sum() < _SPANS or (np.ptp(both, axis=1) <= 1e-9 * np.abs(both).max(axis=1)).any():
+        if (known.sum() < _MIN_SPANS
+                or (np.ptp(both, axis=1) <= 1e-9 * np.abs(both).max(axis=1)).any()):
             continue
         correlation, chance = pearsonr(*both)
-        if correlation ** 2 > 0.5 and chance < _FOLLOWS:
+        if correlation ** 2 > 0.5 and chance < _CORRELATION_P_VALUE:
             raise DataRefused(
                 f'the reference heading turns with the output ({100.0 * correlation ** 2:.0f} % '
                 f'of the variance of means over {span:g} s): the gyro was moved; give a part at '
@@ -160,79 +164,81 @@ def _refuse_dead(time: Array, output: Array) -> None:
                           'than its noise; check it, and record again')
 
 
-def _remove_outliers(rate: Array, stamps: Stamps) -> list[str]:
+def _remove_outliers(rate: Array, stamps: StampGrid) -> list[str]:
     """
     Remove single samples far beyond the noise, and return a remark on them.
 
     A motion or a jolt lasts longer than two samples and is not removed.
 
     """
-    values = _filled(rate)
+    values = _fill_gaps(rate)
     off = np.abs(values - medfilt(values, 5))
     off[:2] = off[-2:] = 0.0
     # a high quantile, since half of these are zero where the output is a random walk
-    usual = float(np.quantile(off, 0.9)) / 1.645 or _scale(off)
-    outliers = np.nonzero(off > 1.25 * CHANCE * usual)[0]
+    usual = float(np.quantile(off, 0.9)) / 1.645 or _noise_scale(off)
+    outliers = np.nonzero(off > 1.25 * MAX_NOISE_SIGMAS * usual)[0]
     if not outliers.size or outliers.size > 0.001 * len(rate):
         return []
     rate[outliers] = np.nan
     return [f'Far beyond the noise, and left out: {outliers.size} single '
-            f'sample{"s" * (outliers.size > 1)}, the first at {stamps.at(outliers[0]):.3f} s.']
+            f'sample{"s" * (outliers.size > 1)}, the first at {stamps.time_at(outliers[0]):.3f} '
+            's.']
 
 
-def _scale(values: Array) -> float:
+def _noise_scale(values: Array) -> float:
     """Return the standard deviation of Gaussian values; the rms where most of them are zero."""
     return robust_deviation(values) or float(np.sqrt(np.mean(values ** 2)))
 
 
-def _refuse_motion(rate: Array, stamps: Stamps) -> None:
+def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
     """Refuse a record whose means change by more than noise; name time and longest rest."""
-    angle, lost = angle_of(rate), _lost_before(rate)
+    angle, lost = integrate_angle(rate), _count_lost_before(rate)
     moved, worst, over = np.zeros(len(rate), dtype=bool), 0.0, 0
-    for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / LONG)), 0))):
+    for size in (2 ** octave for octave in range(max(int(math.log2(len(rate) / MIN_WINDOWS)), 0))):
         # changes of the mean over `size` samples, times `size`
         end, step = len(angle) - 2 * size, max(1, size // 4)
         at = np.arange(0, end, step)
         if lost is not None:
-            at = at[whole(lost, size, 0, end, step)]
-        if len(at) < LONG:
+            at = at[mask_complete_windows(lost, size, 0, end, step)]
+        if len(at) < MIN_WINDOWS:
             break
         change = np.abs(angle[at + 2 * size] - 2.0 * angle[at + size] + angle[at])
-        scale = _scale(change)
-        for begin in at[change > CHANCE * scale]:
+        scale = _noise_scale(change)
+        for begin in at[change > MAX_NOISE_SIGMAS * scale]:
             moved[begin:begin + 2 * size] = True
         if change.max() > worst * scale:
             worst, over = float(change.max() / scale), size
     if not moved.any():
         return
-    rests = max(runs(~moved), key=lambda rest: rest.stop - rest.start, default=None)
+    rests = max(find_runs(~moved), key=lambda rest: rest.stop - rest.start, default=None)
     longest = ('at rest nowhere' if rests is None else
-               f'at rest longest from {stamps.at(rests.start):.1f} '
-               f'to {stamps.at(rests.stop - 1):.1f} s')
+               f'at rest longest from {stamps.time_at(rests.start):.1f} '
+               f'to {stamps.time_at(rests.stop - 1):.1f} s')
     raise DataRefused(
-        f'the gyro was moved, or its output jumped: from {stamps.at(int(np.argmax(moved))):.2f} s '
+        'the gyro was moved, or its output jumped: from '
+        f'{stamps.time_at(int(np.argmax(moved))):.2f} s '
         f'on means over {over * stamps.interval:.3g} s change up to {worst:.0f} standard '
         f'deviations; it is {longest}: use that part, or record again')
 
 
 # lost samples
 
-def angle_of(rate: Array) -> Array:
+def integrate_angle(rate: Array) -> Array:
     """Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples."""
     angle = np.empty(len(rate) + 1)
     angle[0] = 0.0
-    np.cumsum(_filled(rate), out=angle[1:])
+    np.cumsum(_fill_gaps(rate), out=angle[1:])
     return angle
 
 
-def _filled(rate: Array) -> Array:
+def _fill_gaps(rate: Array) -> Array:
     """Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side."""
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
     if known.all():
         return values
     values[~known] = 0.0
-    begins, ends = np.array([(gap.start, gap.stop) for gap in runs(~known)]).T
+    begins, ends = np.array([(gap.start, gap.stop) for gap in find_runs(~known)]).T
     margin = 5 * (ends - begins) + 5
     low, high = np.maximum(begins - margin, 0), np.minimum(ends + margin, len(rate))
     sums, counts = (np.concatenate([[0.0], np.cumsum(each)]) for each in (values, known))
@@ -241,34 +247,34 @@ def _filled(rate: Array) -> Array:
     return values
 
 
-def _lost_before(rate: Array) -> Integers | None:
+def _count_lost_before(rate: Array) -> Integers | None:
     """Return how many samples are lost before each one, shape (n + 1,), or None without losses."""
     lost = np.isnan(rate)
     return np.concatenate([[0], np.cumsum(lost)]) if lost.any() else None
 
 
-def whole(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mask:
+def mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mask:
     """
     Return which second differences over `size` samples, from `begin` to `end`, have few losses.
 
-    `lost` is the result of `_lost_before`.
+    `lost` is the result of `_count_lost_before`.
 
     """
     return np.asarray(lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step]
-                      <= _LOST_SHARE * 2 * size)
+                      <= _MAX_LOST_PER_WINDOW * 2 * size)
 
 
 #: Samples in a block, whose arrays fit into the cache for all averaging times.
-_BLOCK = 16384
+_BLOCK_SAMPLES = 16384
 #: Longest dot product that numpy computes in one thread, which is faster here.
-_PRODUCT = 8192
+_MAX_DOT_LENGTH = 8192
 #: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
-_FINE, _COARSE = 8, 512
+_LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
 #: Indices of quantization and ramp among the terms, and of terms whose second differences are
 #: independent over longer times.
-_QUANTIZATION, _RAMP = PARTS.index(QUANTIZATION), PARTS.index(RATE_RAMP)
-_FORGETTING = [place for place, part in enumerate(PARTS)
-               if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
+_QUANTIZATION_INDEX, _RAMP_INDEX = NOISE_TERMS.index(QUANTIZATION), NOISE_TERMS.index(RATE_RAMP)
+_SHORT_MEMORY_INDICES = [place for place, part in enumerate(NOISE_TERMS)
+                         if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
 
 
 @dataclass(frozen=True)
@@ -302,7 +308,7 @@ class AllanChart:
     samples : number in the record, lost ones included
     size : averaging times in samples
     deviation : rad/s
-    differences : number of second differences in the mean square
+    difference_count : number of second differences in the mean square
     degrees_of_freedom : equivalent degrees of freedom of the mean square
     lower, upper : bounds of the deviation with 95 % confidence, rad/s
 
@@ -312,7 +318,7 @@ class AllanChart:
     samples: int
     size: Integers
     deviation: Array
-    differences: Integers
+    difference_count: Integers
     degrees_of_freedom: Array
     lower: Array
     upper: Array
@@ -366,7 +372,7 @@ def allan_deviation(rate: Array, interval: float,
             raise DataRefused(f'averaging times: {given}; wanted at least one sample, '
                               f'{interval:g} s, and at most half the record, '
                               f'{samples // 2 * interval:g} s: choose others, or record longer')
-    sums, counts = _square_sums(rate, sizes)
+    sums, counts = _sum_squared_differences(rate, sizes)
     some = counts > 0
     sizes, counts = sizes[some], counts[some]
     variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
@@ -380,14 +386,14 @@ def allan_deviation(rate: Array, interval: float,
                       *chi_squared_bounds(variance, freedom))
 
 
-def _square_sums(rate: Array, sizes: Integers) -> tuple[Array, Integers]:
+def _sum_squared_differences(rate: Array, sizes: Integers) -> tuple[Array, Integers]:
     """Return the sums of the squared second differences of the angle, and their numbers."""
-    angle, lost = angle_of(rate), _lost_before(rate)
-    twice, buffer = 2.0 * angle, np.empty(_BLOCK)
+    angle, lost = integrate_angle(rate), _count_lost_before(rate)
+    twice, buffer = 2.0 * angle, np.empty(_BLOCK_SAMPLES)
     sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
-    for begin in range(0, len(angle), _BLOCK):
+    for begin in range(0, len(angle), _BLOCK_SAMPLES):
         for place, size in enumerate(sizes.tolist()):
-            end = min(begin + _BLOCK, len(angle) - 2 * size)
+            end = min(begin + _BLOCK_SAMPLES, len(angle) - 2 * size)
             if end <= begin:
                 break
             block = buffer[:end - begin]
@@ -396,18 +402,19 @@ def _square_sums(rate: Array, sizes: Integers) -> tuple[Array, Integers]:
             if lost is None:
                 counts[place] += len(block)
             else:
-                kept = whole(lost, size, begin, end)
+                kept = mask_complete_windows(lost, size, begin, end)
                 block *= kept
                 counts[place] += np.count_nonzero(kept)
-            sums[place] += sum(float(part @ part) for part in (block[:_PRODUCT], block[_PRODUCT:]))
+            sums[place] += sum(
+                float(part @ part) for part in (block[:_MAX_DOT_LENGTH], block[_MAX_DOT_LENGTH:]))
     return sums, counts
 
 
 # degrees of freedom
 
-def chi_squared_bounds(mean_square: Any, freedom: Any) -> tuple[Any, Any]:
+def chi_squared_bounds(mean_square: Any, degrees_of_freedom: Any) -> tuple[Any, Any]:
     """Return the 95 % bounds of a root mean square (NIST SP 1065, eq. 45)."""
-    lower, upper = (np.sqrt(mean_square * freedom / chdtri(freedom, tail))
+    lower, upper = (np.sqrt(mean_square * degrees_of_freedom / chdtri(degrees_of_freedom, tail))
                     for tail in (0.025, 0.975))
     return lower, upper
 
@@ -415,18 +422,19 @@ def chi_squared_bounds(mean_square: Any, freedom: Any) -> tuple[Any, Any]:
 def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array:
     """Return (sum of variances)² / sum of covariances² (Greenhall and Riley, PTTI 2003)."""
     freedom = []
-    for size, part in zip(sizes.tolist(), _parts_by_slope(sizes, variance)):
+    for size, part in zip(sizes.tolist(), _select_terms_by_slope(sizes, variance)):
         count = samples + 1 - 2 * size
         # the covariance of quantization is nonzero at single lags only
-        stride = 1 if part is QUANTIZATION else max(1, size // _FINE)
+        stride = 1 if part is QUANTIZATION else max(1, size // _LAGS_PER_WINDOW)
         lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
-        squares = _lag_covariance(part.covariance, size, size, lags) ** 2 * (count - lags) * stride
+        squares = (_lag_covariance(part.angle_covariance, size, size, lags) ** 2 *
+                   (count - lags) * stride)
         freedom.append(max(1.0, float(squares[0]) * count / stride
                            / float(2.0 * squares.sum() - squares[0])))
     return np.array(freedom)
 
 
-def _parts_by_slope(sizes: Integers, variance: Array) -> list[Part]:
+def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
     """
     Return the random term that fits the slope of each Allan variance best.
 
@@ -473,35 +481,35 @@ def covariance_form(samples: int, first: int, second: int,
     """
     counts, area = ((samples + 1 - 2 * first, samples + 1 - 2 * second),
                     float(first) ** 2 * float(second) ** 2)
-    angles = [part.covariance for part in PARTS]
+    angles = [part.angle_covariance for part in NOISE_TERMS]
     if process is not None:
         angles.append(process.angle_covariance)
 
-    def pairs_at(lags: Integers) -> Integers:
+    def count_pairs(lags: Integers) -> Integers:
         """Return how many pairs of second differences stand at each lag."""
         return np.maximum(np.minimum(counts[0], counts[1] - lags) - np.maximum(0, -lags), 0)
 
     # lags that are dense enough for all but quantization
     longer, shorter = max(first, second), min(first, second)
-    stride = max(1, shorter // _FINE, longer // _COARSE)
+    stride = max(1, shorter // _LAGS_PER_WINDOW, longer // _LAGS_PER_LONGER_WINDOW)
     lags = np.arange(-(min(10 * longer, counts[0]) // stride),
                      min(10 * longer, counts[1]) // stride + 1) * stride
     values = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])
-    values[_QUANTIZATION] = 0.0
+    values[_QUANTIZATION_INDEX] = 0.0
     if stride > max(1, shorter // 2):
-        values[_FORGETTING] = 0.0  # independent at lags of this size
+        values[_SHORT_MEMORY_INDICES] = 0.0  # independent at lags of this size
         if process is not None and process.correlation_time < stride:
             values[-1] = 0.0
-    pairs = pairs_at(lags) * float(stride)
+    pairs = count_pairs(lags) * float(stride)
     # lags at which two samples of quantization coincide
     lags = np.unique([i * first - j * second for i in range(3) for j in range(3)])
     meeting = np.array([_lag_covariance(angle, first, second, lags) for angle in angles])
-    meeting_pairs = pairs_at(lags)
+    meeting_pairs = count_pairs(lags)
     # no matrix product, which would start threads
     form = np.array([[2.0 * (pairs * one * other).sum() for other in values] for one in values])
-    form[_QUANTIZATION] = form[:, _QUANTIZATION] = 2.0 * (
-        meeting * meeting[_QUANTIZATION] * meeting_pairs).sum(axis=1)
+    form[_QUANTIZATION_INDEX] = form[:, _QUANTIZATION_INDEX] = 2.0 * (
+        meeting * meeting[_QUANTIZATION_INDEX] * meeting_pairs).sum(axis=1)
     slopes = (values * pairs).sum(axis=1)
-    slopes[_QUANTIZATION] = meeting[_QUANTIZATION] @ meeting_pairs
-    form[_RAMP] = form[:, _RAMP] = 2.0 * area * slopes
+    slopes[_QUANTIZATION_INDEX] = meeting[_QUANTIZATION_INDEX] @ meeting_pairs
+    form[_RAMP_INDEX] = form[:, _RAMP_INDEX] = 2.0 * area * slopes
     return form / (4.0 * area * counts[0] * counts[1])

@@ -11,7 +11,7 @@
 """
 The noise figures of a record: the coefficients of the noise terms, and their bounds.
 
-Every combination of terms is fitted to the Allan variances at octaves (`Description`). The fits
+Every combination of terms is fitted to the Allan variances at octaves (`CombinationFit`). The fits
 are ranked by likelihood (`Ranking`), and the best one gives the figures.
 
 """
@@ -32,40 +32,40 @@ from gyro_calibration.allan.deviation import (
 )
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.logs.stamps import Integers
-from gyro_calibration.model.noise import GaussMarkov, Noise, Part, PARTS, QUANTIZATION
+from gyro_calibration.model.noise import GaussMarkov, Noise, NOISE_TERMS, NoiseTerm, QUANTIZATION
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc
 
 #: Least decrease of -2 ln likelihood for a further term. For white noise alone no further term is
 #: then found in 95 of 100 records.
-_EVIDENCE = 10.0
+_TERM_PENALTY = 10.0
 #: Largest difference in -2 ln likelihood of an alternative combination of terms.
-_ALIKE = 6.0
+_ALTERNATIVE_LIMIT = 6.0
 #: A combination that is likelier by this, but has too many terms, widens the bounds.
-_WIDENS = 1.0
+_WIDENING_LIMIT = 1.0
 #: Increase of -2 ln likelihood at the ends of a 95 % interval: the quantile of chi squared.
-_CONFIDENCE = 3.84
+_CHI_SQUARED_95 = 3.84
 #: Least p-value of the residuals of an accepted fit.
-_CHANCE = 0.05
+_MIN_P_VALUE = 0.05
 #: Relative differences between the Allan deviations and the sum of the terms that are tried; the
 #: smallest sufficient one is used.
-_MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
+_MISFIT_SHARES = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
 #: Least number of octaves that show a slope and its end.
-_FEWEST_OCTAVES = 4
+_MIN_OCTAVES = 4
 #: Indices of the terms, of a Gauss-Markov process, and of the reduction of the variance by a
 #: filter: at times beyond its memory it has the slope of quantization, with a negative sign.
-_N, _B, _K, _Q, _R, _PROCESS, _BEND = range(len(PARTS) + 2)
+_N, _B, _K, _Q, _R, _PROCESS, _FILTER_BEND = range(len(NOISE_TERMS) + 2)
 #: Combinations of terms, without and with quantization, and with the bend of a filter.
 _COMBINATIONS = [
-    combination for count in range(len(PARTS))
+    combination for count in range(len(NOISE_TERMS))
     for places in itertools.combinations((_N, _B, _K, _R), count)
-    for combination in (places, (*places, _Q), (*places, _BEND) if _N in places else ())
+    for combination in (places, (*places, _Q), (*places, _FILTER_BEND) if _N in places else ())
     if combination]
 
 
 @dataclass(frozen=True)
-class Octaves:
+class OctaveVariances:
     """
     Allan variances at octaves and the terms of their covariance, all in samples.
 
@@ -73,7 +73,7 @@ class Octaves:
     ----------
     samples : of the record
     size : averaging times, shape (n,)
-    scarcity : factor of the scatter of an Allan deviation by lost windows, shape (n,)
+    loss_factor : factor of the scatter of an Allan deviation by lost windows, shape (n,)
     variance : shape (n,)
     columns : of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
     forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or (n,
@@ -84,52 +84,57 @@ class Octaves:
 
     samples: int
     size: Integers
-    scarcity: Array
+    loss_factor: Array
     variance: Array
     columns: Array
     forms: Array
     process: GaussMarkov | None = None
 
     @classmethod
-    def of(cls, chart: AllanChart) -> Octaves:
-        columns = np.column_stack([*(part.variance(chart.size) for part in PARTS),
-                                   np.zeros(len(chart.size)), -QUANTIZATION.variance(chart.size)])
-        scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.differences)
-        forms = (_forms(chart.samples, tuple(chart.size.tolist()))
+    def from_chart(cls, chart: AllanChart) -> OctaveVariances:
+        columns = np.column_stack([
+            *(part.allan_variance(chart.size) for part in NOISE_TERMS),
+            np.zeros(len(chart.size)), -QUANTIZATION.allan_variance(chart.size)
+        ])
+        scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.difference_count)
+        forms = (_octave_covariance_forms(chart.samples, tuple(chart.size.tolist()))
                  * np.outer(scarcity, scarcity)[:, :, None, None])
         return cls(chart.samples, chart.size, scarcity, chart.deviation ** 2, columns, forms)
 
-    def since(self, start: int) -> Octaves:
+    def drop_shortest(self, start: int) -> OctaveVariances:
         """Return the octaves without the shortest averaging times."""
-        return Octaves(self.samples, self.size[start:], self.scarcity[start:],
-                       self.variance[start:], self.columns[start:], self.forms[start:, start:])
+        return OctaveVariances(self.samples, self.size[start:], self.loss_factor[start:],
+                               self.variance[start:], self.columns[start:], self.forms[start:,
+                                                                                       start:])
 
-    def with_column(self, process: GaussMarkov) -> Array:
+    def process_columns(self, process: GaussMarkov) -> Array:
         """Return the columns with that of a process of 1 rad/s, its times in samples."""
         columns = self.columns.copy()
         columns[:, _PROCESS] = process.allan_variance(self.size.astype(float))
         return columns
 
-    def with_process(self, process: GaussMarkov) -> Octaves:
+    def with_process(self, process: GaussMarkov) -> OctaveVariances:
         """Add a process of 1 rad/s, and its part of the covariance."""
-        forms = _forms(self.samples, tuple(self.size.tolist()), process)
-        return replace(self, columns=self.with_column(process), process=process,
-                       forms=forms * np.outer(self.scarcity, self.scarcity)[:, :, None, None])
+        forms = _octave_covariance_forms(self.samples, tuple(self.size.tolist()), process)
+        return replace(
+            self, columns=self.process_columns(process), process=process,
+            forms=forms * np.outer(self.loss_factor, self.loss_factor)[:, :, None, None])
 
     def covariance(self, squares: Array) -> Array:
         """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
         known = squares[:self.forms.shape[-1]]
         return np.einsum('ijpq,p,q->ij', self.forms, known, known)
 
-    def model(self, squares: Array) -> Array:
+    def model_variance(self, squares: Array) -> Array:
         """Return the sum of the terms for these squared coefficients, kept above zero."""
         return np.maximum(self.columns @ squares, 1e-3 * self.variance)
 
 
 @lru_cache(maxsize=64)
-def _forms(samples: int, sizes: tuple[int, ...], process: GaussMarkov | None = None) -> Array:
+def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
+                             process: GaussMarkov | None = None) -> Array:
     """Return the covariances as forms of the squared coefficients, as `Octaves.forms`."""
-    forms = np.zeros((len(sizes),) * 2 + (len(PARTS) + (process is not None),) * 2)
+    forms = np.zeros((len(sizes),) * 2 + (len(NOISE_TERMS) + (process is not None),) * 2)
     for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
         form = covariance_form(samples, sizes[i], sizes[j], process)
         forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
@@ -137,7 +142,7 @@ def _forms(samples: int, sizes: tuple[int, ...], process: GaussMarkov | None = N
 
 
 @dataclass(frozen=True)
-class Description:
+class CombinationFit:
     """
     A combination of terms, fitted to octaves.
 
@@ -145,41 +150,42 @@ class Description:
     ----------
     octaves : the fitted Allan variances
     squares : squared coefficients, shape (6,)
-    half : Cholesky factor of the covariance of the variances
+    cholesky_factor : Cholesky factor of the covariance of the variances
 
     """
 
-    octaves: Octaves
+    octaves: OctaveVariances
     squares: Array
-    half: Array
+    cholesky_factor: Array
 
     @property
-    def held(self) -> list[int]:
+    def active_terms(self) -> list[int]:
         """Return the indices of the terms with a coefficient above zero."""
         return np.nonzero(self.squares)[0].tolist()
 
-    def _scores(self) -> tuple[Array, float]:
+    def _normal_scores(self) -> tuple[Array, float]:
         """
         Return standard normal scores, and -2 ln of the normalization of their density.
 
         The cube root of a mean square is nearly Gaussian (Wilson and Hilferty, 1931).
 
         """
-        model, deviation = self.octaves.model(self.squares), np.sqrt((self.half ** 2).sum(axis=1))
+        model, deviation = (self.octaves.model_variance(self.squares),
+                            np.sqrt((self.cholesky_factor ** 2).sum(axis=1)))
         ninth = (deviation / model) ** 2 / 9.0
         normal = (np.cbrt(self.octaves.variance / model) - 1.0 + ninth) / np.sqrt(ninth)
-        half = self.half / deviation[:, None]
+        half = self.cholesky_factor / deviation[:, None]
         density = (np.log(ninth).sum() + 2.0 / 3.0 * np.log(model).sum()
                    + 2.0 * np.log(half.diagonal()).sum())
         return np.linalg.solve(half, normal), float(density)
 
     @cached_property
-    def surprise(self) -> float:
+    def deviance(self) -> float:
         """Return -2 ln likelihood, up to a constant that all combinations share."""
-        normal, density = self._scores()
+        normal, density = self._normal_scores()
         return float(normal @ normal) + density
 
-    def cost(self) -> float:
+    def penalized_deviance(self) -> float:
         """
         Return -2 ln likelihood plus a penalty for each term.
 
@@ -187,58 +193,60 @@ class Description:
         Gauss-Markov process counts as two terms.
 
         """
-        return (self.surprise + _EVIDENCE * (len(self.held) + (_PROCESS in self.held))
-                + _ALIKE * (_R in self.held))
+        return (self.deviance + _TERM_PENALTY *
+                (len(self.active_terms) +
+                 (_PROCESS in self.active_terms)) + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
 
-    def likely(self) -> bool:
+    def is_likely(self) -> bool:
         """Return whether the residuals are within chance."""
-        normal, _ = self._scores()
-        freedom = len(normal) - len(self.held) - (_PROCESS in self.held)
-        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > _CHANCE
+        normal, _ = self._normal_scores()
+        freedom = len(normal) - len(self.active_terms) - (_PROCESS in self.active_terms)
+        return freedom > 0 and chdtrc(freedom, float(normal @ normal)) > _MIN_P_VALUE
 
-    def estimate(self, places: Sequence[int]) -> tuple[Array, Array]:
+    def estimate_squares(self, indices: Sequence[int]) -> tuple[Array, Array]:
         """Return the squared coefficients by least squares, of any sign, and their deviations."""
-        white = np.linalg.solve(self.half, self.octaves.columns[:, list(places)])
+        white = np.linalg.solve(self.cholesky_factor, self.octaves.columns[:, list(indices)])
         size = np.linalg.norm(white, axis=0)
         inverse = np.linalg.pinv((white / size).T @ (white / size))
-        found = inverse @ (white / size).T @ np.linalg.solve(self.half, self.octaves.variance)
+        found = (inverse @ (white / size).T
+                 @ np.linalg.solve(self.cholesky_factor, self.octaves.variance))
         return found / size, np.sqrt(inverse.diagonal()) / size
 
-    def deviation(self, place: int) -> float:
+    def square_deviation(self, index: int) -> float:
         """Return the standard deviation of the squared coefficient of a term of the fit."""
-        return float(self.estimate(self.held)[1][self.held.index(place)])
+        return float(self.estimate_squares(self.active_terms)[1][self.active_terms.index(index)])
 
-    def bounds(self, place: int) -> tuple[float, float]:
+    def coefficient_bounds(self, index: int) -> tuple[float, float]:
         """Return 95 % bounds of a coefficient, whose square is taken as a mean square."""
-        square = self.squares[place]
+        square = self.squares[index]
         lower, upper = chi_squared_bounds(
-            square, max(2.0 * (square / self.deviation(place)) ** 2, 1.0))
+            square, max(2.0 * (square / self.square_deviation(index)) ** 2, 1.0))
         return float(lower), float(upper)
 
 
-def describe(octaves: Octaves, places: tuple[int, ...], misfit: float, held_at: int = -1,
-             square: float = 0.0) -> Description:
+def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: float,
+                    fixed_term: int = -1, fixed_square: float = 0.0) -> CombinationFit:
     """
     Fit a combination of nonnegative terms, with the covariance of the fitted noise.
 
     For `misfit` see `NoiseFit`. A further term may be fixed at a squared coefficient.
 
     """
-    given = np.zeros(_BEND + 1)
-    if held_at >= 0:
-        given[held_at] = square
-    both = np.column_stack([octaves.columns[:, places],
+    given = np.zeros(_FILTER_BEND + 1)
+    if fixed_term >= 0:
+        given[fixed_term] = fixed_square
+    both = np.column_stack([octaves.columns[:, indices],
                             octaves.variance - octaves.columns @ given])
     squares, half = given.copy(), np.diag(octaves.variance)
     for number in range(12):
         white = np.linalg.solve(half, both)
         size = np.linalg.norm(white[:, :-1], axis=0)
         found = nnls(white[:, :-1] / size, white[:, -1])[0] / size
-        if not (found.any() or square) or (number and np.allclose(
-                squares[list(places)], found, rtol=1e-4, atol=0.0)):
+        if not (found.any() or fixed_square) or (number and np.allclose(
+                squares[list(indices)], found, rtol=1e-4, atol=0.0)):
             break
-        squares[list(places)] = found
-        model, covariance = octaves.model(squares), octaves.covariance(squares)
+        squares[list(indices)] = found
+        model, covariance = octaves.model_variance(squares), octaves.covariance(squares)
         covariance[np.diag_indices(len(model))] += 4.0 * (misfit * model) ** 2
         try:
             half = np.linalg.cholesky(covariance)
@@ -248,7 +256,7 @@ def describe(octaves: Octaves, places: tuple[int, ...], misfit: float, held_at: 
             values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
             half = size[:, None] * np.linalg.cholesky(
                 (vectors * np.maximum(values, 1e-4)) @ vectors.T)
-    return Description(octaves, squares, half)
+    return CombinationFit(octaves, squares, half)
 
 
 @dataclass(frozen=True)
@@ -258,31 +266,32 @@ class Ranking:
 
     Attributes
     ----------
-    start : the first octave that is fitted
+    first_octave : the first octave that is fitted
     misfit : see `NoiseFit`
-    descriptions : the likeliest first
-    processes : the best with a Gauss-Markov process in place of its flicker and rate random walk,
-        and in place of the walk alone
+    fits : the likeliest first
+    process_fits : the best with a Gauss-Markov process in place of its flicker and rate random
+        walk, and in place of the walk alone
 
     """
 
-    start: int
+    first_octave: int
     misfit: float
-    descriptions: tuple[Description, ...]
-    processes: tuple[Description, ...] = ()
+    fits: tuple[CombinationFit, ...]
+    process_fits: tuple[CombinationFit, ...] = ()
 
     @property
-    def best(self) -> Description:
+    def best(self) -> CombinationFit:
         """Return the fit with the least penalized -2 ln likelihood."""
-        return self.descriptions[0]
+        return self.fits[0]
 
     @property
-    def process(self) -> Description | None:
+    def best_process(self) -> CombinationFit | None:
         """Return the best fit with a process, if it is better than the best without."""
-        found = min(self.processes, key=Description.cost, default=None)
-        return found if found and found.cost() < self.best.cost() else None
+        found = min(self.process_fits, key=CombinationFit.penalized_deviance, default=None)
+        return (found
+                if found and found.penalized_deviance() < self.best.penalized_deviance() else None)
 
-    def without(self, place: int) -> bool:
+    def is_replaceable(self, index: int) -> bool:
         """
         Tell whether a process may replace a term.
 
@@ -291,34 +300,39 @@ class Ranking:
 
         """
         best = self.best
-        return any(place not in each.held and (
-            each.surprise - best.surprise if place == _K else each.cost() - best.cost())
-            < _CONFIDENCE for each in self.processes)
+        return any(index not in each.active_terms and (
+            each.deviance - best.deviance if index == _K else each.penalized_deviance()
+            - best.penalized_deviance()) < _CHI_SQUARED_95 for each in self.process_fits)
 
     @property
-    def seen(self) -> list[int]:
+    def detected_terms(self) -> list[int]:
         """Return the indices of the detected terms; quantization only from the first octave on."""
-        return [place for place in self.best.held if place != _BEND
-                and (place != _Q or self.start == 0)]
+        return [place for place in self.best.active_terms if place != _FILTER_BEND
+                and (place != _Q or self.first_octave == 0)]
 
     @cached_property
-    def alternatives(self) -> list[Description]:
+    def alternatives(self) -> list[CombinationFit]:
         """Return the combinations of other terms, not more of them, that are nearly as likely."""
         best = self.best
-        return [each for each in self.descriptions
-                if each.surprise < best.surprise + _ALIKE and len(each.held) <= len(best.held)
-                and not set(each.held) - {_BEND, _Q} <= set(best.held)]
+        return [
+            each for each in self.fits if each.deviance < best.deviance
+            + _ALTERNATIVE_LIMIT and len(each.active_terms) <= len(best.active_terms)
+            and not set(each.active_terms) - {_FILTER_BEND, _Q} <= set(best.active_terms)
+        ]
 
     @cached_property
-    def possible(self) -> list[Description]:
+    def plausible_fits(self) -> list[CombinationFit]:
         """Return the best, likelier ones with more terms, and those joined with alternatives."""
         best = self.best
-        both = [{*best.held, *other.held} for other in self.alternatives]
-        return [best, *(each for each in self.descriptions
-                        if each.surprise < best.surprise - _WIDENS or set(each.held) in both)]
+        both = [{*best.active_terms, *other.active_terms} for other in self.alternatives]
+        return [
+            best,
+            *(each for each in self.fits
+              if each.deviance < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)
+        ]
 
 
-def rank(octaves: Octaves) -> Ranking:
+def rank_combinations(octaves: OctaveVariances) -> Ranking:
     """
     Rank all combinations of terms.
 
@@ -331,27 +345,31 @@ def rank(octaves: Octaves) -> Ranking:
 
     """
     last = max(len(octaves.variance) // 2 - 1, 0)
-    for misfit, start in itertools.product(_MISFITS, range(last + 1)):
-        ranking = _rank_since(octaves, start, misfit)
-        if ranking.best.likely() or (ranking.process is not None and ranking.process.likely()):
-            return _rank_since(octaves, start + 1, misfit) if 0 < start < last else ranking
-    raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum '
+    for misfit, start in itertools.product(_MISFIT_SHARES, range(last + 1)):
+        ranking = _rank_from_octave(octaves, start, misfit)
+        if (ranking.best.is_likely()
+                or (ranking.best_process is not None and ranking.best_process.is_likely())):
+            return _rank_from_octave(octaves, start + 1, misfit) if 0 < start < last else ranking
+    raise DataRefused(f'the Allan deviations are more than {100 * _MISFIT_SHARES[-1]:.0f} % off '
+                      'any sum '
                       'of the five noise terms: the record contains something else, such as a '
                       'swing or a vibration; record again at rest')
 
 
-def _rank_since(octaves: Octaves, start: int, misfit: float) -> Ranking:
-    since = octaves.since(start)
-    descriptions = tuple(sorted((describe(since, places, misfit) for places in _COMBINATIONS),
-                                key=Description.cost))
+def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ranking:
+    since = octaves.drop_shortest(start)
+    descriptions = tuple(
+        sorted((fit_combination(since, places, misfit) for places in _COMBINATIONS),
+               key=CombinationFit.penalized_deviance))
     best = descriptions[0]
-    kept = {tuple(place for place in best.held if place not in replaced)
-            for replaced in ((_B, _K), (_K,)) if set(replaced) & set(best.held)}
+    kept = {tuple(place for place in best.active_terms if place not in replaced)
+            for replaced in ((_B, _K), (_K,)) if set(replaced) & set(best.active_terms)}
     return Ranking(start, misfit, descriptions, tuple(filter(None, (
-        _with_process(best, each, misfit) for each in kept))))
+        _fit_with_process(best, each, misfit) for each in kept))))
 
 
-def _with_process(best: Description, kept: tuple[int, ...], misfit: float) -> Description | None:
+def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
+                      misfit: float) -> CombinationFit | None:
     """
     Return the best fit of some terms and a Gauss-Markov process, or None without one.
 
@@ -361,35 +379,36 @@ def _with_process(best: Description, kept: tuple[int, ...], misfit: float) -> De
     correlation time is found with the covariance of the best fit, scaled by the Allan deviations.
 
     """
-    octaves, places = best.octaves, (*kept, _PROCESS)
-    longest, known = octaves.size[-1] / 1.9, octaves.model(best.squares)
+    octaves, places = best.octaves, (*kept_terms, _PROCESS)
+    longest, known = octaves.size[-1] / 1.9, octaves.model_variance(best.squares)
 
-    def roughly(process: GaussMarkov) -> float:
-        columns, squares, half = octaves.with_column(process), np.zeros(_BEND + 1), best.half
+    def approximate_deviance(process: GaussMarkov) -> float:
+        columns, squares, half = (octaves.process_columns(process), np.zeros(_FILTER_BEND + 1),
+                                  best.cholesky_factor)
         for _ in range(2):
             white = np.linalg.solve(half, np.column_stack(
                 [columns[:, places], octaves.variance]))
             size = np.linalg.norm(white[:, :-1], axis=0)
             squares[list(places)] = nnls(white[:, :-1] / size, white[:, -1])[0] / size
             model = np.maximum(columns @ squares, 1e-3 * octaves.variance)
-            half = best.half * (model / known)[:, None]
-        return Description(replace(octaves, columns=columns), squares, half).surprise
+            half = best.cholesky_factor * (model / known)[:, None]
+        return CombinationFit(replace(octaves, columns=columns), squares, half).deviance
 
     process = min((GaussMarkov(math.sqrt(2.0 / constant), constant) for constant in np.geomspace(
-        octaves.size[0], longest, 4 * len(octaves.size)).tolist()), key=roughly)
-    found = describe(octaves.with_process(process), places, misfit)
+        octaves.size[0], longest, 4 * len(octaves.size)).tolist()), key=approximate_deviance)
+    found = fit_combination(octaves.with_process(process), places, misfit)
     first = found.squares * found.octaves.columns[0]
     return found if 0.0 < first[_PROCESS] < 0.5 * first.sum() else None
 
 
 @dataclass(frozen=True)
-class Figure:
+class NoiseFigure:
     """
     The coefficient of one noise term.
 
     Attributes
     ----------
-    part : the term
+    term : the term
     value : its coefficient, in the unit of the term; 0 where it is not detected
     standard_deviation : of the coefficient, if only the detected terms are present; nan where it
         is not detected
@@ -398,15 +417,15 @@ class Figure:
 
     """
 
-    part: Part
+    term: NoiseTerm
     value: float
     standard_deviation: float
     lower: float
     upper: float
 
-    def variance(self, time: Array) -> Array:
+    def allan_variance(self, time: Array) -> Array:
         """Return the Allan variance of the term, (rad/s)²."""
-        return self.value ** 2 * self.part.variance(time)
+        return self.value ** 2 * self.term.allan_variance(time)
 
 
 @dataclass(frozen=True)
@@ -418,7 +437,7 @@ class NoiseFit:
     ----------
     figures : by symbol: N, B, K, Q, R
     chart : the Allan deviations that were fitted, at octaves
-    shortest, longest : the range of averaging times of the fit, s
+    min_time, max_time : the range of averaging times of the fit, s
     misfit : relative difference between the Allan deviations and the sum of the terms, beyond
         chance
     alternatives : the symbols of other combinations of terms that fit the record nearly as well
@@ -427,10 +446,10 @@ class NoiseFit:
 
     """
 
-    figures: dict[str, Figure]
+    figures: dict[str, NoiseFigure]
     chart: AllanChart
-    shortest: float
-    longest: float
+    min_time: float
+    max_time: float
     misfit: float
     alternatives: tuple[str, ...] = ()
     process: GaussMarkov | None = None
@@ -448,14 +467,14 @@ class NoiseFit:
 
     def deviation(self, time: Array) -> Array:
         """Return the Allan deviation of the sum of the terms, rad/s."""
-        return np.sqrt(sum(figure.variance(time) for figure in self.figures.values()))
+        return np.sqrt(sum(figure.allan_variance(time) for figure in self.figures.values()))
 
     @property
-    def floor_reached(self) -> bool:
+    def is_floor_reached(self) -> bool:
         """Return whether N and Q make less than half of the variance, an octave before the end."""
         time = self.chart.time[-2]
-        falling = sum(figure.variance(time) for figure in self.figures.values()
-                      if figure.part.slope < 0.0)
+        falling = sum(figure.allan_variance(time) for figure in self.figures.values()
+                      if figure.term.slope < 0.0)
         return bool(falling < 0.5 * self.deviation(time) ** 2)
 
 
@@ -481,87 +500,94 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
     """
     chart = allan_deviation(rate, interval, 2.0 ** np.arange(
         max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
-    if len(chart.size) < _FEWEST_OCTAVES or not chart.deviation.all():
+    if len(chart.size) < _MIN_OCTAVES or not chart.deviation.all():
         raise DataRefused(f'{len(chart.size)} octaves of averaging times without a gap, the '
                           'lowest Allan deviation '
                           f'{chart.deviation.min(initial=math.inf):g} rad/s; wanted '
-                          f'{_FEWEST_OCTAVES} octaves, all above 0: record longer and without '
+                          f'{_MIN_OCTAVES} octaves, all above 0: record longer and without '
                           'losses')
-    ranking = rank(Octaves.of(chart))
-    figures = {part.symbol: _figure(ranking, place, interval)
-               for place, part in enumerate(PARTS)}
-    return NoiseFit(figures, chart, float(chart.time[ranking.start]), float(chart.time[-1]),
-                    ranking.misfit, tuple(sorted({
-                        ''.join(PARTS[place].symbol for place in each.held if place != _BEND)
-                        for each in ranking.alternatives})), _process(ranking, interval))
+    ranking = rank_combinations(OctaveVariances.from_chart(chart))
+    figures = {part.symbol: _build_figure(ranking, place, interval)
+               for place, part in enumerate(NOISE_TERMS)}
+    return NoiseFit(
+        figures, chart, float(chart.time[ranking.first_octave]), float(chart.time[-1]),
+        ranking.misfit,
+        tuple(
+            sorted({
+                ''.join(NOISE_TERMS[place].symbol for place in each.active_terms
+                        if place != _FILTER_BEND) for each in ranking.alternatives
+            })), _select_process(ranking, interval))
 
 
-def _process(ranking: Ranking, interval: float) -> GaussMarkov | None:
+def _select_process(ranking: Ranking, interval: float) -> GaussMarkov | None:
     """Return the process in SI, if the best fit has one."""
-    if ranking.process is None or ranking.process.octaves.process is None:
+    if ranking.best_process is None or ranking.best_process.octaves.process is None:
         return None
-    time = ranking.process.octaves.process.correlation_time * interval
-    return GaussMarkov(math.sqrt(2.0 / time * ranking.process.squares[_PROCESS]), time)
+    time = ranking.best_process.octaves.process.correlation_time * interval
+    return GaussMarkov(math.sqrt(2.0 / time * ranking.best_process.squares[_PROCESS]), time)
 
 
-def _figure(ranking: Ranking, place: int, interval: float) -> Figure:
+def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
     """Return a figure with bounds that hold with and without undetected terms."""
-    part, process = PARTS[place], ranking.process
+    part, process = NOISE_TERMS[index], ranking.best_process
     # flicker and rate random walk approximate a process; the other terms are fitted with it
-    with_process = process is not None and place not in (_B, _K)
+    with_process = process is not None and index not in (_B, _K)
     best = process if process is not None and with_process else ranking.best
     value, deviation = 0.0, math.nan
-    lower, upper = _bounds(ranking, place, with_process)
-    if place in ranking.seen and place in best.held:
-        value = math.sqrt(best.squares[place])
-        deviation = 0.5 * best.deviation(place) / value
-        possible = [best] if with_process else ranking.possible
-        ends = [(lower, upper), *(each.bounds(place) for each in possible if place in each.held)]
+    lower, upper = _likelihood_bounds(ranking, index, with_process)
+    if index in ranking.detected_terms and index in best.active_terms:
+        value = math.sqrt(best.squares[index])
+        deviation = 0.5 * best.square_deviation(index) / value
+        possible = [best] if with_process else ranking.plausible_fits
+        ends = [(lower, upper), *(each.coefficient_bounds(index)
+                                  for each in possible if index in each.active_terms)]
         lower, upper = min(value, *(low for low, _ in ends)), max(value, *(up for _, up in ends))
-        if place in (_B, _K) and ranking.without(place):
+        if index in (_B, _K) and ranking.is_replaceable(index):
             lower = 0.0
     else:
         lower = 0.0
     unit = interval ** -part.slope
-    return Figure(part, *(each * unit for each in (value, deviation, lower, upper)))
+    return NoiseFigure(part, *(each * unit for each in (value, deviation, lower, upper)))
 
 
-def _bounds(ranking: Ranking, place: int, with_process: bool) -> tuple[float, float]:
+def _likelihood_bounds(ranking: Ranking, index: int, with_process: bool) -> tuple[float, float]:
     """
-    Return the coefficients between which -2 ln likelihood is within `_CONFIDENCE` of the least.
+    Return the bounds of a coefficient by the likelihood.
+
+    Between them -2 ln likelihood is within `_CHI_SQUARED_95` of its minimum.
 
     At each coefficient the other terms are fitted anew (profile likelihood): those of the best
     fits, N, B and K, detected or not, and a process where it is fitted with the term.
 
     """
     octaves, misfit = ranking.best.octaves, ranking.misfit
-    if with_process and ranking.process is not None:
-        octaves = ranking.process.octaves
-    held = {_N, _B, _K, *(each for one in (*ranking.possible, *ranking.alternatives)
-                          for each in one.held)}
-    others = tuple(sorted(held - {place} | ({_PROCESS} if with_process else set())))
-    joint = describe(octaves, (*others, place), misfit)
-    (*_, square), (*_, deviation) = joint.estimate((*others, place))
+    if with_process and ranking.best_process is not None:
+        octaves = ranking.best_process.octaves
+    held = {_N, _B, _K, *(each for one in (*ranking.plausible_fits, *ranking.alternatives)
+                          for each in one.active_terms)}
+    others = tuple(sorted(held - {index} | ({_PROCESS} if with_process else set())))
+    joint = fit_combination(octaves, (*others, index), misfit)
+    (*_, square), (*_, deviation) = joint.estimate_squares((*others, index))
 
     @cache
-    def surprise(coefficient: float) -> float:
-        return describe(octaves, others, misfit, place, coefficient ** 2).surprise
+    def deviance_at(coefficient: float) -> float:
+        return fit_combination(octaves, others, misfit, index, coefficient ** 2).deviance
 
-    found = math.sqrt(joint.squares[place])
+    found = math.sqrt(joint.squares[index])
     scale = math.sqrt(max(square, 0.0) + deviation)
     likeliest = min((found, *(scale * factor for factor in (0.25, 0.5, 0.75, 0.9, 1.0, 1.1))),
-                    key=surprise)
-    limit = surprise(likeliest) + _CONFIDENCE
+                    key=deviance_at)
+    limit = deviance_at(likeliest) + _CHI_SQUARED_95
 
-    def border(inside: float, outside: float) -> float:
+    def bisect_limit(inside: float, outside: float) -> float:
         for _ in range(12):
             middle = 0.5 * (inside + outside)
-            inside, outside = ((middle, outside) if surprise(middle) < limit
+            inside, outside = ((middle, outside) if deviance_at(middle) < limit
                                else (inside, middle))
         return inside
 
     high = max(likeliest, scale)
-    while surprise(high) < limit and high < 1e3 * scale:
+    while deviance_at(high) < limit and high < 1e3 * scale:
         high *= 1.5
-    lower = 0.0 if surprise(0.0) < limit else border(likeliest, 0.0)
-    return lower, border(likeliest, high)
+    lower = 0.0 if deviance_at(0.0) < limit else bisect_limit(likeliest, 0.0)
+    return lower, bisect_limit(likeliest, high)

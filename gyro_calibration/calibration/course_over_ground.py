@@ -24,7 +24,8 @@ smoothing. The noise sizes are those of `noise_grid`; each point of the course h
 its own, by the errors of the course around it.
 
 Where a drive does not determine scale factor error and bias, a prior does: normal about zero, with
-a standard deviation that is not known (`PriorSize`), but limited by the technology of the gyro.
+a standard deviation that is not known (`HierarchicalPrior`), but limited by the technology of the
+gyro.
 
 """
 
@@ -33,13 +34,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.calibration.likelihood import Fit, robust_residual
+from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
+    bias_wander_columns,
+    fit_noise_grid,
     GridFit,
     heading_noise,
-    noise_grid,
-    PriorSize,
-    wander,
+    HierarchicalPrior,
 )
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
@@ -48,32 +49,32 @@ from gyro_calibration.model.motion import Motion
 import numpy as np
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
-PRIORS = {
+TECHNOLOGY_PRIORS = {
     'mems': (0.02, 1.0 * DEGREE),
     'open_loop_fog': (0.005, 0.02 * DEGREE),
     'closed_loop_fog': (0.001, 0.002 * DEGREE),
 }
 #: Length of a span, s; smoothing over a second then leaves the scale to a percent of its error.
-SPAN = 2.0
+SPAN_DURATION = 2.0
 #: Largest time offset of the stamps of a gyro against satellites, either way, s.
-LARGEST_TIME_OFFSET = 1.5
+MAX_TIME_OFFSET = 1.5
 #: A reference that is lost for this part of the time, or noisier than this from span to span, rad,
 #: is taken for a course; one in steps of more than this, rad, for an encoder.
-LOST, NOISY, ROUNDED = 0.003, 0.25 * DEGREE, 2e-4
+MIN_LOST_SHARE, MIN_COURSE_NOISE, MAX_ROUNDING_STEP = 0.003, 0.25 * DEGREE, 2e-4
 #: Minimum number of spans; fewer do not determine the noise of a course.
-FEWEST_SPANS = 10
+MIN_SPANS = 10
 #: Prior standard deviations of the rest of the delay, s, and of the smoothing, s².
-DELAY, SMOOTHING = 0.2, 0.1
+DELAY_DEVIATION, SMOOTHING_DEVIATION = 0.2, 0.1
 #: Typical duration of a burst of errors of a course, s; length of the stretches between which the
 #: scatter is taken, s.
-BURST, STRETCH = 5.0, 15.0
+BURST_DURATION, STRETCH_DURATION = 5.0, 15.0
 #: The few errors within a burst hardly determine its variance: the errors of a course have
 #: Student's distribution with so many degrees of freedom, plus one for each observed error.
-FREEDOM = 4.0
+STUDENT_DOF = 4.0
 #: The gyro's noises that are possible, rad/√s and rad/s/√s, and cosines for its wander.
-WHITE, WALK, COSINES = (1e-5, 1e-2), (1e-7, 1e-4), 8
+WHITE_NOISE_RANGE, RANDOM_WALK_RANGE, COSINE_COUNT = (1e-5, 1e-2), (1e-7, 1e-4), 8
 #: Largest deviation of the course from a gyro that follows it, with any side slip, rad.
-FOLLOWED = 3.0 * DEGREE
+MAX_FOLLOWED_RESIDUAL = 3.0 * DEGREE
 
 
 @dataclass(frozen=True)
@@ -85,65 +86,66 @@ class _Spans:
     ----------
     time : s, shape (n,)
     course : rad, shape (n,)
-    turned : integral of the output, rad, shape (n,)
+    gyro_angle : integral of the output, rad, shape (n,)
     rate, acceleration : of the gyro, rad/s and rad/s², shape (n,)
 
     """
 
     time: Array
     course: Array
-    turned: Array
+    gyro_angle: Array
     rate: Array
     acceleration: Array
 
 
-class _Drive:
+class _CourseAlignment:
     """Gyro and course, aligned at any time offset."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion):
         """Average the course over spans that are at least half known."""
         self._time, self._integral = time, integrate(time, rate)
-        number = np.floor(motion.time / SPAN).astype(np.intp)
+        number = np.floor(motion.time / SPAN_DURATION).astype(np.intp)
         count = np.bincount(number)
         usual = float(np.median(count[count > 0]))
-        self._kept = (count >= 0.5 * usual)[number]
-        number = np.unique(number[self._kept], return_inverse=True)[1]
+        self._is_used = (count >= 0.5 * usual)[number]
+        number = np.unique(number[self._is_used], return_inverse=True)[1]
         self._begins = np.flatnonzero(np.diff(number, prepend=-1))
-        self._size = np.diff(np.append(self._begins, len(number)))
-        self._at = motion.time[self._kept]
-        self.course = self._mean(motion.heading[self._kept])
-        self.time = self._mean(self._at)
+        self._span_sizes = np.diff(np.append(self._begins, len(number)))
+        self._reference_time = motion.time[self._is_used]
+        self.course = self._average_by_span(motion.heading[self._is_used])
+        self.time = self._average_by_span(self._reference_time)
 
-    def _mean(self, values: Array) -> Array:
-        return np.add.reduceat(values, self._begins) / self._size
+    def _average_by_span(self, values: Array) -> Array:
+        return np.add.reduceat(values, self._begins) / self._span_sizes
 
-    def turned(self, offset: float) -> Array:
+    def gyro_angle(self, offset: float) -> Array:
         """Return the mean integral of the output in each span, rad, the gyro being late, s."""
-        return self._mean(np.interp(self._at + offset, self._time, self._integral))
+        return self._average_by_span(
+            np.interp(self._reference_time + offset, self._time, self._integral))
 
-    def spans(self, offset: float) -> _Spans:
+    def average_spans(self, offset: float) -> _Spans:
         """Return the spans for a time offset that the samples cover."""
-        base = 0.5
-        inside = (self.time + offset - base - 0.5 * SPAN >= self._time[0]) & (
-            self.time + offset + base + 0.5 * SPAN <= self._time[-1]
+        half_step = 0.5
+        inside = (self.time + offset - half_step - 0.5 * SPAN_DURATION >= self._time[0]) & (
+            self.time + offset + half_step + 0.5 * SPAN_DURATION <= self._time[-1]
         )
         middle, later, earlier = (
-            self.turned(offset + shift)[inside] for shift in (0, base, -base)
+            self.gyro_angle(offset + shift)[inside] for shift in (0, half_step, -half_step)
         )
         return _Spans(
             self.time[inside],
             self.course[inside],
             middle,
-            (later - earlier) / (2.0 * base),
-            (later - 2.0 * middle + earlier) / base**2,
+            (later - earlier) / (2.0 * half_step),
+            (later - 2.0 * middle + earlier) / half_step**2,
         )
 
-    def coarse_offset(self, largest: float) -> float:
+    def find_coarse_offset(self, largest: float) -> float:
         """Return the offset at which course less integral is straight for most of the time."""
         offsets = np.arange(-round(largest / 0.05), round(largest / 0.05) + 1) * 0.05
         line = np.column_stack([np.ones(len(self.time)), self.time])
         misfits = [
-            float(np.mean(np.abs(robust_residual(line, self.course - self.turned(offset), 3))))
+            float(np.mean(np.abs(robust_residual(line, self.course - self.gyro_angle(offset), 3))))
             for offset in offsets
         ]
         return float(offsets[int(np.argmin(misfits))])
@@ -154,8 +156,8 @@ def fit_course(
     rate: Array,
     motion: Motion,
     technology: str = 'mems',
-    largest_time_offset: float = LARGEST_TIME_OFFSET,
-) -> Fit:
+    largest_time_offset: float = MAX_TIME_OFFSET,
+) -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset to a drive.
 
@@ -164,7 +166,7 @@ def fit_course(
     time : s since the course began, shape (n,)
     rate : output of the gyro, rad/s, shape (n,)
     motion : the courses that are known
-    technology : of the gyro, one of `PRIORS`
+    technology : of the gyro, one of `TECHNOLOGY_PRIORS`
     largest_time_offset : how late or early the gyro's stamps may be, s
 
     Raises
@@ -172,26 +174,26 @@ def fit_course(
     DataRefused : the course is known for too short a time, or the gyro does not follow it
 
     """
-    drive = _Drive(time, rate, motion)
-    offset = drive.coarse_offset(largest_time_offset)
-    spans = drive.spans(offset)
-    if len(spans.time) < FEWEST_SPANS:
+    alignment = _CourseAlignment(time, rate, motion)
+    offset = alignment.find_coarse_offset(largest_time_offset)
+    spans = alignment.average_spans(offset)
+    if len(spans.time) < MIN_SPANS:
         raise DataRefused(
-            f'the course is known for {len(spans.time) * SPAN:.0f} s, wanted at least '
-            f'{FEWEST_SPANS * SPAN:.0f} s: drive for longer, faster than a walk'
+            f'the course is known for {len(spans.time) * SPAN_DURATION:.0f} s, wanted at least '
+            f'{MIN_SPANS * SPAN_DURATION:.0f} s: drive for longer, faster than a walk'
         )
     _refuse_other_motion(spans)
-    points: Array = np.ones(len(spans.time))
+    point_variance: Array = np.ones(len(spans.time))
     for _ in range(2):
-        points = _burst_variance(spans, _point_errors(spans, points))
-    found = _regression(spans, points, technology)
-    scale, drift, late = found.values[:3]
-    jacobian = np.array([[-1.0 / scale**2, 0.0], [-drift / scale**2, 1.0 / scale]])
-    covariance = jacobian @ _covariance(found, spans) @ jacobian.T
+        point_variance = _burst_variance(spans, _point_errors(spans, point_variance))
+    found = _regress_course(spans, point_variance, technology)
+    scale, scaled_bias, late = found.values[:3]
+    jacobian = np.array([[-1.0 / scale**2, 0.0], [-scaled_bias / scale**2, 1.0 / scale]])
+    covariance = jacobian @ _stretch_covariance(found, spans) @ jacobian.T
     influence = found.influence[:, :2] @ jacobian.T
-    return Fit(
+    return ScaleBiasFit(
         float(1.0 / scale - 1.0),
-        float(drift / scale),
+        float(scaled_bias / scale),
         covariance,
         offset + float(late),
         found.size('angle_random_walk'),
@@ -214,53 +216,54 @@ def is_course(time: Array, rate: Array, motion: Motion) -> bool:
     motion : by the reference
 
     """
-    if quantization_step(motion.heading) > ROUNDED:
+    if quantization_step(motion.heading) > MAX_ROUNDING_STEP:
         return False
     interval = np.diff(np.concatenate([[time[0]], motion.time, [time[-1]]]))
     lost = float(np.sum(interval[interval > 5.0 * np.median(interval)]))
-    if lost > LOST * float(time[-1] - time[0]):
+    if lost > MIN_LOST_SHARE * float(time[-1] - time[0]):
         return True
-    drive = _Drive(time, rate, motion)
-    spans = drive.spans(drive.coarse_offset(LARGEST_TIME_OFFSET))
-    if len(spans.time) < FEWEST_SPANS:
+    alignment = _CourseAlignment(time, rate, motion)
+    spans = alignment.average_spans(alignment.find_coarse_offset(MAX_TIME_OFFSET))
+    if len(spans.time) < MIN_SPANS:
         return False
-    residual = robust_residual(_columns(spans), np.diff(spans.course), 10)
-    return float(np.median(np.abs(residual))) > 0.6745 * math.sqrt(2.0) * NOISY
+    residual = robust_residual(_regression_columns(spans), np.diff(spans.course), 10)
+    return float(np.median(np.abs(residual))) > 0.6745 * math.sqrt(2.0) * MIN_COURSE_NOISE
 
 
-def _columns(spans: _Spans) -> Array:
+def _regression_columns(spans: _Spans) -> Array:
     """Return the columns of p, q, d and c in the increments of the course, shape (n - 1, 4)."""
     return np.diff(
-        np.column_stack([spans.turned, -spans.time, spans.rate, spans.acceleration]), axis=0
+        np.column_stack([spans.gyro_angle, -spans.time, spans.rate, spans.acceleration]), axis=0
     )
 
 
-def _regression(spans: _Spans, points: Array, technology: str) -> GridFit:
-    largest_scale, largest_bias = PRIORS[technology]
-    columns, increments = _columns(spans), np.diff(spans.course)
-    cosines, wanders = wander(spans.time, None, WALK, COSINES)
-    noise = heading_noise(spans.time, spans.rate, points, angle_random_walk=WHITE)
-    return noise_grid(
+def _regress_course(spans: _Spans, point_variance: Array, technology: str) -> GridFit:
+    largest_scale, largest_bias = TECHNOLOGY_PRIORS[technology]
+    columns, increments = _regression_columns(spans), np.diff(spans.course)
+    cosines, wanders = bias_wander_columns(spans.time, None, RANDOM_WALK_RANGE, COSINE_COUNT)
+    noise = heading_noise(spans.time, spans.rate, point_variance,
+                          angle_random_walk=WHITE_NOISE_RANGE)
+    return fit_noise_grid(
         increments,
         columns,
         noise,
         cosines,
         wanders,
         np.array([1.0, 0.0, 0.0, 0.0]),
-        np.array([largest_scale, largest_bias, DELAY, SMOOTHING]),
-        wandering=1,
-        prior_sizes=(
-            PriorSize('scale_factor_error', 0, (1e-2 * largest_scale, largest_scale)),
-            PriorSize('bias', 1, (1e-3 * largest_bias, largest_bias)),
+        np.array([largest_scale, largest_bias, DELAY_DEVIATION, SMOOTHING_DEVIATION]),
+        wandering_value=1,
+        hierarchical_priors=(
+            HierarchicalPrior('scale_factor_error', 0, (1e-2 * largest_scale, largest_scale)),
+            HierarchicalPrior('bias', 1, (1e-3 * largest_bias, largest_bias)),
         ),
     )
 
 
-def _point_errors(spans: _Spans, points: Array) -> Array:
+def _point_errors(spans: _Spans, point_variance: Array) -> Array:
     """Return the error of each point of the course about a fit weighted by their variances."""
     columns = np.column_stack([spans.time, spans.rate, np.ones(len(spans.time))])
-    weights = 1.0 / np.sqrt(points)[:, None]
-    error = spans.course - spans.turned
+    weights = 1.0 / np.sqrt(point_variance)[:, None]
+    error = spans.course - spans.gyro_angle
     scale = np.abs(columns).max(axis=0) + 1e-12
     values = np.linalg.lstsq(columns / scale * weights, error * weights[:, 0], rcond=1e-10)[0]
     return error - columns / scale @ values
@@ -268,45 +271,46 @@ def _point_errors(spans: _Spans, points: Array) -> Array:
 
 def _burst_variance(spans: _Spans, error: Array) -> Array:
     """Return the variance of each point relative to the usual one, by the errors around it."""
-    around = np.abs(spans.time[:, None] - spans.time) <= 0.5 * BURST
+    around = np.abs(spans.time[:, None] - spans.time) <= 0.5 * BURST_DURATION
     squares, count = around @ error**2, around.sum(axis=1)
     usual = max(float(np.median(squares / count)), 1e-12)
-    return (FREEDOM + squares / usual) / (FREEDOM + count)
+    return (STUDENT_DOF + squares / usual) / (STUDENT_DOF + count)
 
 
 def _refuse_other_motion(spans: _Spans) -> None:
     """Refuse a gyro that explains less than half of the variation of the course."""
-    left, there = (
-        _curved(spans.time, each) for each in (spans.course - spans.turned, spans.course)
-    )
-    if left > max(FOLLOWED, 0.5 * there):
+    residual_variation, course_variation = (_median_line_deviation(
+        spans.time, each) for each in (spans.course - spans.gyro_angle, spans.course))
+    if residual_variation > max(MAX_FOLLOWED_RESIDUAL, 0.5 * course_variation):
         raise DataRefused(
-            f'within {STRETCH:.0f} s the course varies by {there / DEGREE:.1f} deg, and less the '
-            f'gyro by {left / DEGREE:.1f} deg (medians): the gyro does not follow the '
+            f'within {STRETCH_DURATION:.0f} s the course varies by '
+            f'{course_variation / DEGREE:.1f} deg, and less the '
+            f'gyro by {residual_variation / DEGREE:.1f} deg (medians): the gyro does not follow '
+            'the '
             'course. Check that both belong to one drive, and check axis, sign, units, and that '
             'the gyro responds'
         )
 
 
-def _curved(time: Array, heading: Array) -> float:
+def _median_line_deviation(time: Array, heading: Array) -> float:
     """Return the median deviation of a heading from a line within stretches, rad."""
-    number = np.floor((time - time[0]) / STRETCH).astype(np.intp)
-    off = [np.empty(0)]
+    number = np.floor((time - time[0]) / STRETCH_DURATION).astype(np.intp)
+    deviations = [np.empty(0)]
     for each in np.unique(number):
         inside = number == each
         if inside.sum() > 3:
             line = np.polyfit(time[inside], heading[inside], 1)
-            off.append(np.abs(heading[inside] - np.polyval(line, time[inside])))
-    joined = np.concatenate(off)
+            deviations.append(np.abs(heading[inside] - np.polyval(line, time[inside])))
+    joined = np.concatenate(deviations)
     return float(np.median(joined)) if len(joined) else 0.0
 
 
-def _covariance(found: GridFit, spans: _Spans) -> Array:
+def _stretch_covariance(found: GridFit, spans: _Spans) -> Array:
     """Return the covariance of (p, q): by the noise, or by the scatter of stretches if larger."""
     covariance = found.covariance[:2, :2]
-    number = np.floor((spans.time[1:] - spans.time[0]) / STRETCH).astype(np.intp)
+    number = np.floor((spans.time[1:] - spans.time[0]) / STRETCH_DURATION).astype(np.intp)
     sums = np.array([np.bincount(number, column) for column in found.influence[:, :2].T])
     stretches = max(sums.shape[1], 2)
     scatter = np.diag(sums @ sums.T) * stretches / (stretches - 1.0)
-    larger = np.sqrt(np.maximum(scatter / np.diag(covariance), 1.0))
-    return covariance * np.outer(larger, larger)
+    widening = np.sqrt(np.maximum(scatter / np.diag(covariance), 1.0))
+    return covariance * np.outer(widening, widening)

@@ -22,8 +22,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.likelihood import ASYMMETRY, Fit
-from gyro_calibration.calibration.noise_grid import BandedNoise, GridFit, noise_grid
+from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, ScaleBiasFit
+from gyro_calibration.calibration.noise_grid import BandedNoise, fit_noise_grid, GridFit
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
@@ -31,36 +31,37 @@ import numpy as np
 from scipy.special import chdtr
 
 #: Number of windows of a run in the second fit of the bias.
-_WINDOWS = 16
+_WINDOW_COUNT = 16
 #: Probability of that second fit where the noise is a random walk of the heading.
-_CHANCE = 1e-3
+_FALSE_ALARM_RATE = 1e-3
 
 #: Duration, s, and net turn, rad, of the drive for which the precision of a calibration is judged.
-DRIVE, TURN = 300.0, 2.0 * math.pi
+DRIVE_DURATION, DRIVE_ANGLE = 300.0, 2.0 * math.pi
 
 
 @dataclass(frozen=True)
-class _Windows:
+class _WindowMeans:
     """
     Means over windows of equal length, shape (n,) each, and the repeatable error.
 
     Attributes
     ----------
-    length : of a window, s
+    duration : of a window, s
     time, heading : means of times, s, and reference headings, rad
-    turned : mean heading error of the gyro against the reference, rad
-    repeating : standard deviation of that error about its means within the windows, rad
+    heading_error : mean heading error of the gyro against the reference, rad
+    repeatable_error : standard deviation of that error about its means within the windows, rad
 
     """
 
-    length: float
+    duration: float
     time: Array
     heading: Array
-    turned: Array
-    repeating: float
+    heading_error: Array
+    repeatable_error: float
 
 
-def look_slower(fit: Fit, time: Array, rate: Array, motion: Motion) -> Fit:
+def refit_bias_by_windows(fit: ScaleBiasFit, time: Array, rate: Array,
+                          motion: Motion) -> ScaleBiasFit:
     """
     Return the fit with the bias by window means, where repeatable errors dominate the blocks.
 
@@ -79,53 +80,58 @@ def look_slower(fit: Fit, time: Array, rate: Array, motion: Motion) -> Fit:
         returned unchanged
 
     """
-    windows = None if motion.rate is not None else _windows(fit, time, rate, motion)
+    windows = None if motion.rate is not None else _average_windows(fit, time, rate, motion)
     if windows is None:
         return fit
-    walk, point = fit.angle_random_walk, max(windows.repeating, 1e-12)
-    adding_up = _line(windows, (walk, walk), (1e-15, 1e-15))
-    if not chdtr(_WINDOWS - 2, np.sum(adding_up.whiten(adding_up.residual) ** 2)) < _CHANCE:
+    walk, reference_deviation = fit.angle_random_walk, max(windows.repeatable_error, 1e-12)
+    random_walk_fit = _fit_windows(windows, (walk, walk), (1e-15, 1e-15))
+    if not chdtr(_WINDOW_COUNT - 2, np.sum(random_walk_fit.whiten(random_walk_fit.residual) **
+                                           2)) < _FALSE_ALARM_RATE:
         return fit
-    found = _line(windows, (1e-3 * walk, walk), (1e-3 * point, point))
-    weights = found.solve(np.diff(windows.time))
+    repeatable_fit = _fit_windows(windows, (1e-3 * walk, walk),
+                                  (1e-3 * reference_deviation, reference_deviation))
+    weights = repeatable_fit.solve(np.diff(windows.time))
     slope = float(weights @ np.diff(windows.heading)) / float(weights @ np.diff(windows.time))
     scale_variance = fit.covariance[0, 0]
     covariance = np.array([[scale_variance, -slope * scale_variance],
                            [-slope * scale_variance,
-                            2.0 * found.covariance[0, 0] + slope ** 2 * scale_variance]])
-    return replace(fit, bias=float(found.values[0]), covariance=covariance,
-                   repeating=windows.repeating)
+                            2.0 * repeatable_fit.covariance[0, 0] + slope ** 2 * scale_variance]])
+    return replace(fit, bias=float(repeatable_fit.values[0]), covariance=covariance,
+                   repeatable_error=windows.repeatable_error)
 
 
-def _windows(fit: Fit, time: Array, rate: Array, motion: Motion) -> _Windows | None:
+def _average_windows(fit: ScaleBiasFit, time: Array, rate: Array,
+                     motion: Motion) -> _WindowMeans | None:
     """Return the windows; None where one is empty, or shorter than 1 s."""
-    at = motion.time + fit.time_offset
-    inside = (at >= time[0]) & (at <= time[-1])
-    at, heading = at[inside], motion.heading[inside]
-    if len(at) < 2 * _WINDOWS:
+    gyro_time = motion.time + fit.time_offset
+    inside = (gyro_time >= time[0]) & (gyro_time <= time[-1])
+    gyro_time, heading = gyro_time[inside], motion.heading[inside]
+    if len(gyro_time) < 2 * _WINDOW_COUNT:
         return None
-    length = float(at[-1] - at[0]) / _WINDOWS
-    place = np.minimum(((at - at[0]) / length).astype(np.intp), _WINDOWS - 1)
-    count = np.bincount(place, minlength=_WINDOWS)
+    length = float(gyro_time[-1] - gyro_time[0]) / _WINDOW_COUNT
+    place = np.minimum(((gyro_time - gyro_time[0]) / length).astype(np.intp), _WINDOW_COUNT - 1)
+    count = np.bincount(place, minlength=_WINDOW_COUNT)
     if length < 1.0 or not count.all():
         return None
-    beyond = np.interp(at, time, integrate(time, rate)) - (1.0 + fit.scale_factor_error) * heading
+    error = (np.interp(gyro_time, time, integrate(time, rate)) -
+             (1.0 + fit.scale_factor_error) * heading)
     middle, known, turned = (np.bincount(place, values) / count
-                             for values in (at, heading, beyond))
-    return _Windows(length, middle, known, turned, float(np.std(beyond - turned[place])))
+                             for values in (gyro_time, heading, error))
+    return _WindowMeans(length, middle, known, turned, float(np.std(error - turned[place])))
 
 
-def _line(windows: _Windows, walk: tuple[float, float], point: tuple[float, float]) -> GridFit:
+def _fit_windows(windows: _WindowMeans, walk_range: tuple[float, float],
+                 reference_range: tuple[float, float]) -> GridFit:
     """Fit a bias, with ranges of N, rad/√s, and of the errors of the means of windows, rad."""
     ones = np.ones(len(windows.time) - 1)
-    return noise_grid(
-        np.diff(windows.turned), np.diff(windows.time)[:, None],
-        [BandedNoise('angle_random_walk', 2.0 / 3.0 * windows.length * ones,
-                     windows.length / 6.0 * ones, walk),
-         BandedNoise('reference', 2.0 * ones, -ones, point)])
+    return fit_noise_grid(
+        np.diff(windows.heading_error), np.diff(windows.time)[:, None],
+        [BandedNoise('angle_random_walk', 2.0 / 3.0 * windows.duration * ones,
+                     windows.duration / 6.0 * ones, walk_range),
+         BandedNoise('reference', 2.0 * ones, -ones, reference_range)])
 
 
-def allow_asymmetry(fit: Fit, rate: Array) -> Fit:
+def add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
     """
     Return the fit with the variance of a scale difference between both senses of turning added.
 
@@ -136,20 +142,21 @@ def allow_asymmetry(fit: Fit, rate: Array) -> Fit:
 
     """
     columns = np.column_stack([rate, np.ones(len(rate))])
-    mistaken = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
-    return replace(fit, covariance=fit.covariance + ASYMMETRY ** 2 * np.outer(mistaken, mistaken))
+    absorbed = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
+    return replace(
+        fit, covariance=fit.covariance + ASYMMETRY_DEVIATION ** 2 * np.outer(absorbed, absorbed))
 
 
-def refuse_repeating(fit: Fit, limit: float) -> None:
+def refuse_repeatable_error(fit: ScaleBiasFit, limit: float) -> None:
     """Refuse a run whose heading error exceeds a limit, rad, for any scale and bias."""
-    if fit.repeating > limit:
-        raise DataRefused(f'the heading error is {fit.repeating / DEGREE:.1f} deg rms and '
+    if fit.repeatable_error > limit:
+        raise DataRefused(f'the heading error is {fit.repeatable_error / DEGREE:.1f} deg rms and '
                           f'repeats with the motion, at most {limit / DEGREE:g} deg are allowed; '
                           'scale and bias do not explain it: turn more slowly and gently, fasten '
                           'the gyro, or sample faster')
 
 
-def refuse_useless(fit: Fit, limit: float) -> None:
+def refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
     """
     Refuse a calibration that by its own covariance makes a heading less accurate.
 
@@ -163,12 +170,15 @@ def refuse_useless(fit: Fit, limit: float) -> None:
     DataRefused : the standard deviation exceeds the limit, and the error without the calibration
 
     """
-    after = math.sqrt((fit.covariance[1, 1] * DRIVE + 2.0 * fit.covariance[0, 1] * TURN) * DRIVE
-                      + fit.covariance[0, 0] * TURN ** 2)
-    before = math.hypot(fit.bias * DRIVE, fit.scale_factor_error * TURN)
-    if after > max(limit, before):
+    error_with = math.sqrt((fit.covariance[1, 1] * DRIVE_DURATION
+                            + 2.0 * fit.covariance[0, 1] * DRIVE_ANGLE) * DRIVE_DURATION
+                           + fit.covariance[0, 0] * DRIVE_ANGLE ** 2)
+    error_without = math.hypot(fit.bias * DRIVE_DURATION, fit.scale_factor_error * DRIVE_ANGLE)
+    if error_with > max(limit, error_without):
         raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
                           'deg/s only, which lets a heading drift by '
-                          f'{after / DEGREE:.0f} deg in five minutes; without the calibration it '
-                          f'is {before / DEGREE:.0f} deg: turn more slowly, with rests, or for '
+                          f'{error_with / DEGREE:.0f} deg in five minutes; without the '
+                          'calibration it '
+                          f'is {error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
+                          'for '
                           'longer')

@@ -73,10 +73,10 @@ from scipy.linalg.lapack import dpttrf, dpttrs
 
 #: Points of the grid for each size, and passes: the first is over the whole range, each further
 #: one around the likely points.
-POINTS, PASSES = 5, 4
+GRID_POINTS, GRID_PASSES = 5, 4
 #: Cosines that describe a wandering bias; faster changes are hardly distinguishable from white
 #: noise.
-COSINES = 24
+COSINE_COUNT = 24
 
 
 @dataclass(frozen=True)
@@ -88,16 +88,16 @@ class BandedNoise:
     ----------
     name : of the size
     diagonal : shape (n,)
-    neighbours : of each observation with the one before it, shape (n,); the first is not looked
+    off_diagonal : of each observation with the one before it, shape (n,); the first is not looked
         at. None where they are independent
-    range : smallest and largest size that is possible; equal where the size is known
+    size_range : smallest and largest size that is possible; equal where the size is known
 
     """
 
     name: str
     diagonal: Array
-    neighbours: Array | None
-    range: tuple[float, float]  # noqa: A003
+    off_diagonal: Array | None
+    size_range: tuple[float, float]  # noqa: A003
 
 
 @dataclass(frozen=True)
@@ -109,20 +109,20 @@ class SharedNoise:
     ----------
     name : of the size
     variance : shape (q,)
-    range : smallest and largest size that is possible; equal where the size is known
-    unseen : variance that the observations have in common, so that it looks like one of the
-        values, in units of size²
+    size_range : smallest and largest size that is possible; equal where the size is known
+    unobservable_variance : variance that the observations have in common, so that it looks like
+        one of the values, in units of size²
 
     """
 
     name: str
     variance: Array
-    range: tuple[float, float]  # noqa: A003
-    unseen: float = 0.0
+    size_range: tuple[float, float]  # noqa: A003
+    unobservable_variance: float = 0.0
 
 
 @dataclass(frozen=True)
-class PriorSize:
+class HierarchicalPrior:
     """
     A value whose normal prior has a standard deviation of unknown size.
 
@@ -132,14 +132,14 @@ class PriorSize:
     Attributes
     ----------
     name : of the size
-    value : number of the value
-    range : smallest and largest standard deviation, in the unit of the value
+    value_index : number of the value
+    size_range : smallest and largest standard deviation, in the unit of the value
 
     """
 
     name: str
-    value: int
-    range: tuple[float, float]  # noqa: A003
+    value_index: int
+    size_range: tuple[float, float]  # noqa: A003
 
 
 @dataclass(frozen=True)
@@ -153,31 +153,33 @@ class GridFit:
     covariance : of the values, shape (m, m), including the uncertainty of the noise
     sizes : for each size its name, its estimate (mean of the logarithm), and the limits that hold
         95 %
-    likely : the size of each part at the point of the grid with the largest likelihood, by name
+    likeliest_sizes : the size of each part at the point of the grid with the largest likelihood,
+        by name
     log_likelihood : there, with the values of flat prior integrated out; for models with the same
         columns of flat prior
-    evidence : logarithm of the mean likelihood over the grid, to compare models with the same
+    log_evidence : logarithm of the mean likelihood over the grid, to compare models with the same
         columns of flat prior
     residual : observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
     shared : estimates of u at the likeliest point, shape (q,)
     influence : what the error of each observation adds to the values at the likeliest point, shape
         (n, m); sums over stretches of a log give a covariance that does not rely on the noise
         model
-    unseen : variance that the shared noise has in common with one of the values, as it is `unseen`
+    unobservable_variance : variance that the shared noise has in common with one of the values, as
+        it is `unobservable_variance`
 
     """
 
     values: Array
     covariance: Array
     sizes: Mapping[str, tuple[float, float, float]]
-    likely: Mapping[str, float]
+    likeliest_sizes: Mapping[str, float]
     log_likelihood: float
-    evidence: float
+    log_evidence: float
     residual: Array
     shared: Array
     influence: Array
-    unseen: float
-    _noise: Tridiagonal
+    unobservable_variance: float
+    _noise: TridiagonalMatrix
 
     @property
     def deviations(self) -> Array:
@@ -197,7 +199,7 @@ class GridFit:
         return self._noise.solve(columns)
 
 
-class Tridiagonal:
+class TridiagonalMatrix:
     """A positive definite tridiagonal matrix, factored as L D L'."""
 
     def __init__(self, diagonal: Array, neighbours: Array):
@@ -224,8 +226,8 @@ def heading_noise(
     time: Array,
     rate: Array,
     point_variance: Array | None = None,
-    turned: bool = False,
-    unit: float = math.radians(1.0),
+    with_angle_noise: bool = False,
+    typical_reference_noise: float = math.radians(1.0),
     angle_random_walk: tuple[float, float] | None = None,
 ) -> list[BandedNoise]:
     """
@@ -237,40 +239,43 @@ def heading_noise(
     rate : at the points, rad/s, shape (n + 1,)
     point_variance : of the reference at each point, relative to the others, shape (n + 1,); larger
         where a point is an outlier
-    turned : whether noise in proportion to the angle turned is looked for
-    unit : typical size of the noise of the reference, rad; sizes from 1e-4 to 10 times it are
-        possible
+    with_angle_noise : whether noise in proportion to the angle turned is looked for
+    typical_reference_noise : typical size of the noise of the reference, rad; sizes from 1e-4 to
+        10 times it are possible
     angle_random_walk : smallest and largest N that is possible, rad/√s, where a log at rest, a
         data sheet or the differences between samples bound it; equal ends where it is known
 
     """
     points = np.ones(len(time)) if point_variance is None else point_variance
-    interval, size = np.diff(time), math.sqrt(float(np.mean(rate**2))) + 1e-12
+    interval, rate_rms = np.diff(time), math.sqrt(float(np.mean(rate**2))) + 1e-12
     parts = [
         BandedNoise(
-            'angle_random_walk', interval, None, angle_random_walk or (1e-4 * unit, 1e1 * unit)
-        ),
-        BandedNoise('reference', *_differenced(points), (1e-4 * unit, 1e1 * unit)),
+            'angle_random_walk', interval, None, angle_random_walk
+            or (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
+        BandedNoise('reference', *_difference_covariance(points),
+                    (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
         BandedNoise(
-            'motion', *_differenced(points * rate**2), (1e-3 * unit / size, 1e1 * unit / size)
-        ),
+            'motion', *_difference_covariance(points * rate ** 2),
+            (1e-3 * typical_reference_noise / rate_rms, 1e1 * typical_reference_noise / rate_rms)),
     ]
-    if turned:
+    if with_angle_noise:
         angle = np.abs(0.5 * (rate[1:] + rate[:-1]) * interval)
-        parts.append(BandedNoise('turned', angle, None, (1e-3 * unit, 1e1 * unit)))
+        parts.append(
+            BandedNoise('turned', angle, None,
+                        (1e-3 * typical_reference_noise, 1e1 * typical_reference_noise)))
     return parts
 
 
-def _differenced(variance: Array) -> tuple[Array, Array]:
+def _difference_covariance(variance: Array) -> tuple[Array, Array]:
     """Return variances of differences between points, and covariances with the one before."""
     return variance[1:] + variance[:-1], -variance[:-1]
 
 
-def wander(
+def bias_wander_columns(
     time: Array,
     bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
     rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
-    cosines: int = COSINES,
+    cosine_count: int = COSINE_COUNT,
 ) -> tuple[Array, list[SharedNoise]]:
     """
     Return the columns of a wandering bias in increments between points, and its noise parts.
@@ -287,7 +292,7 @@ def wander(
     time : of the points, s, shape (n + 1,)
     bias_instability : range of B, rad/s, or None without flicker
     rate_random_walk : range of K, rad/s/√s, or None without rate random walk
-    cosines : their number, limited to half the number of spans
+    cosine_count : their number, limited to half the number of spans
 
     Returns
     -------
@@ -295,7 +300,7 @@ def wander(
 
     """
     duration = float(time[-1] - time[0])
-    omega = math.pi * np.arange(1, max(min(cosines, (len(time) - 1) // 2), 1) + 1) / duration
+    omega = math.pi * np.arange(1, max(min(cosine_count, (len(time) - 1) // 2), 1) + 1) / duration
     columns = np.diff(np.sin(omega * (time - time[0])[:, None]) / omega, axis=0)
     parts = [
         SharedNoise(name, 2.0 / duration / omega**power, limits, mean)
@@ -314,31 +319,31 @@ class _Regression:
 
     observed: Array
     columns: Array
-    values: int
-    precision: Array
+    value_count: int
+    prior_precision: Array
     banded: Sequence[BandedNoise]
     shared: Sequence[SharedNoise]
-    priors: Sequence[PriorSize]
+    hierarchical_priors: Sequence[HierarchicalPrior]
 
     @property
-    def parts(self) -> list[BandedNoise | SharedNoise | PriorSize]:
+    def parts(self) -> list[BandedNoise | SharedNoise | HierarchicalPrior]:
         """Return the parts of the noise and the priors of unknown size."""
-        return [*self.banded, *self.shared, *self.priors]
+        return [*self.banded, *self.shared, *self.hierarchical_priors]
 
-    def noise(self, sizes: Iterable[float]) -> Tridiagonal:
+    def banded_covariance(self, sizes: Iterable[float]) -> TridiagonalMatrix:
         """Return the covariance of the banded noise."""
         diagonal, neighbours = np.zeros((2, len(self.observed)))
         for size, part in zip(sizes, self.banded):
             diagonal += size**2 * part.diagonal
-            if part.neighbours is not None:
-                neighbours += size**2 * part.neighbours
-        return Tridiagonal(diagonal, neighbours)
+            if part.off_diagonal is not None:
+                neighbours += size**2 * part.off_diagonal
+        return TridiagonalMatrix(diagonal, neighbours)
 
-    def precisions(self, sizes: Array) -> Array:
+    def prior_precisions(self, sizes: Array) -> Array:
         """Return prior precisions, shape (k, m + q), for sizes of shape (k, parts)."""
-        fixed = np.tile(self.precision, (len(sizes), 1))
-        for prior, size in zip(self.priors, sizes[:, len(self.shared):].T):
-            fixed[:, prior.value] = 1.0 / size**2
+        fixed = np.tile(self.prior_precision, (len(sizes), 1))
+        for prior, size in zip(self.hierarchical_priors, sizes[:, len(self.shared):].T):
+            fixed[:, prior.value_index] = 1.0 / size**2
         if not self.shared:
             return fixed
         variance = sizes[:, : len(self.shared)] ** 2 @ np.array(
@@ -346,7 +351,8 @@ class _Regression:
         )
         return np.concatenate([fixed, 1.0 / np.maximum(variance, 1e-300)], axis=1)
 
-    def solved(self, noise: Tridiagonal, precisions: Array) -> tuple[Array, Array, Array]:
+    def solve(self, covariance: TridiagonalMatrix,
+              precisions: Array) -> tuple[Array, Array, Array]:
         """
         Solve for one banded noise, and k variances of the shared values.
 
@@ -355,7 +361,7 @@ class _Regression:
         log likelihoods, shape (k,); values, shape (k, m + q); inverse normal matrices
 
         """
-        weighted = noise.solve(np.column_stack([self.columns, self.observed]))
+        weighted = covariance.solve(np.column_stack([self.columns, self.observed]))
         gram = self.columns.T @ weighted
         # scaled, since the columns have different units
         scale = 1.0 / np.sqrt(np.maximum(np.diag(gram[:, :-1]) + precisions, 1e-300))
@@ -366,7 +372,7 @@ class _Regression:
         )
         inverse = (
             np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-            if self.values and np.linalg.cond(normal[0]) > 1e12
+            if self.value_count and np.linalg.cond(normal[0]) > 1e12
             else np.linalg.inv(normal)
         )
         log_determinant = np.linalg.slogdet(normal)[1] - 2.0 * np.log(scale).sum(axis=1)
@@ -374,10 +380,11 @@ class _Regression:
         values = inverse @ gram[:, -1]
         squares = self.observed @ weighted[:, -1] - values @ gram[:, -1]
         proper = np.log(np.where(precisions > 0.0, precisions, 1.0)).sum(axis=1)
-        return -0.5 * (noise.log_determinant + log_determinant - proper + squares), values, inverse
+        return (-0.5 *
+                (covariance.log_determinant + log_determinant - proper + squares), values, inverse)
 
 
-def noise_grid(
+def fit_noise_grid(
     observed: Array,
     columns: Array,
     banded: Sequence[BandedNoise],
@@ -386,8 +393,8 @@ def noise_grid(
     prior_mean: Array | None = None,
     prior_deviation: Array | None = None,
     noisy_column: int | None = None,
-    wandering: int | None = None,
-    prior_sizes: Sequence[PriorSize] = (),
+    wandering_value: int | None = None,
+    hierarchical_priors: Sequence[HierarchicalPrior] = (),
 ) -> GridFit:
     """
     Estimate values by a likelihood over a grid of the sizes of the noise.
@@ -404,9 +411,9 @@ def noise_grid(
         the parts 'reference' and 'motion'. Its estimate would be too small by the share of the
         noise in it; it is estimated with the column smoothed by what is observed as the instrument
         (errors in variables). None where no column is noisy
-    prior_sizes : values with a prior of unknown size
-    wandering : number of the value whose variance holds what the shared noise has `unseen`; None
-        where there is none
+    hierarchical_priors : values with a prior of unknown size
+    wandering_value : number of the value whose variance holds what the shared noise has
+        `unobservable_variance`; None where there is none
 
     Raises
     ------
@@ -422,24 +429,25 @@ def noise_grid(
     precision = np.zeros(count) if prior_deviation is None else 1.0 / np.square(prior_deviation)
     together = columns if shared_columns is None else np.column_stack([columns, shared_columns])
     regression = _Regression(
-        observed - columns @ mean, together, count, precision, banded, shared, prior_sizes
+        observed - columns @ mean, together, count, precision, banded, shared, hierarchical_priors
     )
-    axes = [_axis(part.range) for part in regression.parts]
-    for remaining in reversed(range(PASSES)):
-        grid = _on_grid(regression, axes)
+    axes = [_initial_axis(part.size_range) for part in regression.parts]
+    for remaining in reversed(range(GRID_PASSES)):
+        grid = _evaluate_grid(regression, axes)
         weights = np.exp(grid.log_likelihood - grid.log_likelihood.max())
         weights /= weights.sum()
         if remaining:
             axes = [
-                _refined(axis, grid.sizes[:, place], weights, part.range)
+                _refine_axis(axis, grid.sizes[:, place], weights, part.size_range)
                 for place, (axis, part) in enumerate(zip(axes, regression.parts))
             ]
-    unseen = grid.sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
-        [part.unseen for part in shared]
+    unobservable_variance = grid.sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
+        [part.unobservable_variance for part in shared]
     )
-    if wandering is not None:
-        grid.covariance[:, wandering, wandering] += unseen
-    return _averaged(regression, grid, weights, mean, noisy_column, float(weights @ unseen))
+    if wandering_value is not None:
+        grid.covariance[:, wandering_value, wandering_value] += unobservable_variance
+    return _average_grid(regression, grid, weights, mean, noisy_column,
+                         float(weights @ unobservable_variance))
 
 
 @dataclass(frozen=True)
@@ -452,11 +460,11 @@ class _Grid:
     covariance: Array
 
 
-def _axis(limits: tuple[float, float]) -> Array:
-    return np.array(limits[:1]) if limits[0] == limits[1] else np.geomspace(*limits, POINTS)
+def _initial_axis(limits: tuple[float, float]) -> Array:
+    return np.array(limits[:1]) if limits[0] == limits[1] else np.geomspace(*limits, GRID_POINTS)
 
 
-def _refined(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:
+def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float, float]) -> Array:
     """
     Return an axis where the sizes are likely, at least to the middle between old points.
 
@@ -469,21 +477,22 @@ def _refined(axis: Array, sizes: Array, weights: Array, limits: tuple[float, flo
     logarithms, step = np.log(sizes), math.log(axis[1] / axis[0])
     middle = float(weights @ logarithms)
     spread = math.sqrt(float(weights @ (logarithms - middle) ** 2))
-    half = max(2.5 * spread, 0.6 * step)
+    half_width = max(2.5 * spread, 0.6 * step)
     low, high = (
         min(max(end, math.log(limits[0])), math.log(limits[1]))
-        for end in (middle - half, middle + half)
+        for end in (middle - half_width, middle + half_width)
     )
     return np.exp(np.linspace(low, high, len(axis)))
 
 
-def _on_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
-    banded, count = len(regression.banded), regression.values
+def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
+    banded, count = len(regression.banded), regression.value_count
     inner = np.array(list(product(*axes[banded:])))  # one empty row where nothing is shared
-    precisions = regression.precisions(inner)
+    precisions = regression.prior_precisions(inner)
     found = []
     for sizes in product(*axes[:banded]):
-        log_likelihood, values, inverse = regression.solved(regression.noise(sizes), precisions)
+        log_likelihood, values, inverse = regression.solve(regression.banded_covariance(sizes),
+                                                           precisions)
         found.append(
             (
                 np.column_stack([np.tile(sizes, (len(inner), 1)), inner]),
@@ -495,23 +504,24 @@ def _on_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
     return _Grid(*(np.concatenate(each) for each in zip(*found)))
 
 
-def _averaged(
+def _average_grid(
     regression: _Regression, grid: _Grid, weights: Array, mean: Array, noisy_column: int | None,
-    unseen: float
+    unobservable_variance: float
 ) -> GridFit:
     values = weights @ grid.values
-    apart = grid.values - values
-    covariance = np.tensordot(weights, grid.covariance, 1) + (apart * weights[:, None]).T @ apart
+    deviations = grid.values - values
+    covariance = (np.tensordot(weights, grid.covariance, 1) +
+                  (deviations * weights[:, None]).T @ deviations)
     best = int(grid.log_likelihood.argmax())
-    banded, count = len(regression.banded), regression.values
-    noise = regression.noise(grid.sizes[best, :banded])
-    precisions = regression.precisions(grid.sizes[best: best + 1, banded:])
-    _, (all_values,), (inverse,) = regression.solved(noise, precisions)
+    banded, count = len(regression.banded), regression.value_count
+    noise = regression.banded_covariance(grid.sizes[best, :banded])
+    precisions = regression.prior_precisions(grid.sizes[best: best + 1, banded:])
+    _, (all_values,), (inverse,) = regression.solve(noise, precisions)
     names = [part.name for part in regression.parts]
-    likely = dict(zip(names, grid.sizes[best].tolist()))
+    likeliest_sizes = dict(zip(names, grid.sizes[best].tolist()))
     if noisy_column is not None:
         corrected = _errors_in_variables(
-            regression, noise, precisions[0], likely, all_values, mean, noisy_column
+            regression, noise, precisions[0], likeliest_sizes, all_values, mean, noisy_column
         )
         values = values + (corrected - all_values)[:count]
         all_values = corrected
@@ -521,8 +531,8 @@ def _averaged(
     return GridFit(
         values + mean,
         covariance,
-        {name: _limits(grid.sizes[:, place], weights) for place, name in enumerate(names)},
-        likely,
+        {name: _interval_95(grid.sizes[:, place], weights) for place, name in enumerate(names)},
+        likeliest_sizes,
         float(grid.log_likelihood[best]),
         float(
             np.log(np.mean(np.exp(grid.log_likelihood - grid.log_likelihood[best])))
@@ -531,12 +541,12 @@ def _averaged(
         residual,
         all_values[count:],
         influence,
-        unseen,
+        unobservable_variance,
         noise,
     )
 
 
-def _limits(sizes: Array, weights: Array) -> tuple[float, float, float]:
+def _interval_95(sizes: Array, weights: Array) -> tuple[float, float, float]:
     """Return the mean of the logarithm as a size, and the limits that hold 95 %."""
     order = np.argsort(sizes, kind='stable')
     below = np.cumsum(weights[order]) - 0.5 * weights[order]
@@ -546,27 +556,27 @@ def _limits(sizes: Array, weights: Array) -> tuple[float, float, float]:
 
 def _errors_in_variables(
     regression: _Regression,
-    noise: Tridiagonal,
+    noise: TridiagonalMatrix,
     precision: Array,
-    likely: Mapping[str, float],
+    likeliest_sizes: Mapping[str, float],
     values: Array,
     mean: Array,
-    place: int,
+    column_index: int,
 ) -> Array:
     """Return the values with a noisy column smoothed by what is observed as the instrument."""
     parts = [
-        (likely[part.name] ** 2, part)
+        (likeliest_sizes[part.name] ** 2, part)
         for part in regression.banded
         if part.name in ('reference', 'motion')
     ]
     for _ in range(3):
-        scale = values[place] + mean[place]
+        scale = values[column_index] + mean[column_index]
         solved = noise.solve(regression.observed - regression.columns @ values)
         error = np.zeros(len(solved))
         for variance, part in parts:
-            error += variance * _times(part, solved)
+            error += variance * _multiply(part, solved)
         instrument = regression.columns.copy()
-        instrument[:, place] += error / math.copysign(max(abs(scale), 1e-3), scale)
+        instrument[:, column_index] += error / math.copysign(max(abs(scale), 1e-3), scale)
         weighted = noise.solve(instrument)
         normal = weighted.T @ regression.columns + np.diag(precision)
         sizes = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(normal)), 1e-300))
@@ -581,10 +591,10 @@ def _errors_in_variables(
     return values
 
 
-def _times(part: BandedNoise, vector: Array) -> Array:
+def _multiply(part: BandedNoise, vector: Array) -> Array:
     """Return the matrix of a part times a vector."""
     found = part.diagonal * vector
-    if part.neighbours is not None:
-        found[1:] += part.neighbours[1:] * vector[:-1]
-        found[:-1] += part.neighbours[1:] * vector[1:]
+    if part.off_diagonal is not None:
+        found[1:] += part.off_diagonal[1:] * vector[:-1]
+        found[:-1] += part.off_diagonal[1:] * vector[1:]
     return found

@@ -17,18 +17,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, take
+from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.scatter import (
-    find_scatter,
-    parts_of,
+    cross_validation_parts,
+    estimate_scatter,
+    MIN_TEMPERATURE_SPREAD,
     rms,
     Scatter,
-    SMALLEST_TEMPERATURE_SPREAD,
-    summed,
+    sum_by_part,
     Uncertainty,
     Whitener,
 )
-from gyro_calibration.calibration.tolerance import tolerance_of
+from gyro_calibration.calibration.tolerance import estimate_tolerance
 from gyro_calibration.logs.log import Array, DataRefused, Mask
 from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -36,7 +36,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 #: Beyond this condition number of the columns, each of length one, the effects are not separable.
-LARGEST_CONDITION = 1e3
+MAX_CONDITION_NUMBER = 1e3
 
 
 class EffectsUnidentifiable(DataRefused):
@@ -65,12 +65,12 @@ class Calibration:
     dwells : all of them
     scatter : of the dwells, and which were fitted
     residual : error of each dwell that the effects do not explain, rad/s, shape (n,)
-    left_out : the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at outlying
-        dwells, infinite where the other sweeps do not determine it
+    left_out_residual : the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at
+        outlying dwells, infinite where the other sweeps do not determine it
     deviation : standard deviation of each dwell, rad/s, shape (n,)
-    condition : number of the columns, each of length one
-    freedom : dwells less fitted values
-    misfit : sum of the whitened squared residuals; about `freedom` where no effect is missing
+    condition_number : number of the columns, each of length one
+    dof : dwells less fitted values
+    misfit : sum of the whitened squared residuals; about `dof` where no effect is missing
 
     """
 
@@ -78,10 +78,10 @@ class Calibration:
     dwells: Dwells
     scatter: Scatter
     residual: Array
-    left_out: Array
+    left_out_residual: Array
     deviation: Array
-    condition: float
-    freedom: int
+    condition_number: float
+    dof: int
     misfit: float
 
     @property
@@ -92,11 +92,11 @@ class Calibration:
     @cached_property
     def model(self) -> GyroModel:
         """Return effects with values, covariance and valid range; 1.96 deviations hold 95 %."""
-        used = take(self.dwells, self.scatter.kept)
-        if not self.freedom:
-            return _model(used, self.terms, None)
-        uncertainty = self._uncertainty(*_forward(used, self.terms))
-        covariance, sweeps = uncertainty.covariance(), uncertainty.sweeps.tolist()
+        used = select_dwells(self.dwells, self.scatter.inliers)
+        if not self.dof:
+            return _build_model(used, self.terms, None)
+        uncertainty = self._uncertainty(*_linearize_output(used, self.terms))
+        covariance, sweeps = uncertainty.covariance(), uncertainty.sweep_scatter.tolist()
         scatter = replace(self.scatter, sweep_bias=sweeps[0], sweep_scale=sweeps[1])
 
         def columns(rate: Array, temperature: Array) -> Array:
@@ -104,69 +104,70 @@ class Calibration:
             return np.column_stack([row for term in self.terms
                                     for row in term.sensitivity(channels)])
 
-        tolerance = tolerance_of(used, Whitener(used, scatter), uncertainty.sweeps, columns,
-                                 covariance)
-        return replace(_model(used, self.terms, covariance), tolerance=tolerance)
+        tolerance = estimate_tolerance(used, Whitener(used, scatter), uncertainty.sweep_scatter,
+                                       columns, covariance)
+        return replace(_build_model(used, self.terms, covariance), tolerance=tolerance)
 
-    def deviation_of(self, effect: Effect) -> float:
+    def effect_deviation(self, effect: Effect) -> float:
         """Return the standard deviation of the last value of an effect."""
-        owners = [term.effect for term in self.terms for _ in term.fitted]
+        owners = [term.effect for term in self.terms for _ in term.fitted_indices]
         assert self.model.covariance is not None
         place = len(owners) - 1 - owners[::-1].index(effect)
         return math.sqrt(float(self.model.covariance[place, place]))
 
-    def chance_of(self, effect: Effect) -> float:
+    def p_value(self, effect: Effect) -> float:
         """Return the two-sided p-value of an effect."""
-        used = take(self.dwells, self.scatter.kept)
+        used = select_dwells(self.dwells, self.scatter.inliers)
         term = next(each for each in self.terms if each.effect is effect)
         # The whole effect, not its derivative by a shape, which vanishes near zero for a sine.
         error = np.broadcast_to(term.error(channels_of(used)), len(used))
         others = np.column_stack([np.empty((len(used), 0)), *(
-            columns_of(used, [each]) for each in self.terms if each is not term)])
+            sensitivity_columns(used, [each]) for each in self.terms if each is not term)])
         left = error - others @ np.linalg.lstsq(others, error, rcond=None)[0]
         # a sine may have its zeros at the rates of all dwells
-        if not self.freedom or np.linalg.norm(left) <= 1e-9 * np.linalg.norm(error):
+        if not self.dof or np.linalg.norm(left) <= 1e-9 * np.linalg.norm(error):
             return 1.0
-        below = float(self._uncertainty(np.column_stack([others, error]),
-                                        self.residual[self.scatter.kept]).below(-1.0)[-1])
+        below = float(
+            self._uncertainty(np.column_stack([others, error]),
+                              self.residual[self.scatter.inliers]).probability_below(-1.0)[-1])
         return 2.0 * min(below, 1.0 - below)
 
     def _uncertainty(self, columns: Array, residual: Array) -> Uncertainty:
-        return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns,
-                              residual)
+        return Uncertainty.from_fit(select_dwells(self.dwells, self.scatter.inliers), self.scatter,
+                                    columns, residual)
 
     @property
-    def folded_beyond(self) -> float | None:
+    def min_non_monotonic_rate(self) -> float | None:
         """
         Return the slowest rate of a dwell, rad/s, at which the output no longer grows with it.
 
         None where the output always grows with the rate.
 
         """
-        steepness = GyroModel(self.terms).steepness(channels_of(self.dwells))
+        steepness = GyroModel(self.terms).output_slope(channels_of(self.dwells))
         folded = np.broadcast_to(steepness <= 0.1, len(self.dwells))
         return float(np.abs(self.dwells.rate[folded]).min()) if folded.any() else None
 
     @property
-    def before_rms(self) -> float:
+    def uncorrected_rms(self) -> float:
         """Return the root mean square of output less rate of what was fitted, rad/s."""
-        return rms((self.dwells.output - self.dwells.rate)[self.scatter.kept])
+        return rms((self.dwells.output - self.dwells.rate)[self.scatter.inliers])
 
     @property
     def residual_rms(self) -> float:
         """Return the root mean square of the residual of what was fitted, rad/s."""
-        return rms(self.residual[self.scatter.kept])
+        return rms(self.residual[self.scatter.inliers])
 
     @property
     def left_out_rms(self) -> float:
         """Return the root mean square of the errors of sweeps left out, rad/s."""
-        return rms(self.left_out[self.scatter.kept])
+        return rms(self.left_out_residual[self.scatter.inliers])
 
-    def predicted_misfit(self) -> float:
+    def cross_validation_misfit(self) -> float:
         """Return the mean over left-out sweeps of the mean squared error, in dwell variances."""
-        parts = parts_of(take(self.dwells, self.scatter.kept))
-        squares = (self.left_out / self.deviation)[self.scatter.kept] ** 2
-        return float(np.mean(summed(squares, parts) / np.bincount(parts)))
+        parts = cross_validation_parts(select_dwells(self.dwells, self.scatter.inliers))
+        squares = (self.left_out_residual / self.deviation)[self.scatter.inliers] ** 2
+        return float(np.mean(sum_by_part(squares, parts) / np.bincount(parts)))
 
 
 def channels_of(dwells: Dwells) -> Channels:
@@ -199,18 +200,21 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect],
     DataRefused : too few dwells
 
     """
-    _refuse_unseen(dwells, effects)
-    terms = tuple(Term(effect, tuple(_start(parameter, dwells) for parameter in effect.parameters))
-                  for effect in effects)
-    _refuse_few(dwells, terms)
-    scatter = scatter or find_scatter(dwells)
-    used = take(dwells, scatter.kept)
-    _refuse_few(used, terms)
+    _refuse_unobservable(dwells, effects)
+    terms = tuple(
+        Term(effect, tuple(_start_value(parameter, dwells) for parameter in effect.parameters))
+        for effect in effects)
+    _refuse_too_few_dwells(dwells, terms)
+    scatter = scatter or estimate_scatter(dwells)
+    used = select_dwells(dwells, scatter.inliers)
+    _refuse_too_few_dwells(used, terms)
     whitener = Whitener(used, scatter)
-    return _calibration(dwells, _solve(used, _search(used, terms), whitener), scatter, whitener)
+    return _assemble_calibration(
+        dwells, _iterate_gauss_newton(used, _search_shapes(used, terms), whitener), scatter,
+        whitener)
 
 
-def _start(parameter: Parameter, dwells: Dwells) -> float:
+def _start_value(parameter: Parameter, dwells: Dwells) -> float:
     """Return a start value; conventions, such as the reference temperature, are final."""
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
     conventions = {
@@ -223,19 +227,19 @@ def _start(parameter: Parameter, dwells: Dwells) -> float:
     return conventions.get(parameter.name, parameter.default or 0.0)
 
 
-def error_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
+def unexplained_error(dwells: Dwells, terms: Sequence[Term]) -> Array:
     """Return the errors of the dwells that the effects do not explain, rad/s, shape (n,)."""
     channels = channels_of(dwells)
     return dwells.output - dwells.rate - sum(term.error(channels) for term in terms)
 
 
-def columns_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
+def sensitivity_columns(dwells: Dwells, terms: Sequence[Term]) -> Array:
     """Return the derivatives of the error by each fitted value, shape (n, m)."""
     channels = channels_of(dwells)
     return np.column_stack([row for term in terms for row in term.sensitivity(channels)])
 
 
-def _forward(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
+def _linearize_output(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
     """
     Return the columns, shape (n, m), and residual of the output at the reference rate.
 
@@ -248,105 +252,109 @@ def _forward(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
 
     """
     model, channels = GyroModel(tuple(terms)), channels_of(dwells)
-    if not model.looks_at('output'):
-        return columns_of(dwells, terms), error_of(dwells, terms)
-    expected, step = model.output_in(channels), 1e-5
-    below, here, above = (channels.moving(channels.rate, expected + change)
+    if not model.uses_channel('output'):
+        return sensitivity_columns(dwells, terms), unexplained_error(dwells, terms)
+    expected, step = model.output_from_channels(channels), 1e-5
+    below, here, above = (channels.with_rate(channels.rate, expected + change)
                           for change in (-step, 0.0, step))
     slope = (model.error(above) - model.error(below)) / (2.0 * step)
     columns = np.column_stack([row for term in terms for row in term.sensitivity(here)])
     return columns / np.maximum(1.0 - slope, 0.1)[:, None], dwells.output - expected
 
 
-def _search(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
+def _search_shapes(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
     """Set each fitted shape in turn to the best of a grid over its bounds."""
     for number, term in enumerate(terms):
-        for place in term.fitted:
-            if place < len(term.effect.shapes):
-                grid = np.geomspace(*term.effect.shapes[place].bounds, 60).tolist()
-                tried = [(*terms[:number], _with(term, place, value), *terms[number + 1:])
+        for place in term.fitted_indices:
+            if place < len(term.effect.nonlinear_parameters):
+                grid = np.geomspace(*term.effect.nonlinear_parameters[place].bounds, 60).tolist()
+                tried = [(*terms[:number], _replace_value(term, place, value), *terms[number + 1:])
                          for value in grid]
                 terms = min(tried, key=lambda each: _linear_misfit(dwells, each))
     return terms
 
 
-def _with(term: Term, place: int, value: float) -> Term:
-    low, high = term.effect.parameters[place].bounds
-    return replace(term, values=(*term.values[:place], min(max(value, low), high),
-                                 *term.values[place + 1:]))
+def _replace_value(term: Term, index: int, value: float) -> Term:
+    low, high = term.effect.parameters[index].bounds
+    return replace(term, values=(*term.values[:index], min(max(value, low), high),
+                                 *term.values[index + 1:]))
 
 
 def _linear_misfit(dwells: Dwells, terms: Sequence[Term]) -> float:
     """Return the residual sum of squares with the coefficients fitted and the shapes fixed."""
     channels = channels_of(dwells)
-    columns = [term.columns(channels)[place - len(term.effect.shapes)]
-               for term in terms for place in term.fitted if place >= len(term.effect.shapes)]
-    error = error_of(dwells, terms)
+    columns = [
+        term.columns(channels)[place - len(term.effect.nonlinear_parameters)] for term in terms
+        for place in term.fitted_indices if place >= len(term.effect.nonlinear_parameters)
+    ]
+    error = unexplained_error(dwells, terms)
     matrix = np.column_stack([*columns, np.zeros(len(dwells))])
     return float(np.sum((error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0]) ** 2))
 
 
-def _solve(dwells: Dwells, terms: tuple[Term, ...], whitener: Whitener) -> tuple[Term, ...]:
+def _iterate_gauss_newton(dwells: Dwells, terms: tuple[Term, ...],
+                          whitener: Whitener) -> tuple[Term, ...]:
     """Take Gauss-Newton steps; where only coefficients are fitted the first is the solution."""
     for _ in range(20):
-        orthogonal, triangle, lengths = _factor(dwells, terms, whitener)
+        orthogonal, triangle, lengths = _factor_columns(dwells, terms, whitener)
         step = solve_triangular(
-            triangle, orthogonal.T @ whitener.whiten(error_of(dwells, terms))) / lengths
-        terms = _moved(terms, step)
+            triangle, orthogonal.T @ whitener.whiten(unexplained_error(dwells, terms))) / lengths
+        terms = _apply_step(terms, step)
         if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
             break
     return terms
 
 
-def _moved(terms: Sequence[Term], step: Array) -> tuple[Term, ...]:
-    changes, moved = iter(step.tolist()), []
+def _apply_step(terms: Sequence[Term], step: Array) -> tuple[Term, ...]:
+    changes, new_terms = iter(step.tolist()), []
     for term in terms:
-        for place in term.fitted:
-            term = _with(term, place, term.values[place] + next(changes))
-        moved.append(term)
-    return tuple(moved)
+        for place in term.fitted_indices:
+            term = _replace_value(term, place, term.values[place] + next(changes))
+        new_terms.append(term)
+    return tuple(new_terms)
 
 
-def _factor(dwells: Dwells, terms: Sequence[Term],
-            whitener: Whitener) -> tuple[Array, Array, Array]:
+def _factor_columns(dwells: Dwells, terms: Sequence[Term],
+                    whitener: Whitener) -> tuple[Array, Array, Array]:
     """Return Q and R of the whitened columns, each of length one, and their lengths before."""
-    columns = whitener.whiten(columns_of(dwells, terms))
+    columns = whitener.whiten(sensitivity_columns(dwells, terms))
     lengths = np.linalg.norm(columns, axis=0)
     orthogonal, triangle = np.linalg.qr(columns / np.where(lengths > 0.0, lengths, 1.0))
-    if not np.linalg.cond(triangle) < LARGEST_CONDITION:
-        raise _unidentifiable(terms, triangle)
+    if not np.linalg.cond(triangle) < MAX_CONDITION_NUMBER:
+        raise _unidentifiable_error(terms, triangle)
     return orthogonal, triangle, lengths
 
 
 # the result
 
-def _calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter,
-                 whitener: Whitener) -> Calibration:
-    used = take(dwells, scatter.kept)
-    orthogonal, triangle, lengths = _factor(used, terms, whitener)
-    whitened = whitener.whiten(error_of(used, terms))
+def _assemble_calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter,
+                          whitener: Whitener) -> Calibration:
+    used = select_dwells(dwells, scatter.inliers)
+    orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
+    whitened = whitener.whiten(unexplained_error(used, terms))
     left_out, deviation = np.full(len(dwells), np.nan), np.full(len(dwells), np.nan)
-    left_out[scatter.kept], deviation[scatter.kept] = (_left_out(orthogonal, whitened, whitener),
-                                                       whitener.deviation)
-    return Calibration(terms, dwells, scatter, error_of(dwells, terms), left_out, deviation,
-                       float(np.linalg.cond(triangle)), len(used) - len(lengths),
-                       float(whitened @ whitened))
+    left_out[scatter.inliers], deviation[scatter.inliers] = (_left_out_residuals(
+        orthogonal, whitened, whitener), whitener.deviation)
+    return Calibration(terms, dwells, scatter, unexplained_error(dwells, terms), left_out,
+                       deviation, float(np.linalg.cond(triangle)),
+                       len(used) - len(lengths), float(whitened @ whitened))
 
 
-def _left_out(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
+def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
     """Return each dwell's residual of a fit without its sweep: the deleted residuals."""
     parts = whitener.parts
-    rest = np.eye(orthogonal.shape[1]) - summed(orthogonal[:, :, None] * orthogonal[:, None, :],
-                                                parts)
-    alone = np.linalg.eigvalsh(rest)[:, 0] < 1e-9  # only this sweep shows some value
-    rest[alone] = np.eye(len(rest[0]))
+    remaining_gram = np.eye(orthogonal.shape[1]) - sum_by_part(
+        orthogonal[:, :, None] * orthogonal[:, None, :], parts)
+    # only this sweep shows some value
+    is_sole_source = np.linalg.eigvalsh(remaining_gram)[:, 0] < 1e-9
+    remaining_gram[is_sole_source] = np.eye(len(remaining_gram[0]))
     changes = np.linalg.solve(
-        rest, summed(orthogonal * whitened[:, None], parts)[:, :, None])[:, :, 0]
+        remaining_gram, sum_by_part(orthogonal * whitened[:, None], parts)[:, :, None])[:, :, 0]
     left_out = whitened + np.einsum('nm,nm->n', orthogonal, changes[parts])
-    return np.where(alone[parts], math.inf, whitener.restore(left_out))
+    return np.where(is_sole_source[parts], math.inf, whitener.restore(left_out))
 
 
-def _model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) -> GyroModel:
+def _build_model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) -> GyroModel:
     outputs, temperatures = dwells.output, dwells.temperature
     middle = 25.0 if temperatures is None else round(float(temperatures.mean()), 1)
     temperature_range = ((-math.inf, math.inf) if temperatures is None
@@ -357,15 +365,15 @@ def _model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) ->
 
 # refusals
 
-def _refuse_few(dwells: Dwells, terms: Sequence[Term]) -> None:
-    values = sum(len(term.fitted) for term in terms)
+def _refuse_too_few_dwells(dwells: Dwells, terms: Sequence[Term]) -> None:
+    values = sum(len(term.fitted_indices) for term in terms)
     if len(dwells) < values:
         raise DataRefused(f'{len(dwells)} dwells do not determine {values} values; '
                           'add dwells, or fit fewer effects')
 
 
-def _refuse_unseen(dwells: Dwells, effects: Sequence[Effect]) -> None:
-    thermal = [effect.name for effect in effects if 'temperature' in effect.looks_at]
+def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
+    thermal = [effect.name for effect in effects if 'temperature' in effect.inputs]
     if not thermal:
         return
     unseen = f'{", ".join(thermal)} cannot be seen'
@@ -373,25 +381,25 @@ def _refuse_unseen(dwells: Dwells, effects: Sequence[Effect]) -> None:
         raise EffectsUnidentifiable(
             f'{unseen}: the log holds no temperature; record temperature_degc too', thermal)
     spread = float(np.ptp(dwells.temperature))
-    if spread < SMALLEST_TEMPERATURE_SPREAD:
+    if spread < MIN_TEMPERATURE_SPREAD:
         raise EffectsUnidentifiable(
             f'{unseen}: the temperature varies by {spread:.2g} K, wanted at least '
-            f'{SMALLEST_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature', thermal)
+            f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature', thermal)
 
 
-def _unidentifiable(terms: Sequence[Term], triangle: Array) -> EffectsUnidentifiable:
+def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> EffectsUnidentifiable:
     """Return the refusal with the effects whose columns nearly cancel, and their remedies."""
     direction = np.abs(np.linalg.svd(triangle)[2][-1])
-    owners = [term.effect for term in terms for _ in term.fitted]
+    owners = [term.effect for term in terms for _ in term.fitted_indices]
     alike = [effect for effect in dict.fromkeys(owners)
              if max(size for size, owner in zip(direction, owners) if owner is effect)
              > 0.1 * direction.max()]
     names = [effect.name for effect in alike]
     if len(names) == 1:
         return EffectsUnidentifiable(
-            f'{names[0]} cannot be determined from these dwells; {alike[0].shown_by}', names)
-    advice = '; '.join(dict.fromkeys(effect.shown_by for effect in alike[::-1]
-                                     if effect.shown_by))
+            f'{names[0]} cannot be determined from these dwells; {alike[0].experiment}', names)
+    advice = '; '.join(dict.fromkeys(effect.experiment for effect in alike[::-1]
+                                     if effect.experiment))
     return EffectsUnidentifiable(
         f'{", ".join(names)} look alike in these dwells and cannot be distinguished; {advice}, or '
         'leave one out', names)
@@ -408,7 +416,7 @@ class Bin:
     ----------
     low, high : ends of the bin, in the unit of what was binned
     count : of dwells
-    before, residual : mean error without the model and with it, rad/s
+    uncorrected, residual : mean error without the model and with it, rad/s
     deviation : standard deviation of the mean residual, rad/s
     rms : of the residual, rad/s
 
@@ -417,27 +425,27 @@ class Bin:
     low: float
     high: float
     count: int
-    before: float
+    uncorrected: float
     residual: float
     deviation: float
     rms: float
 
 
-def binned(fit: Calibration, values: Array, most: int = 8) -> list[Bin]:
+def bin_errors(fit: Calibration, values: Array, max_bins: int = 8) -> list[Bin]:
     """Return the errors over one quantity, shape (n,), in non-empty bins of equal width."""
-    edges = np.linspace(values.min(), values.max(), min(most, len(np.unique(values))) + 1)
+    edges = np.linspace(values.min(), values.max(), min(max_bins, len(np.unique(values))) + 1)
     place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
-    chosen = [(place == number) & fit.scatter.kept for number in range(len(edges) - 1)]
-    return [_bin(fit, float(low), float(high), part)
+    chosen = [(place == number) & fit.scatter.inliers for number in range(len(edges) - 1)]
+    return [_summarize_bin(fit, float(low), float(high), part)
             for low, high, part in zip(edges, edges[1:], chosen) if part.any()]
 
 
-def _bin(fit: Calibration, low: float, high: float, chosen: Mask) -> Bin:
-    part, residual = take(fit.dwells, chosen), fit.residual[chosen]
+def _summarize_bin(fit: Calibration, low: float, high: float, chosen: Mask) -> Bin:
+    part, residual = select_dwells(fit.dwells, chosen), fit.residual[chosen]
     # Errors common to a sweep do not average out within it.
     sweeps = np.unique(part.sweep, return_inverse=True)[1]
     variance = (np.sum(fit.deviation[chosen] ** 2)
-                + np.sum(summed(fit.scatter.shared(part), sweeps) ** 2))
+                + np.sum(sum_by_part(fit.scatter.sweep_columns(part), sweeps) ** 2))
     before = float((part.output - part.rate).mean())
     return Bin(low, high, len(part), before, float(residual.mean()),
                math.sqrt(float(variance)) / len(part), rms(residual))

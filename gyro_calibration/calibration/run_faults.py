@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.calibration.likelihood import unlikeliest
+from gyro_calibration.calibration.likelihood import find_deviating_stretch
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
@@ -30,16 +30,16 @@ import numpy as np
 
 #: Minimum length of the pieces in which motions are compared, and step of the tried starts, ends
 #: and offsets, s; largest number of pieces: the time of the search is proportional to its cube.
-_PIECE, _STEP, _MOST_PIECES = 0.1, 0.1, 650
+_MIN_PIECE_DURATION, _TRIAL_STEP, _MAX_PIECES = 0.1, 0.1, 650
 #: Speeds that are tried, as parts of the profile's.
-_SPEEDS = 2.0 ** (np.arange(-32, 33) / 16.0)
+_TRIAL_SPEEDS = 2.0 ** (np.arange(-32, 33) / 16.0)
 #: A motion explains a run if it leaves at most this fraction of its sum of squares.
-EXPLAINED = 0.1
+MAX_UNEXPLAINED_SHARE = 0.1
 #: Factor by which a motion with a deviating stretch must leave less than one without.
-_SIMPLER = 1.5
+_SLIP_PENALTY = 1.5
 
 #: Reported over true rate -> the confused unit of the gyro, or of the profile, that causes it.
-_UNITS = {
+_UNIT_CONFUSIONS = {
     180.0 / math.pi: ('the gyro is in deg/s and read as rad/s',
                       'the profile in rad and read as deg'),
     math.pi / 180.0: ('the gyro is in rad/s and read as deg/s',
@@ -79,61 +79,64 @@ _UNITS = {
        for factor in (4.0, 8.0, 10.0, 100.0, 0.25, 0.125, 0.1, 0.01)},
 }
 #: Largest scale factor error in addition to a confused unit, as a logarithm.
-_NEAR = math.log(1.1)
+_UNIT_LOG_TOLERANCE = math.log(1.1)
 
 
-def unit_error(scale: float, by_profile: bool = True) -> str:
+def describe_unit_error(scale: float, profile_suspect: bool = True) -> str:
     """
     Return the error of units, of gyro or profile, that explains a scale; '' where there is none.
 
     Parameters
     ----------
     scale : reported over true rate
-    by_profile : the unit of the profile may be wrong too
+    profile_suspect : the unit of the profile may be wrong too
 
     """
     size = abs(math.log(max(abs(scale), 1e-300)))
-    nearest = min(_UNITS, key=lambda factor: abs(math.log(max(abs(scale), 1e-300) / factor)))
-    if size < _NEAR or abs(math.log(max(abs(scale), 1e-300) / nearest)) > _NEAR:
+    nearest = min(_UNIT_CONFUSIONS,
+                  key=lambda factor: abs(math.log(max(abs(scale), 1e-300) / factor)))
+    if (size < _UNIT_LOG_TOLERANCE
+            or abs(math.log(max(abs(scale), 1e-300) / nearest)) > _UNIT_LOG_TOLERANCE):
         return ''
-    turned = ', and turns the other way' if scale < 0.0 else ''
-    gyro, profile = _UNITS[nearest]
-    cause = f'either {gyro}, or {profile}' if by_profile else gyro
-    return (f'the gyro reports {abs(scale):.4g} times what was turned{turned}: '
+    sign_note = ', and turns the other way' if scale < 0.0 else ''
+    gyro, profile = _UNIT_CONFUSIONS[nearest]
+    cause = f'either {gyro}, or {profile}' if profile_suspect else gyro
+    return (f'the gyro reports {abs(scale):.4g} times what was turned{sign_note}: '
             f'{cause}; correct the unit')
 
 
 @dataclass(frozen=True)
-class Pieces:
+class RunPieces:
     """A run in short pieces: their edges, s, and how far the gyro turned in each, rad."""
 
     edges: Array
-    turned: Array
+    gyro_angle: Array
 
-    def headings(self, motion: Motion, offset: float = 0.0, speed: float = 1.0,
-                 end: float = math.inf) -> Array:
+    def reference_angle(self, motion: Motion, offset: float = 0.0, speed: float = 1.0,
+                        end: float = math.inf) -> Array:
         """Return the turn in each piece, rad, by a motion late by `offset` and cut at `end`, s."""
         return np.diff(motion.heading_at(np.minimum(speed * (self.edges - offset), end)))
 
-    def left(self, reference: Array) -> tuple[float, float]:
+    def fit_scale(self, reference: Array) -> tuple[float, float]:
         """Return the unexplained part of the squares, and the scale; 1 and 0 without pieces."""
-        if not len(self.turned):
+        if not len(self.gyro_angle):
             return 1.0, 0.0
-        known, turned = reference - reference.mean(), self.turned - self.turned.mean()
+        known, turned = reference - reference.mean(), self.gyro_angle - self.gyro_angle.mean()
         power = float(known @ known)
         scale = float(known @ turned) / power if power > 0.0 else 0.0
         return 1.0 - scale * float(known @ turned) / max(float(turned @ turned), 1e-300), scale
 
 
-def pieces(time: Array, rate: Array) -> Pieces:
+def split_run(time: Array, rate: Array) -> RunPieces:
     """Return a run in pieces."""
-    length = max(_PIECE, 2.0 * float(np.median(np.diff(time))),
-                 float(time[-1] - time[0]) / _MOST_PIECES)
+    length = max(_MIN_PIECE_DURATION, 2.0 * float(np.median(np.diff(time))),
+                 float(time[-1] - time[0]) / _MAX_PIECES)
     edges = np.arange(time[0], time[-1], length)
-    return Pieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
+    return RunPieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
 
 
-def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str = '') -> None:
+def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
+                        slip: str = '') -> None:
     """
     Refuse a run that another motion explains far better than the profile, with the cause.
 
@@ -146,74 +149,84 @@ def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str =
     DataRefused : with the cause that explains it best
 
     """
-    ways = {name: _best(way(run, motion, largest_offset)) for name, way in _WAYS.items()}
-    name = min(ways, key=lambda each: ways[each][0] * (_SIMPLER if each == 'slip' else 1.0))
-    left, value = ways[name]
-    if _SIMPLER * left > followed(run, motion, largest_offset)[0] <= EXPLAINED:
+    trials = ({
+        name: _best_trial(make_trials(run, motion, largest_offset))
+        for name, make_trials in _FAULT_TRIALS.items()
+    })
+    name = min(trials, key=lambda each: trials[each][0] * (_SLIP_PENALTY
+                                                           if each == 'slip' else 1.0))
+    unexplained, value = trials[name]
+    if _SLIP_PENALTY * unexplained > fit_profile(run, motion,
+                                                 largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
         return
-    if left > EXPLAINED:
+    if unexplained > MAX_UNEXPLAINED_SHARE:
         raise DataRefused('the robot turned otherwise than the profile (the best that can be made '
-                          f'of it explains {100 * max(1 - left, 0.0):.0f} % of the run): '
+                          f'of it explains {100 * max(1 - unexplained, 0.0):.0f} % of the run): '
                           'was another profile driven?')
-    raise DataRefused(slip if slip and name == 'slip' else _SENTENCES[name](value, motion))
+    raise DataRefused(slip if slip and name == 'slip' else _FAULT_MESSAGES[name](value, motion))
 
 
-def followed(run: Pieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
+def fit_profile(run: RunPieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
     """Return the unexplained fraction of the squares at the best delay, and the scale there."""
-    return min(run.left(run.headings(motion, offset)) for offset in _offsets(largest_offset))
+    return min(
+        run.fit_scale(run.reference_angle(motion, offset))
+        for offset in _trial_offsets(largest_offset))
 
 
 #: Unexplained part of a run, and the value of what was tried: a speed, s, or a turn in rad with
 #: its time, s.
-Tried = Iterable[tuple[float, tuple[float, ...]]]
+Trials = Iterable[tuple[float, tuple[float, ...]]]
 
 
-def _best(tried: Tried) -> tuple[float, tuple[float, ...]]:
+def _best_trial(trials: Trials) -> tuple[float, tuple[float, ...]]:
     """Return the trial with the least unexplained fraction; infinity without trials."""
-    return min(tried, key=lambda each: each[0], default=(math.inf, ()))
+    return min(trials, key=lambda each: each[0], default=(math.inf, ()))
 
 
-def _offsets(largest: float) -> Array:
-    return np.arange(-round(largest / _STEP), round(largest / _STEP) + 1) * _STEP
+def _trial_offsets(largest_offset: float) -> Array:
+    return (np.arange(-round(largest_offset / _TRIAL_STEP),
+                      round(largest_offset / _TRIAL_STEP) + 1) * _TRIAL_STEP)
 
 
-def _early(run: Pieces, motion: Motion, largest: float) -> Tried:
+def _try_early_ends(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
     """Try ends of the motion, each at the delay that fits the part before it best."""
     for end in np.arange(0.05, 0.97, 0.0125) * motion.duration:
-        yield _best((run.left(run.headings(motion, offset, end=end))[0], (float(end),))
-                    for offset in _offsets(largest)[::2])
+        yield _best_trial(
+            (run.fit_scale(run.reference_angle(motion, offset, end=end))[0], (float(end), ))
+            for offset in _trial_offsets(largest_offset)[::2])
 
 
-def _speed(run: Pieces, motion: Motion, largest: float) -> Tried:
-    for speed in _SPEEDS[np.abs(np.log(_SPEEDS)) > _NEAR]:
-        for offset in _offsets(largest)[::2]:
-            yield run.left(run.headings(motion, offset, float(speed)))[0], (float(speed),)
+def _try_speeds(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
+    for speed in _TRIAL_SPEEDS[np.abs(np.log(_TRIAL_SPEEDS)) > _UNIT_LOG_TOLERANCE]:
+        for offset in _trial_offsets(largest_offset)[::2]:
+            yield run.fit_scale(run.reference_angle(motion, offset,
+                                                    float(speed)))[0], (float(speed), )
 
 
-def _late(run: Pieces, motion: Motion, largest: float) -> Tried:
-    for offset in _offsets(0.6 * motion.duration):
-        if abs(offset) > largest:
-            yield run.left(run.headings(motion, offset))[0], (float(offset),)
+def _try_late_starts(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
+    for offset in _trial_offsets(0.6 * motion.duration):
+        if abs(offset) > largest_offset:
+            yield run.fit_scale(run.reference_angle(motion, offset))[0], (float(offset),)
 
 
-def _slip(run: Pieces, motion: Motion, largest: float) -> Tried:
+def _try_slips(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
     """Try a stretch with a different turn, at the delay that fits best with it."""
-    edges = np.arange(0, len(run.turned) + 1, 5)
+    edges = np.arange(0, len(run.gyro_angle) + 1, 5)
     interval = float(np.median(np.diff(run.edges)))
-    steps = np.where(np.arange(len(run.turned))[:, None] >= edges, interval, 0.0)
-    whole = np.sum((run.turned - run.turned.mean()) ** 2)
-    for offset in _offsets(largest):
-        reference = run.headings(motion, offset)
-        found = unlikeliest(
-            np.column_stack([reference, np.full(len(reference), interval)]), steps, run.turned)
-        left = run.left(reference)[0] - found.gain / max(float(whole), 1e-300)
-        yield left, (found.rate * float(edges[found.last] - edges[found.first]) * interval,
+    steps = np.where(np.arange(len(run.gyro_angle))[:, None] >= edges, interval, 0.0)
+    whole = np.sum((run.gyro_angle - run.gyro_angle.mean()) ** 2)
+    for offset in _trial_offsets(largest_offset):
+        reference = run.reference_angle(motion, offset)
+        found = find_deviating_stretch(
+            np.column_stack([reference, np.full(len(reference), interval)]), steps, run.gyro_angle)
+        left = run.fit_scale(reference)[0] - found.explained_squares / max(float(whole), 1e-300)
+        yield left, (found.excess_rate * float(edges[found.last] - edges[found.first]) * interval,
                      float(run.edges[edges[found.first]]))
 
 
-_WAYS: dict[str, Callable[[Pieces, Motion, float], Tried]] = {
-    'early': _early, 'speed': _speed, 'late': _late, 'slip': _slip}
-_SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
+_FAULT_TRIALS: dict[str, Callable[[RunPieces, Motion, float], Trials]] = {
+    'early': _try_early_ends, 'speed': _try_speeds, 'late': _try_late_starts, 'slip': _try_slips}
+_FAULT_MESSAGES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
     'early': lambda value, motion: (
         f"the robot stopped at about {value[0]:.1f} s of the profile's {motion.duration:.1f} s: "
         'drive the whole profile'),
@@ -224,12 +237,13 @@ _SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
     'late': lambda value, _: (
         f'the robot began {abs(value[0]):.1f} s {"after" if value[0] > 0 else "before"} '
         'the profile: begin with it, or allow a larger time offset'),
-    'slip': lambda value, _: slip_sentence(abs(value[0]), value[1]),
+    'slip': lambda value, _: format_slip(abs(value[0]), value[1]),
 }
 
 
-def slip_sentence(turned: float, time: float, size: float = math.nan) -> str:
+def format_slip(angle: float, time: float, sigmas: float = math.nan) -> str:
     """Say that the robot slipped or was bumped."""
-    sure = '' if math.isnan(size) else f' ({size:.0f} standard deviations)'
-    return (f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the '
-            f'profile{sure}, at about {time:.1f} s: a slip or a bump; run again on free ground')
+    significance = '' if math.isnan(sigmas) else f' ({sigmas:.0f} standard deviations)'
+    return (f'a stretch of the run turned {angle / DEGREE:.1f} deg otherwise than the '
+            f'profile{significance}, at about {time:.1f} s: a slip or a bump; run again on free '
+            'ground')

@@ -26,7 +26,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, Numbers, take
+from gyro_calibration.calibration.dwells import Dwells, Numbers, select_dwells
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.logs.log import Array, DataRefused, Mask
 import numpy as np
@@ -35,15 +35,15 @@ from scipy.optimize import minimize
 from scipy.stats import t as student
 
 #: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
-OUTLYING = 6.0
+OUTLIER_THRESHOLD = 6.0
 #: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
-SMALLEST_TEMPERATURE_SPREAD = 1.0
+MIN_TEMPERATURE_SPREAD = 1.0
 #: With fewer, errors common to the dwells of a sweep are not distinguishable from random errors.
-FEWEST_SWEEPS = 4
+MIN_SWEEPS = 4
 #: Largest number of blocks of dwells that replace sweeps where there are fewer sweeps.
-_MOST_BLOCKS = 60
+_MAX_BLOCKS = 60
 #: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
-_FEWEST_DWELLS = 12
+_MIN_DWELLS = 12
 
 
 @dataclass(frozen=True)
@@ -56,26 +56,26 @@ class Scatter:
 
     Attributes
     ----------
-    dwell : of a dwell, beyond its own deviation, rad/s
+    dwell_bias : of a dwell, beyond its own deviation, rad/s
     dwell_scale : of the scale factor from dwell to dwell, 1, such as that of a table's speed
     sweep_bias : of the bias from sweep to sweep, rad/s
     sweep_scale : of the scale factor from sweep to sweep, 1
-    kept : which dwells are not outlying, shape (n,)
+    inliers : which dwells are not outlying, shape (n,)
 
     """
 
-    dwell: float
+    dwell_bias: float
     dwell_scale: float
     sweep_bias: float
     sweep_scale: float
-    kept: Mask
+    inliers: Mask
 
     def deviation(self, dwells: Dwells) -> Array:
         """Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,)."""
-        return np.sqrt(_own_deviation(dwells) ** 2 + self.dwell ** 2
+        return np.sqrt(_own_deviation(dwells) ** 2 + self.dwell_bias ** 2
                        + (self.dwell_scale * dwells.rate) ** 2)
 
-    def shared(self, dwells: Dwells) -> Array:
+    def sweep_columns(self, dwells: Dwells) -> Array:
         """Return the effect of one deviation of sweep bias and scale, rad/s, shape (n, 2)."""
         return np.column_stack([np.full(len(dwells), self.sweep_bias),
                                 self.sweep_scale * dwells.rate])
@@ -93,7 +93,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
 
 
-def parts_of(dwells: Dwells) -> Numbers:
+def cross_validation_parts(dwells: Dwells) -> Numbers:
     """
     Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
 
@@ -103,11 +103,11 @@ def parts_of(dwells: Dwells) -> Numbers:
 
     """
     parts = np.unique(dwells.sweep, return_inverse=True)[1]
-    return (parts if parts.max() + 1 >= FEWEST_SWEEPS
-            else np.arange(len(dwells)) * min(len(dwells), _MOST_BLOCKS) // len(dwells))
+    return (parts if parts.max() + 1 >= MIN_SWEEPS
+            else np.arange(len(dwells)) * min(len(dwells), _MAX_BLOCKS) // len(dwells))
 
 
-def summed(values: Array, parts: Numbers) -> Array:
+def sum_by_part(values: Array, parts: Numbers) -> Array:
     """Return the sums of values of shape (n, ...) over each part, shape (parts, ...)."""
     order = np.argsort(parts, kind='stable')
     return np.add.reduceat(values[order], np.flatnonzero(np.diff(parts[order], prepend=-1)))
@@ -118,75 +118,76 @@ class Whitener:
 
     def __init__(self, dwells: Dwells, scatter: Scatter):
         """Find the directions of each sweep, and the scatter of its dwells along them."""
-        self.parts = parts_of(dwells)
+        self.parts = cross_validation_parts(dwells)
         self.deviation = scatter.deviation(dwells)
-        self._shared = scatter.shared(dwells) / self.deviation[:, None]
-        self._sizes, self._directions = np.linalg.eigh(
-            summed(self._shared[:, :, None] * self._shared[:, None, :], self.parts))
+        self._shared = scatter.sweep_columns(dwells) / self.deviation[:, None]
+        self._eigenvalues, self._eigenvectors = np.linalg.eigh(
+            sum_by_part(self._shared[:, :, None] * self._shared[:, None, :], self.parts))
 
     def whiten(self, values: Array) -> Array:
         """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
-        return self._stretched((values.T / self.deviation).T, -0.5)
+        return self._multiply_power((values.T / self.deviation).T, -0.5)
 
     def restore(self, whitened: Array) -> Array:
         """Return what `whiten` was given, shape (n,)."""
-        return self._stretched(whitened, 0.5) * self.deviation
+        return self._multiply_power(whitened, 0.5) * self.deviation
 
-    def _stretched(self, values: Array, power: float) -> Array:
+    def _multiply_power(self, values: Array, power: float) -> Array:
         """Multiply by a power of the covariance in units of the dwells' own."""
-        sizes = np.maximum(self._sizes, 1e-12)
+        sizes = np.maximum(self._eigenvalues, 1e-12)
         # the covariance is the identity plus the products of two columns for each sweep
-        inner = (self._directions * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :]
-                 @ self._directions.swapaxes(1, 2))
+        inner = (self._eigenvectors * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :]
+                 @ self._eigenvectors.swapaxes(1, 2))
         columns = values.reshape(len(values), -1)
-        along = inner @ summed(self._shared[:, :, None] * columns[:, None, :], self.parts)
+        along = inner @ sum_by_part(self._shared[:, :, None] * columns[:, None, :], self.parts)
         return values + np.einsum('ni,nim->nm', self._shared,
                                   along[self.parts]).reshape(values.shape)
 
 
 # its size
 
-def find_scatter(dwells: Dwells) -> Scatter:
+def estimate_scatter(dwells: Dwells) -> Scatter:
     """Return how dwells scatter, by restricted likelihood, and which of them are outlying."""
-    kept = not_outlying(dwells)
-    used = take(dwells, kept)
-    error, surface = used.output - used.rate, _surface(used)
+    kept = find_inliers(dwells)
+    used = select_dwells(dwells, kept)
+    error, surface = used.output - used.rate, _smooth_surface(used)
     # The likelihood does not depend on the part that the surface explains; without its removal,
     # small errors would be lost in rounding.
     error = error - surface @ (surface.T @ error)
     size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
     relative = size / max(float(np.abs(used.rate).max()), 1e-9)
-    units = np.array([size, relative, size, relative])[:_sought(used)]
+    units = np.array([size, relative, size, relative])[:_count_scatter_terms(used)]
 
     def scatter(logarithms: Array) -> Scatter:
         return Scatter(  # type: ignore[misc]
-            *np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)
+            *np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(),
+            inliers=kept)
 
     # a simplex would collapse onto a bound
     best = minimize(
-        lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
+        lambda logarithms: -_restricted_log_likelihood(used, scatter(logarithms), error, surface),
         np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B',
         bounds=[(-7.0, 2.0)] * len(units), options={'eps': 1e-4, 'ftol': 1e-7})
     return scatter(best.x)
 
 
-def _sought(dwells: Dwells) -> int:
+def _count_scatter_terms(dwells: Dwells) -> int:
     """Return how many of the four scatters the dwells and sweeps determine."""
-    if len(dwells) < _FEWEST_DWELLS:
+    if len(dwells) < _MIN_DWELLS:
         return 1
-    return 4 if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 2
+    return 4 if len(np.unique(dwells.sweep)) >= MIN_SWEEPS else 2
 
 
-def not_outlying(dwells: Dwells) -> Mask:
+def find_inliers(dwells: Dwells) -> Mask:
     """Return which dwells are not outlying, by a robust fit of the surface."""
-    surface = _surface(dwells)
+    surface = _smooth_surface(dwells)
     residual = np.abs(robust_residual(surface, dwells.output - dwells.rate, 20))
     # Such a fit passes through as many dwells as it has columns; these are left out of the median.
     spread = 1.4826 * float(np.median(np.sort(residual)[surface.shape[1]:]))
-    return (residual <= OUTLYING * spread + 1e-12) | (len(dwells) < _FEWEST_DWELLS)
+    return (residual <= OUTLIER_THRESHOLD * spread + 1e-12) | (len(dwells) < _MIN_DWELLS)
 
 
-def _surface(dwells: Dwells) -> Array:
+def _smooth_surface(dwells: Dwells) -> Array:
     """
     Return orthonormal columns of a smooth surface over rate and temperature, shape (n, m).
 
@@ -200,7 +201,7 @@ def _surface(dwells: Dwells) -> Array:
     temperature = (np.zeros(len(rate)) if dwells.temperature is None
                    else dwells.temperature - dwells.temperature.mean())
     temperature = temperature / max(float(np.abs(temperature).max()),
-                                    0.5 * SMALLEST_TEMPERATURE_SPREAD)
+                                    0.5 * MIN_TEMPERATURE_SPREAD)
     powers = sorted(((i, j) for i in range(6) for j in range(3)),
                     key=lambda power: (power[0] + 2 * power[1], power[1]))
     products = [rate ** i * temperature ** j for i, j in powers]
@@ -210,17 +211,18 @@ def _surface(dwells: Dwells) -> Array:
     return left[:, sizes > 1e-4 * sizes[0]]
 
 
-def freedom_beside_surface(dwells: Dwells) -> int:
+def surface_dof(dwells: Dwells) -> int:
     """Return the number of dwells less that of the columns of the surface of their scatter."""
-    return len(dwells) - _surface(dwells).shape[1]
+    return len(dwells) - _smooth_surface(dwells).shape[1]
 
 
-def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
-                           columns: Array) -> float:
+def _restricted_log_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
+                               columns: Array) -> float:
     """Return the restricted log-likelihood of the scatter, up to a constant."""
     deviation = scatter.deviation(dwells)
-    sums = _Sums.of(dwells, deviation, np.column_stack([columns, error]))
-    (gram,), (of_sweeps,) = sums.reduced(np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
+    sums = _SweepProducts.from_dwells(dwells, deviation, np.column_stack([columns, error]))
+    (gram, ), (of_sweeps, ) = sums.marginalized(
+        np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
     factor = np.linalg.cholesky(gram[:-1, :-1])
     explained = solve_triangular(factor, gram[:-1, -1], lower=True)
     log_determinant = (float(of_sweeps) + 2.0 * float(np.log(deviation).sum())
@@ -229,7 +231,7 @@ def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
 
 
 @dataclass(frozen=True)
-class _Sums:
+class _SweepProducts:
     """
     The sums of products of columns in the likelihood, for any scatter of sweeps.
 
@@ -246,15 +248,15 @@ class _Sums:
     outer: Array
 
     @classmethod
-    def of(cls, dwells: Dwells, deviation: Array, columns: Array) -> _Sums:
+    def from_dwells(cls, dwells: Dwells, deviation: Array, columns: Array) -> _SweepProducts:
         """Sum over each sweep."""
         columns = columns / deviation[:, None]
         shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
-        inner, outer = (summed(shared[:, :, None] * each[:, None, :], parts_of(dwells))
-                        for each in (shared, columns))
+        inner, outer = (sum_by_part(shared[:, :, None] * each[:, None, :],
+                                    cross_validation_parts(dwells)) for each in (shared, columns))
         return cls(columns.T @ columns, inner, outer)
 
-    def reduced(self, sizes: Array) -> tuple[Array, Array]:
+    def marginalized(self, sizes: Array) -> tuple[Array, Array]:
         """
         Return products of the whitened columns, and log-determinant of the sweeps (Woodbury).
 
@@ -292,20 +294,21 @@ class Uncertainty:
     weights : of possible scatters, shape (k,)
     offsets : from the values that were fitted to the middle of their distribution, shape (k, m)
     covariances : scale matrices of the distribution, shape (k, m, m)
-    freedom : of Student's distribution
-    sweeps : root mean square over all possible scatters of the bias of a sweep, rad/s, and of its
-        scale factor, 1, shape (2,)
+    dof : of Student's distribution
+    sweep_scatter : root mean square over all possible scatters of the bias of a sweep, rad/s, and
+        of its scale factor, 1, shape (2,)
 
     """
 
     weights: Array
     offsets: Array
     covariances: Array
-    freedom: int
-    sweeps: Array
+    dof: int
+    sweep_scatter: Array
 
     @classmethod
-    def of(cls, dwells: Dwells, scatter: Scatter, columns: Array, error: Array) -> Uncertainty:
+    def from_fit(cls, dwells: Dwells, scatter: Scatter, columns: Array,
+                 error: Array) -> Uncertainty:
         """
         Average over the possible scatters.
 
@@ -319,44 +322,46 @@ class Uncertainty:
         """
         lengths = np.linalg.norm(columns, axis=0)
         deviation = scatter.deviation(dwells)
-        sums = _Sums.of(dwells, deviation, np.column_stack([columns / lengths, error]))
-        freedom = len(dwells) - len(lengths)
-        weights, offsets, covariances, sweeps = _averaged(sums, freedom,
-                                                          _units(dwells, deviation))
-        return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), freedom,
-                   sweeps)
+        sums = _SweepProducts.from_dwells(dwells, deviation,
+                                          np.column_stack([columns / lengths, error]))
+        dof = len(dwells) - len(lengths)
+        weights, offsets, covariances, sweep_scatter = _average_over_scatter(
+            sums, dof, _scatter_units(dwells, deviation))
+        return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), dof,
+                   sweep_scatter)
 
     @property
     def deviations(self) -> Array:
         """Return the scales of the distributions of each value, shape (k, m)."""
         return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
 
-    def below(self, change: Array | float) -> Array:
+    def probability_below(self, change: Array | float) -> Array:
         """Return the probability that each value is below the fitted plus a change, shape (m,)."""
         return np.asarray(self.weights @ student.cdf((change - self.offsets) / self.deviations,
-                                                     self.freedom))
+                                                     self.dof))
 
     def covariance(self) -> Array:
         """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""
         low = np.zeros(self.offsets.shape[1])
-        high = (2.0 * student.ppf(0.975, self.freedom)
+        high = (2.0 * student.ppf(0.975, self.dof)
                 * (self.deviations + np.abs(self.offsets)).max(axis=0))
         for _ in range(25):
             half = 0.5 * (low + high)
-            narrow = self.below(half) - self.below(-half) < 0.95
+            narrow = self.probability_below(half) - self.probability_below(-half) < 0.95
             low, high = np.where(narrow, half, low), np.where(narrow, high, half)
         covariance = np.tensordot(self.weights, self.covariances, axes=1)
-        widened = high / 1.959964 / np.sqrt(np.diag(covariance))
-        return covariance * np.outer(widened, widened)
+        widening = high / 1.959964 / np.sqrt(np.diag(covariance))
+        return covariance * np.outer(widening, widening)
 
 
-def _units(dwells: Dwells, deviation: Array) -> Array:
+def _scatter_units(dwells: Dwells, deviation: Array) -> Array:
     """Return scatters of sweep bias and scale as large as a dwell's; zeros for few sweeps."""
     return (np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
-            * (_sought(dwells) == 4))
+            * (_count_scatter_terms(dwells) == 4))
 
 
-def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Array, Array]:
+def _average_over_scatter(sums: _SweepProducts, dof: int,
+                          units: Array) -> tuple[Array, Array, Array, Array]:
     """
     Return weights of possible scatters of sweeps, offsets of the values and their covariances.
 
@@ -364,42 +369,46 @@ def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Ar
     of the scatters.
 
     """
-    shown = bool(units.any())
-    axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)]) if shown else np.zeros(1)] * 2
-    for _ in range(2 if shown else 1):
-        found = [_given(sums, freedom,
-                        units * np.column_stack([np.full(len(axes[1]), bias), axes[1]]))
+    has_sweep_scatter = bool(units.any())
+    axes = ([
+        np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)])
+        if has_sweep_scatter else np.zeros(1)
+    ] * 2)
+    for _ in range(2 if has_sweep_scatter else 1):
+        found = [_evaluate_scatter(sums, dof,
+                                   units * np.column_stack([np.full(len(axes[1]), bias), axes[1]]))
                  for bias in axes[0]]
         logarithm = np.array([each[0] for each in found])
         weights = (np.exp(logarithm - logarithm.max())
-                   * np.outer(*(_prior(axis) for axis in axes)))
+                   * np.outer(*(_scatter_prior(axis) for axis in axes)))
         weights /= weights.sum()
-        axes = [_nearer(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
+        axes = [_refine_axis(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
     likely = weights.ravel() > 1e-4
     values, covariances, squares = (np.concatenate([each[place] for each in found])[likely]
                                     for place in (1, 2, 3))
-    share = weights.ravel()[likely] / weights.ravel()[likely].sum()
-    return share, values, covariances, np.sqrt(share @ squares)
+    probability = weights.ravel()[likely] / weights.ravel()[likely].sum()
+    return probability, values, covariances, np.sqrt(probability @ squares)
 
 
-def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array, Array]:
+def _evaluate_scatter(sums: _SweepProducts, dof: int,
+                      sizes: Array) -> tuple[Array, Array, Array, Array]:
     """
     Return log-likelihoods of sweep scatters, shape (k, 2), with values and covariances.
 
     Last come the squares of the scatters, in which the sizes are parts of what dwells show.
 
     """
-    gram, log_determinant = sums.reduced(sizes)
+    gram, log_determinant = sums.marginalized(sizes)
     inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
     values = np.einsum('kij,kj->ki', inverse, right)
     misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right),
                         1e-12 * sums.gram[-1, -1]) + 1e-200
-    logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + freedom * np.log(misfit))
-    size = misfit / freedom
+    logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + dof * np.log(misfit))
+    size = misfit / dof
     return logarithm, values, inverse * size[:, None, None], sizes ** 2 * size[:, None]
 
 
-def _prior(sizes: Array) -> Array:
+def _scatter_prior(sizes: Array) -> Array:
     """Return the prior of each size: one half at 0, a half Cauchy above."""
     if len(sizes) == 1:
         return np.ones(1)
@@ -407,11 +416,11 @@ def _prior(sizes: Array) -> Array:
                            * math.log(sizes[2] / sizes[1])])
 
 
-def _nearer(sizes: Array, weights: Array) -> Array:
+def _refine_axis(sizes: Array, weights: Array) -> Array:
     """Return 0 and sizes spaced about as finely as the likely ones above 0."""
     if len(sizes) == 1:
         return sizes
-    logarithms, share = np.log(sizes[1:]), weights[1:] / max(weights[1:].sum(), 1e-300)
-    middle = float(share @ logarithms)
-    spread = max(math.sqrt(float(share @ (logarithms - middle) ** 2)), 0.3)
+    logarithms, probability = np.log(sizes[1:]), weights[1:] / max(weights[1:].sum(), 1e-300)
+    middle = float(probability @ logarithms)
+    spread = max(math.sqrt(float(probability @ (logarithms - middle) ** 2)), 0.3)
     return np.concatenate([[0.0], np.exp(middle + spread * np.linspace(-3.0, 3.0, 13))])

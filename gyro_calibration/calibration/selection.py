@@ -27,8 +27,8 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration, fit_effects
-from gyro_calibration.calibration.scatter import find_scatter, Scatter
-from gyro_calibration.calibration.tolerance import BIAS_SLOPE, SCALE_SLOPE
+from gyro_calibration.calibration.scatter import estimate_scatter, Scatter
+from gyro_calibration.calibration.tolerance import BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.model.effects import (
     BIAS,
@@ -40,7 +40,7 @@ from gyro_calibration.model.effects import (
     SCALE_FACTOR_ERROR,
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
-    STEADY,
+    STATIC_EFFECTS,
 )
 import numpy as np
 
@@ -48,22 +48,25 @@ import numpy as np
 FALSE_ALARM_RATE = 0.01
 #: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
 #: one of thirty thousand calibrations.
-DISTINGUISHED = 4.0
+MIN_DISTINGUISHING_SIGMAS = 4.0
 #: Standard deviations below which the data do not prefer one of two causes.
-HARDLY = 2.0
+MIN_PREFERENCE_SIGMAS = 2.0
 #: Technology -> the effect, of two that are hard to distinguish, that its physics causes.
-TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
-                'mems': CUBIC_NONLINEARITY}
-_CONFOUNDERS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
+TECHNOLOGY_EFFECTS = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
+                      'mems': CUBIC_NONLINEARITY}
+_CONFOUNDED_EFFECTS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
 #: Effects of every gyro that are fitted where their standard deviation is below these, which are
 #: those of data sheets.
-_SLOPES = {BIAS_TEMPERATURE: BIAS_SLOPE, SCALE_FACTOR_TEMPERATURE: SCALE_SLOPE}
+_TYPICAL_SLOPES = {
+    BIAS_TEMPERATURE: BIAS_SLOPE_DEVIATION,
+    SCALE_FACTOR_TEMPERATURE: SCALE_SLOPE_DEVIATION
+}
 #: Effect -> another one that it is fitted with only.
-_NEEDS = {BIAS_TEMPERATURE_QUADRATIC: BIAS_TEMPERATURE}
+_REQUIRED_EFFECTS = {BIAS_TEMPERATURE_QUADRATIC: BIAS_TEMPERATURE}
 
 
 @dataclass(frozen=True)
-class Choice:
+class EffectChoice:
     """
     Why an effect was taken or not.
 
@@ -71,22 +74,22 @@ class Choice:
     ----------
     effect : its name
     taken : whether it is in the model
-    without, with_it : error of left-out sweeps, rad/s; nan where a fit was not possible
-    chance : p-value of the effect; nan as before
+    error_without, error_with : error of left-out sweeps, rad/s; nan where a fit was not possible
+    p_value : p-value of the effect; nan as before
     reason : one sentence
 
     """
 
     effect: str
     taken: bool
-    without: float
-    with_it: float
-    chance: float
+    error_without: float
+    error_with: float
+    p_value: float
     reason: str
 
 
 @dataclass(frozen=True)
-class Confounders:
+class ConfoundedPair:
     """
     Two effects that explain the same errors.
 
@@ -95,8 +98,8 @@ class Confounders:
     taken, other : their names
     sigmas : standard deviations by which the data prefer the one that was taken; negative where
         they prefer the other
-    rate : slowest rate, rad/s, at which two dwells each way would distinguish them; None if it is
-        above three times the fastest
+    distinguishing_rate : slowest rate, rad/s, at which two dwells each way would distinguish them;
+        None if it is above three times the fastest
     reason : why it was taken, one sentence
 
     """
@@ -104,13 +107,13 @@ class Confounders:
     taken: str
     other: str
     sigmas: float
-    rate: float | None
+    distinguishing_rate: float | None
     reason: str
 
     @property
-    def distinguishable(self) -> bool:
+    def is_distinguishable(self) -> bool:
         """Tell whether the data distinguish them."""
-        return abs(self.sigmas) >= DISTINGUISHED
+        return abs(self.sigmas) >= MIN_DISTINGUISHING_SIGMAS
 
 
 @dataclass(frozen=True)
@@ -118,8 +121,8 @@ class Selection:
     """A calibration with the effects that the data support, the reasons, and confounded pairs."""
 
     calibration: Calibration
-    choices: tuple[Choice, ...]
-    confounders: tuple[Confounders, ...]
+    choices: tuple[EffectChoice, ...]
+    confounders: tuple[ConfoundedPair, ...]
 
 
 def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
@@ -129,63 +132,66 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     Parameters
     ----------
     dwells : of a rate table or a log
-    technology : one of `TECHNOLOGIES`, of the instrument; it decides where causes tie
+    technology : one of `TECHNOLOGY_EFFECTS`, of the instrument; it decides where causes tie
 
     Raises
     ------
     DataRefused : too few dwells for anything
 
     """
-    best, confounders = supported_effects(dwells, technology)
-    best = with_slopes(best)
+    best, confounders = fit_supported_effects(dwells, technology)
+    best = add_temperature_slopes(best)
     if technology is None:
-        best, confounders = decided(best, None, SINE_RESPONSE)
-    tried = len(STEADY) - sum(effect in best.effects for effect in (BIAS, SCALE_FACTOR_ERROR))
-    choices = tuple(_choice(best, effect, tried, confounders) for effect in STEADY.values())
+        best, confounders = resolve_confounders(best, None, SINE_RESPONSE)
+    tried = (len(STATIC_EFFECTS) - sum(effect in best.effects
+                                       for effect in (BIAS, SCALE_FACTOR_ERROR)))
+    choices = tuple(
+        _explain_choice(best, effect, tried, confounders) for effect in STATIC_EFFECTS.values())
     return Selection(best, choices, confounders)
 
 
-def supported_effects(
-        dwells: Dwells, technology: str | None = None,
-        rate: float = FALSE_ALARM_RATE) -> tuple[Calibration, tuple[Confounders, ...]]:
+def fit_supported_effects(
+        dwells: Dwells, technology: str | None = None, false_alarm_rate: float = FALSE_ALARM_RATE
+) -> tuple[Calibration, tuple[ConfoundedPair, ...]]:
     """Fit the supported effects, without reasons, at a false alarm rate."""
-    scatter = find_scatter(dwells)
-    base = _base(dwells, scatter)
-    candidates = [effect for effect in STEADY.values() if effect not in base.effects]
-    limit = rate / len(candidates)
-    best = _grow(base, candidates, limit)
-    best = _prune(best, base.effects, limit)
-    return decided(best, technology)
+    scatter = estimate_scatter(dwells)
+    base = _fit_base(dwells, scatter)
+    candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]
+    limit = false_alarm_rate / len(candidates)
+    best = _add_effects(base, candidates, limit)
+    best = _remove_superfluous(best, base.effects, limit)
+    return resolve_confounders(best, technology)
 
 
-def with_slopes(fit: Calibration) -> Calibration:
+def add_temperature_slopes(fit: Calibration) -> Calibration:
     """Add the slopes over temperature that the dwells determine better than a data sheet."""
-    for slope, usual in _SLOPES.items():
-        wider = None if slope in fit.effects else _try(fit.dwells, (*fit.effects, slope),
-                                                       fit.scatter)
-        if wider is not None and wider.freedom and wider.deviation_of(slope) < usual:
-            fit = wider
+    for slope, typical_deviation in _TYPICAL_SLOPES.items():
+        extended = None if slope in fit.effects else _try_fit(fit.dwells, (*fit.effects, slope),
+                                                              fit.scatter)
+        if (extended is not None and extended.dof
+                and extended.effect_deviation(slope) < typical_deviation):
+            fit = extended
     return fit
 
 
-def _base(dwells: Dwells, scatter: Scatter) -> Calibration:
+def _fit_base(dwells: Dwells, scatter: Scatter) -> Calibration:
     """Fit bias and scale factor error, or the one of them that the dwells determine."""
     for effects in ((BIAS, SCALE_FACTOR_ERROR), (BIAS,), (SCALE_FACTOR_ERROR,)):
-        fit = _try(dwells, effects, scatter)
+        fit = _try_fit(dwells, effects, scatter)
         if fit is not None:
             return fit
     raise DataRefused(f'{len(dwells)} dwells show neither a bias nor a scale factor; '
                       'rest, and turn both ways at several speeds')
 
 
-def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibration | None:
+def _try_fit(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibration | None:
     try:
         return fit_effects(dwells, effects, scatter)
     except DataRefused:
         return None
 
 
-def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
+def _is_supported(smaller: Calibration, larger: Calibration, significance: float) -> bool:
     """
     Return whether more effects predict left-out sweeps better, and each is significant.
 
@@ -193,152 +199,163 @@ def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
 
     """
     added = [effect for effect in larger.effects if effect not in smaller.effects]
-    predicts = larger.predicted_misfit() < smaller.predicted_misfit()
-    return (predicts and larger.folded_beyond is None
-            and all(larger.chance_of(effect) < limit for effect in added))
+    predicts = larger.cross_validation_misfit() < smaller.cross_validation_misfit()
+    return (predicts and larger.min_non_monotonic_rate is None
+            and all(larger.p_value(effect) < significance for effect in added))
 
 
-def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float) -> Calibration:
+def _add_effects(fit: Calibration, candidates: Sequence[Effect],
+                 significance: float) -> Calibration:
     """Add the effect that predicts left-out sweeps best, until none is supported."""
     while True:
-        new = [effect for effect in candidates if _may_join(effect, fit.effects)]
-        tried = [_try(fit.dwells, _joined(fit.effects, effect), fit.scatter)
+        new = [effect for effect in candidates if _can_add(effect, fit.effects)]
+        tried = [_try_fit(fit.dwells, _add_with_required(fit.effects, effect), fit.scatter)
                  for effect in new]
-        better = [each for each in tried if each is not None and _supported(fit, each, limit)]
+        better = [
+            each for each in tried if each is not None and _is_supported(fit, each, significance)
+        ]
         if not better:
             return fit
-        fit = min(better, key=Calibration.predicted_misfit)
+        fit = min(better, key=Calibration.cross_validation_misfit)
 
 
-def _may_join(effect: Effect, effects: Sequence[Effect]) -> bool:
+def _can_add(effect: Effect, effects: Sequence[Effect]) -> bool:
     return effect not in effects and not any(
-        effect in pair and any(each in effects for each in pair) for pair in _CONFOUNDERS)
+        effect in pair and any(each in effects for each in pair) for pair in _CONFOUNDED_EFFECTS)
 
 
-def _joined(effects: Sequence[Effect], effect: Effect) -> tuple[Effect, ...]:
+def _add_with_required(effects: Sequence[Effect], effect: Effect) -> tuple[Effect, ...]:
     """Return the effects with one more, and one it needs: a curve needs a slope, even if small."""
-    needed = _NEEDS.get(effect)
+    needed = _REQUIRED_EFFECTS.get(effect)
     return ((*effects, effect) if needed is None or needed in effects
             else (*effects, needed, effect))
 
 
-def _prune(fit: Calibration, base: Sequence[Effect], limit: float) -> Calibration:
+def _remove_superfluous(fit: Calibration, base: Sequence[Effect],
+                        significance: float) -> Calibration:
     """Remove effects that later ones made superfluous."""
     for effect in fit.effects:
         rest = tuple(each for each in fit.effects if each is not effect)
-        if effect in base or effect in map(_NEEDS.get, rest):
+        if effect in base or effect in map(_REQUIRED_EFFECTS.get, rest):
             continue
-        smaller = _try(fit.dwells, rest, fit.scatter)
-        if smaller is not None and not _supported(smaller, fit, limit):
-            return _prune(smaller, base, limit)
+        smaller = _try_fit(fit.dwells, rest, fit.scatter)
+        if smaller is not None and not _is_supported(smaller, fit, significance):
+            return _remove_superfluous(smaller, base, significance)
     return fit
 
 
 # confounders
 
-def decided(fit: Calibration, technology: str | None,
-            bounded: Effect | None = None) -> tuple[Calibration, tuple[Confounders, ...]]:
+
+def resolve_confounders(
+        fit: Calibration, technology: str | None,
+        bounded_effect: Effect | None = None) -> tuple[Calibration, tuple[ConfoundedPair, ...]]:
     """
     Decide between effects that explain the same errors.
 
-    Without a technology, a `bounded` effect is taken where the data do not prefer the other one.
+    Without a technology, a `bounded_effect` effect is taken where the data do not prefer the other
+    one.
 
     """
     found = []
-    for pair in _CONFOUNDERS:
+    for pair in _CONFOUNDED_EFFECTS:
         for taken, other in (pair, pair[::-1]):
             swapped = None
             if taken in fit.effects:
-                swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other),
-                               fit.scatter)
+                swapped = _try_fit(fit.dwells, replace_effect(fit.effects, taken, other),
+                                   fit.scatter)
             # with all rates at its zeros a sine fits any data
-            if swapped is not None and swapped.folded_beyond is None:
-                fit, confounders = _decide((fit, taken), (swapped, other), technology, bounded)
+            if swapped is not None and swapped.min_non_monotonic_rate is None:
+                fit, confounders = _resolve_pair((fit, taken), (swapped, other), technology,
+                                                 bounded_effect)
                 found.append(confounders)
                 break
     return fit, tuple(found)
 
 
-def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect],
-            technology: str | None, bounded: Effect | None) -> tuple[Calibration, Confounders]:
+def _resolve_pair(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect],
+                  technology: str | None,
+                  bounded_effect: Effect | None) -> tuple[Calibration, ConfoundedPair]:
     (fit, taken), (swapped, other) = sorted((first, second), key=lambda each: each[0].misfit)
     sigmas = math.sqrt(max(swapped.misfit - fit.misfit, 0.0))
     reason = f'{taken.name} fits better by {sigmas:.1f} standard deviations'
-    if sigmas < DISTINGUISHED and technology is not None:
-        physical = TECHNOLOGIES[technology]
+    if sigmas < MIN_DISTINGUISHING_SIGMAS and technology is not None:
+        physical = TECHNOLOGY_EFFECTS[technology]
         if physical is other:
             (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
         reason = (f'{taken.name} is what the physics of {technology} gives, and fits '
                   f'{"better" if sigmas > 0.0 else "worse"} by {abs(sigmas):.1f} '
                   'standard deviations')
-    elif technology is not None and TECHNOLOGIES[technology] is other:
+    elif technology is not None and TECHNOLOGY_EFFECTS[technology] is other:
         reason += f', although the physics of {technology} gives {other.name}'
-    if technology is None and bounded is other and sigmas < HARDLY:
+    if technology is None and bounded_effect is other and sigmas < MIN_PREFERENCE_SIGMAS:
         (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
         reason = (f'{taken.name} fits worse by {abs(sigmas):.1f} standard deviations only, and '
                   'its error stays bounded beyond the rates that were seen')
-    return fit, Confounders(taken.name, other.name, sigmas, _distinguishing_rate(fit, swapped),
-                            reason)
+    return fit, ConfoundedPair(taken.name, other.name, sigmas, _distinguishing_rate(fit, swapped),
+                               reason)
 
 
 def _distinguishing_rate(fit: Calibration, swapped: Calibration) -> float | None:
     """Return the slowest new rate, rad/s, at which two dwells each way distinguish two fits."""
     fastest = float(np.abs(fit.dwells.rate).max())
     for rate in fastest * np.arange(1.05, 3.0, 0.05):
-        if separation(fit, swapped, np.array([rate, rate, -rate, -rate]),
-                      fit.model.reference_temperature) >= DISTINGUISHED + 1.0:
+        if separation_sigmas(fit, swapped, np.array([rate, rate, -rate, -rate]),
+                             fit.model.reference_temperature) >= MIN_DISTINGUISHING_SIGMAS + 1.0:
             return float(rate)
     return None
 
 
-def separation(fit: Calibration, swapped: Calibration, rates: Array,
-               temperature: float) -> float:
+def separation_sigmas(fit: Calibration, swapped: Calibration, rates: Array,
+                      temperature: float) -> float:
     """Return the difference of two fits in one more sweep at rates (n,), standard deviations."""
     count, known = len(rates), fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
     deviation = np.full(count, np.median(known) if len(known) else np.nan)
     sweep = Dwells(rates, rates, None, deviation, np.zeros(count, dtype=int), ('',) * count)
     channels = Channels(rates, rates, np.full(count, temperature))
     rows = np.column_stack([row for term in fit.terms for row in term.sensitivity(channels)])
-    uncertain = 0.0 if fit.model.covariance is None else rows @ fit.model.covariance @ rows.T
-    shared = fit.scatter.shared(sweep)
-    covariance = uncertain + np.diag(fit.scatter.deviation(sweep) ** 2) + shared @ shared.T
+    fit_covariance = 0.0 if fit.model.covariance is None else rows @ fit.model.covariance @ rows.T
+    shared = fit.scatter.sweep_columns(sweep)
+    covariance = fit_covariance + np.diag(fit.scatter.deviation(sweep) ** 2) + shared @ shared.T
     difference = np.asarray(fit.model.error(channels) - swapped.model.error(channels))
     return math.sqrt(float(difference @ np.linalg.solve(covariance, difference)))
 
 
 # reasons
 
-def _choice(fit: Calibration, effect: Effect, tried: int,
-            confounders: Sequence[Confounders]) -> Choice:
+def _explain_choice(fit: Calibration, effect: Effect, tried_count: int,
+                    confounders: Sequence[ConfoundedPair]) -> EffectChoice:
     """Return the gain of a fit with the effect over one without it, or with its confounder."""
     for pair in confounders:
         if effect.name == pair.other:
-            swapped = fit_effects(
-                fit.dwells, swapped_effects(fit.effects, STEADY[pair.taken], effect), fit.scatter)
+            swapped = fit_effects(fit.dwells,
+                                  replace_effect(fit.effects, STATIC_EFFECTS[pair.taken], effect),
+                                  fit.scatter)
             reason = f'explains the same as {pair.taken}, in place of which it is tried here'
-            return Choice(effect.name, False, fit.left_out_rms, swapped.left_out_rms, math.nan,
-                          reason)
+            return EffectChoice(effect.name, False, fit.left_out_rms, swapped.left_out_rms,
+                                math.nan, reason)
     taken = effect in fit.effects
     rest = tuple(each for each in fit.effects if each is not effect)
     if taken and not rest:
-        return Choice(effect.name, True, math.nan, fit.left_out_rms, math.nan,
-                      'nothing else can be seen')
+        return EffectChoice(effect.name, True, math.nan, fit.left_out_rms, math.nan,
+                            'nothing else can be seen')
     try:
-        other = fit_effects(fit.dwells, rest if taken else _joined(rest, effect), fit.scatter)
+        other = fit_effects(fit.dwells, rest if taken else _add_with_required(rest, effect),
+                            fit.scatter)
     except DataRefused as error:
-        return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
+        return EffectChoice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
     reason = 'no better than chance'
-    if not larger.freedom:
+    if not larger.dof:
         reason = 'as many values as dwells: no significance can be stated; add dwells'
     elif taken:
         reason = ('predicts left-out sweeps better'
-                  if _supported(smaller, larger, FALSE_ALARM_RATE / tried)
+                  if _is_supported(smaller, larger, FALSE_ALARM_RATE / tried_count)
                   else 'belongs to every model')
-    return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
-                  larger.chance_of(effect), reason)
+    return EffectChoice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
+                        larger.p_value(effect), reason)
 
 
-def swapped_effects(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
+def replace_effect(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
     """Return the effects with another one in place of one of them."""
     return tuple(other if each is taken else each for each in effects)

@@ -23,29 +23,29 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.fit_quality import (
-    allow_asymmetry,
-    look_slower,
-    refuse_repeating,
-    refuse_useless,
+    add_asymmetry_variance,
+    refit_bias_by_windows,
+    refuse_no_improvement,
+    refuse_repeatable_error,
 )
 from gyro_calibration.calibration.likelihood import (
-    CHANCE,
-    Fit,
     fit_likelihood,
-    FOLLOWING,
-    Goodness,
+    GoodnessOfFit,
+    MAX_NOISE_SIGMAS,
+    MAX_TRACKING_LAG,
+    ScaleBiasFit,
 )
 from gyro_calibration.calibration.run_faults import (
-    EXPLAINED,
-    followed,
-    Pieces,
-    pieces,
-    refuse_robot,
-    slip_sentence,
-    unit_error,
+    describe_unit_error,
+    fit_profile,
+    format_slip,
+    MAX_UNEXPLAINED_SHARE,
+    refuse_other_motion,
+    RunPieces,
+    split_run,
 )
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise
+from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise_deviation
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
@@ -55,49 +55,52 @@ from scipy.special import chdtrc, ndtri
 
 
 @dataclass(frozen=True)
-class Limits:
+class RunLimits:
     """
     The limits of a run that is accepted.
 
     Attributes
     ----------
-    samples : minimum number of samples
-    gap : longest between samples, s
-    rate_spread : smallest standard deviation of the profile's rate, rad/s; one speed does not
+    min_samples : minimum number of samples
+    max_gap : longest between samples, s
+    min_rate_spread : smallest standard deviation of the profile's rate, rad/s; one speed does not
         separate scale from bias
-    scale_factor_error : largest, 1
-    bias : largest, rad/s
-    scale_standard_deviation : largest standard deviation of the scale, 1
-    residual : largest significant deviation of a stretch of the run from the profile, rad
-    time_offset : largest lag of the gyro behind the profile, either way, s
-    noise_ratio, unexplained : largest noise that accumulates in the heading, as a multiple of the
-        known noise and as its heading error over the run, rad; a run that exceeds both is refused
-    rest : length of the check after the run, s
-    drift : largest corrected rate at rest after the run, rad/s, unless the noise explains more
-    repeating : largest error of the heading that repeats with the motion, rad
-    heading : largest error of the heading after five minutes, rad, unless it was larger without
-        the calibration (`likelihood` only)
+    max_scale_factor_error : largest, 1
+    max_bias : largest, rad/s
+    max_scale_deviation : largest standard deviation of the scale, 1
+    max_stretch_residual : largest significant deviation of a stretch of the run from the profile,
+        rad
+    max_time_offset : largest lag of the gyro behind the profile, either way, s
+    max_noise_ratio, max_unexplained_angle : largest noise that accumulates in the heading, as a
+        multiple of the known noise and as its heading error over the run, rad; a run that exceeds
+        both is refused
+    rest_duration : length of the check after the run, s
+    max_rest_rate : largest corrected rate at rest after the run, rad/s, unless the noise explains
+        more
+    max_repeatable_error : largest error of the heading that repeats with the motion, rad
+    max_heading_error : largest error of the heading after five minutes, rad, unless it was larger
+        without the calibration (`likelihood` only)
 
     """
 
-    samples: int = 50
-    gap: float = 0.5
-    rate_spread: float = 1.0 * DEGREE
-    scale_factor_error: float = 0.3
-    bias: float = 10.0 * DEGREE
-    scale_standard_deviation: float = 0.02
-    residual: float = 1.0 * DEGREE
-    time_offset: float = 1.0
-    noise_ratio: float = 8.0
-    unexplained: float = 1.0 * DEGREE
-    rest: float = 2.0
-    drift: float = 2e-4
-    repeating: float = 1.0 * DEGREE
-    heading: float = 15.0 * DEGREE
+    min_samples: int = 50
+    max_gap: float = 0.5
+    min_rate_spread: float = 1.0 * DEGREE
+    max_scale_factor_error: float = 0.3
+    max_bias: float = 10.0 * DEGREE
+    max_scale_deviation: float = 0.02
+    max_stretch_residual: float = 1.0 * DEGREE
+    max_time_offset: float = 1.0
+    max_noise_ratio: float = 8.0
+    max_unexplained_angle: float = 1.0 * DEGREE
+    rest_duration: float = 2.0
+    max_rest_rate: float = 2e-4
+    max_repeatable_error: float = 1.0 * DEGREE
+    max_heading_error: float = 15.0 * DEGREE
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceErrors:
     """
     The errors of a reference that are not observable in a run; zero for an exact or measured one.
 
@@ -117,21 +120,21 @@ class Reference:
 
 #: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
 #: equal slip in all turns is indistinguishable from a scale factor error.
-_SLIPPING = 0.01
+_MAX_WHEEL_SLIP = 0.01
 
 
-def usual_reference(motion: Motion) -> Reference:
+def default_reference_errors(motion: Motion) -> ReferenceErrors:
     """Return the usual errors of a reference whose errors are not given: commanded rates slip."""
     commanded = motion.rate is not None
-    return Reference(_SLIPPING / math.sqrt(3.0)) if commanded else Reference()
+    return ReferenceErrors(_MAX_WHEEL_SLIP / math.sqrt(3.0)) if commanded else ReferenceErrors()
 
 
 #: Standard deviations from which on a stretch is a slip. With three times the noise of the
 #: XV-3500, 6 of 800 good runs exceeded it and 1 deg as well; with its own noise none of 800.
-SLIP = 4.5
+MIN_SLIP_SIGMAS = 4.5
 
 
-def fit_heading(time: Array, rate: Array, motion: Motion) -> Fit:
+def fit_heading(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
     """
     Fit by Hong and Park's heading reference, unchanged (eq. 4 to 7).
 
@@ -147,10 +150,10 @@ def fit_heading(time: Array, rate: Array, motion: Motion) -> Fit:
     step = np.diff(time)
     g = np.column_stack([np.cumsum(step * rate[:-1]), np.cumsum(step)])
     z = motion.heading_at(time[1:]) - motion.heading_at(time[:1])
-    return _fit_inverse(g.T @ g, g.T @ z)
+    return _solve_inverse_model(g.T @ g, g.T @ z)
 
 
-def fit_rate(time: Array, rate: Array, motion: Motion) -> Fit:
+def fit_rate(time: Array, rate: Array, motion: Motion) -> ScaleBiasFit:
     """
     Fit by Hong and Park's rate reference (eq. 8 and 9), with columns in the order of q = [s̄, b̄].
 
@@ -162,25 +165,25 @@ def fit_rate(time: Array, rate: Array, motion: Motion) -> Fit:
     """
     true = motion.rate_at(time)
     g = np.array([[rate @ rate, rate.sum()], [rate.sum(), len(rate)]])
-    return _fit_inverse(g, np.array([true @ rate, true.sum()]))
+    return _solve_inverse_model(g, np.array([true @ rate, true.sum()]))
 
 
-def _fit_inverse(matrix: Array, vector: Array) -> Fit:
+def _solve_inverse_model(matrix: Array, vector: Array) -> ScaleBiasFit:
     """Solve for s̄ and b̄ of eq. 3, and return them as s and b."""
     if not np.linalg.cond(matrix) < 1e12:
         raise DataRefused('the gyro did not change its rate, so scale and bias cannot be '
                           'separated: turn both ways, with stops')
     scale, offset = np.linalg.solve(matrix, vector).tolist()
-    return Fit(1.0 / scale - 1.0, -offset / scale, np.full((2, 2), np.nan))
+    return ScaleBiasFit(1.0 / scale - 1.0, -offset / scale, np.full((2, 2), np.nan))
 
 
 METHODS = {'likelihood': fit_likelihood, 'heading': fit_heading, 'rate': fit_rate}
 
 
 def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'likelihood',
-                   limits: Limits | None = None, noise: Noise | None = None,
-                   reference: Reference | None = None, output: Array | None = None,
-                   prior: Array | None = None) -> Fit:
+                   limits: RunLimits | None = None, noise: Noise | None = None,
+                   reference: ReferenceErrors | None = None, output: Array | None = None,
+                   prior: Array | None = None) -> ScaleBiasFit:
     """
     Fit a run by one of `METHODS` and refuse one that is not credible.
 
@@ -203,141 +206,152 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     DataRefused : with the reason and the remedy
 
     """
-    limits = limits or Limits()
-    reference = usual_reference(motion) if reference is None else reference
+    limits = limits or RunLimits()
+    reference = default_reference_errors(motion) if reference is None else reference
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)
-    run = pieces(time, rate)
+    run = split_run(time, rate)
     _refuse_run(time, run, motion, limits)
     if method == 'likelihood':
-        fit = _fit_likelihood(time, rate, motion, limits.time_offset, reference.scale_deviation)
+        fit = _fit_likelihood(time, rate, motion, limits.max_time_offset,
+                              reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
     # errors not observable in a run: wander of the bias, and errors of the reference with the
     # slip that all turns have; the root mean square of slips between zero and a largest one is
     # twice their standard deviation
-    scale, floor = 1.0 + fit.scale_factor_error, 0.0 if noise is None else noise.floor
-    hidden = np.diag([(scale * max(reference.scale_deviation, 2.0 * fit.slip)) ** 2,
-                      floor ** 2 + (scale * reference.rate_deviation) ** 2])
-    fit = replace(fit, covariance=fit.covariance + hidden,
-                  goodness=_goodness(fit, reference, noise))
+    scale, bias_floor = 1.0 + fit.scale_factor_error, 0.0 if noise is None else noise.allan_floor
+    unobservable = np.diag(
+        [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2, bias_floor ** 2 +
+         (scale * reference.rate_deviation) ** 2])
+    fit = replace(fit, covariance=fit.covariance + unobservable,
+                  goodness=_goodness_of_fit(fit, reference, noise))
     if prior is not None and np.isfinite(fit.covariance).all():
-        kept = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
-        s, b = (kept.T @ (fit.scale_factor_error, fit.bias)).tolist()
-        fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ kept)
+        shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
+        s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
+        fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
     _refuse_fit(fit, run, motion, limits)
     return fit
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
-                    slip: float) -> Fit:
+                    slip_deviation: float) -> ScaleBiasFit:
     """Fit on the stamps, or on an even grid if that leaves less, and check for slow errors."""
-    even = even_times(time)
-    jitters = float(np.abs(even - time).max()) > 1e-3 * float(np.median(np.diff(time)))
-    fits = [(fit_likelihood(stamps, rate, motion, largest_time_offset, slip=slip), stamps)
-            for stamps in ([time, even] if jitters else [time])]
+    even_stamps = even_times(time)
+    jitters = float(np.abs(even_stamps - time).max()) > 1e-3 * float(np.median(np.diff(time)))
+    fits = [(fit_likelihood(stamps, rate, motion, largest_time_offset,
+                            slip_deviation=slip_deviation), stamps)
+            for stamps in ([time, even_stamps] if jitters else [time])]
     fit, stamps = min(fits, key=lambda found: np.linalg.det(found[0].covariance))
-    return fit if motion.rate is not None else allow_asymmetry(
-        look_slower(fit, stamps, rate, motion), rate)
+    return fit if motion.rate is not None else add_asymmetry_variance(
+        refit_bias_by_windows(fit, stamps, rate, motion), rate)
 
 
-def _goodness(fit: Fit, reference: Reference, noise: Noise | None) -> Goodness | None:
+def _goodness_of_fit(fit: ScaleBiasFit, reference: ReferenceErrors,
+                     noise: Noise | None) -> GoodnessOfFit | None:
     """Compare the residual with the known noise of means over neighbouring blocks."""
-    if noise is None or not noise.angle_random_walk or not fit.freedom:
+    if noise is None or not noise.angle_random_walk or not fit.dof:
         return None
     block = float(np.median(np.diff(fit.influence[:, 2])))
     known = (noise.allan_variance(block) * block
              + ((1.0 + fit.scale_factor_error) * reference.random_walk) ** 2)
-    chi_square = fit.squares / known
-    return Goodness(chi_square, fit.freedom, float(chdtrc(fit.freedom, chi_square)),
-                    fit.angle_random_walk / math.sqrt(known))
+    chi_square = fit.residual_squares / known
+    return GoodnessOfFit(chi_square, fit.dof, float(chdtrc(fit.dof, chi_square)),
+                         fit.angle_random_walk / math.sqrt(known))
 
 
-def refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
+def refuse_samples(time: Array, rate: Array, limits: RunLimits) -> None:
     """Refuse samples that are too few, no numbers, or too far apart."""
-    if len(time) < limits.samples:
-        raise DataRefused(f'only {len(time)} samples came; at least {limits.samples} are needed: '
+    if len(time) < limits.min_samples:
+        raise DataRefused(f'only {len(time)} samples came; at least {limits.min_samples} are '
+                          'needed: '
                           "check the gyro's line and rate")
     if not np.isfinite(rate).all():
         raise DataRefused(f'{np.sum(~np.isfinite(rate))} samples are not a finite number: '
                           'leave them out, or repair the line')
     gap = float(np.diff(time).max())
-    if gap > limits.gap:
-        raise DataRefused(f'no samples came for {gap:.2f} s; at most {limits.gap:g} s may be '
+    if gap > limits.max_gap:
+        raise DataRefused(f'no samples came for {gap:.2f} s; at most {limits.max_gap:g} s may be '
                           'missing: repair the line and run again')
 
 
-def refuse_scale(s: float, reference: str, remedy: str) -> None:
+def refuse_scale(scale_factor_error: float, reference: str, remedy: str) -> None:
     """Refuse a gyro that saw almost none of the reference's turns, or all with the other sign."""
-    if abs(1.0 + s) < 0.5:
-        raise DataRefused(f"the gyro saw {100 * (1 + s):.0f} % of the {reference}'s turns: "
+    if abs(1.0 + scale_factor_error) < 0.5:
+        raise DataRefused(f'the gyro saw {100 * (1 + scale_factor_error):.0f} % of the '
+                          f"{reference}'s turns: "
                           'did the robot move, and does the gyro respond?')
-    if s < -1.5:
+    if scale_factor_error < -1.5:
         raise DataRefused(f'the gyro turns the other way than the {reference} '
-                          f'(scale {1 + s:.2f}): {remedy}')
+                          f'(scale {1 + scale_factor_error:.2f}): {remedy}')
 
 
-def _refuse_run(time: Array, run: Pieces, motion: Motion, limits: Limits) -> None:
+def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) -> None:
     """Refuse a run that is not the whole profile, another unit or sign, or one speed alone."""
     if not np.isfinite(motion.heading).all():
         raise DataRefused('the reference was lost somewhere in the profile: '
                           'leave those points out, or run again')
     covered = float(time[-1] - time[0])
-    if covered < 0.9 * motion.duration - 2.0 * limits.time_offset:
+    if covered < 0.9 * motion.duration - 2.0 * limits.max_time_offset:
         raise DataRefused(f"the samples cover {covered:.1f} s of the profile's "
                           f'{motion.duration:.1f} s: record the whole motion')
-    largest = limits.time_offset + FOLLOWING
-    left, scale = followed(run, motion, largest)
-    if left <= EXPLAINED:
-        unit = unit_error(scale) if abs(scale - 1.0) > limits.scale_factor_error else ''
+    largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
+    unexplained, scale = fit_profile(run, motion, largest_offset)
+    if unexplained <= MAX_UNEXPLAINED_SHARE:
+        unit = (describe_unit_error(scale) if abs(scale
+                                                  - 1.0) > limits.max_scale_factor_error else '')
         if unit:
             raise DataRefused(unit)
         refuse_scale(scale - 1.0, 'profile', "set the driver's parameter invert")
-    spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
-    if spread < limits.rate_spread:
+    rate_spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
+    if rate_spread < limits.min_rate_spread:
         raise DataRefused('the profile turns at one speed (its rate varies by '
-                          f'{spread / DEGREE:.2f} deg/s): scale and bias cannot be separated; '
+                          f'{rate_spread / DEGREE:.2f} deg/s): scale and bias cannot be '
+                          'separated; '
                           'turn both ways, with stops')
-    if left > EXPLAINED:
-        if np.std(run.turned) < 0.1 * np.std(run.headings(motion)):
+    if unexplained > MAX_UNEXPLAINED_SHARE:
+        if np.std(run.gyro_angle) < 0.1 * np.std(run.reference_angle(motion)):
             refuse_scale(scale - 1.0, 'profile', '')
-        refuse_robot(run, motion, largest)
+        refuse_other_motion(run, motion, largest_offset)
 
 
-def _refuse_fit(fit: Fit, run: Pieces, motion: Motion, limits: Limits) -> None:
+def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits) -> None:
     """Refuse by the first cause found; causes that spoil later checks come first."""
-    largest = limits.time_offset + FOLLOWING
-    turned, size = fit.residual
+    largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
+    excess_angle, sigmas = fit.stretch_residual
     s, b = fit.scale_factor_error, fit.bias
     deviation = float(np.nan_to_num(math.sqrt(fit.covariance[0, 0])))
-    slip = slip_sentence(turned, fit.stretch[0], size)
-    slipped = turned > limits.residual and size > SLIP
-    if slipped or abs(fit.time_offset) > largest or deviation > limits.scale_standard_deviation:
-        refuse_robot(run, motion, largest, slip)
-    if slipped:
+    slip = format_slip(excess_angle, fit.stretch_interval[0], sigmas)
+    has_slipped = excess_angle > limits.max_stretch_residual and sigmas > MIN_SLIP_SIGMAS
+    if (has_slipped or abs(fit.time_offset) > largest_offset
+            or deviation > limits.max_scale_deviation):
+        refuse_other_motion(run, motion, largest_offset, slip)
+    if has_slipped:
         raise DataRefused(slip)
-    if abs(s) > limits.scale_factor_error + 3.0 * deviation:
+    if abs(s) > limits.max_scale_factor_error + 3.0 * deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
-                          f'{100 * limits.scale_factor_error:.0f} %: check the sensitivity and '
+                          f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '
+                          'and '
                           "at the profile's unit")
-    if abs(b) > limits.bias:
+    if abs(b) > limits.max_bias:
         raise DataRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.bias / DEGREE:g} deg/s: do not turn the robot by hand')
-    if deviation > limits.scale_standard_deviation:
+                          f'{limits.max_bias / DEGREE:g} deg/s: do not turn the robot by hand')
+    if deviation > limits.max_scale_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
-                          f'wanted {100 * limits.scale_standard_deviation:g} %: turn further, '
+                          f'wanted {100 * limits.max_scale_deviation:g} %: turn further, '
                           'faster, or more often, '
                           'and check that the profile is the one that was driven')
     # against measured headings the deviations include the noise of mount and encoder
-    unexplained = fit.angle_random_walk * math.sqrt(motion.duration)
-    if (motion.rate is not None and fit.goodness is not None and unexplained > limits.unexplained
-            and fit.goodness.noise_ratio > limits.noise_ratio):
+    unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
+    if (motion.rate is not None and fit.goodness is not None
+            and unexplained_angle > limits.max_unexplained_angle
+            and fit.goodness.noise_ratio > limits.max_noise_ratio):
         raise DataRefused(f'the run is {fit.goodness.noise_ratio:.1f} times as noisy as the model '
-                          f'states, at most {limits.noise_ratio:g} are allowed: fasten the '
+                          f'states, at most {limits.max_noise_ratio:g} are allowed: fasten the '
                           'gyro, stop vibration, or measure the noise again (allan)')
-    refuse_repeating(fit, limits.repeating)
-    refuse_useless(fit, limits.heading)
+    refuse_repeatable_error(fit, limits.max_repeatable_error)
+    refuse_no_improvement(fit, limits.max_heading_error)
 
 
 @dataclass(frozen=True)
@@ -357,11 +371,11 @@ class RestCheck:
     rate: float
     deviation: float
     limit: float
-    fit: Fit
+    fit: ScaleBiasFit
 
 
-def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
-               limits: Limits | None = None, false_refusals: float = 1e-3) -> RestCheck:
+def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None = None,
+               limits: RunLimits | None = None, false_refusal_rate: float = 1e-3) -> RestCheck:
     """
     Check a calibration by a rest after its run, and refuse it if the gyro still drifts.
 
@@ -371,30 +385,32 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
     rate : of the gyro as it went into the fit, rad/s, shape (n,)
     fit : which corrects it
     noise : of the gyro, if it is known; else its white noise is taken from the samples
-    false_refusals : how often a good calibration is refused, if the noise is as given
+    false_refusal_rate : how often a good calibration is refused, if the noise is as given
 
     Raises
     ------
     DataRefused : too few samples, motion, or drift
 
     """
-    limits = limits or Limits()
+    limits = limits or RunLimits()
     duration = float(time[-1] - time[0]) if len(time) > 1 else 0.0
-    if duration < 0.75 * limits.rest or len(time) < 10:
+    if duration < 0.75 * limits.rest_duration or len(time) < 10:
         raise DataRefused(f'after the run {duration:.1f} s of rest came, '
-                          f'wanted {limits.rest:g} s: leave the robot at rest after it')
+                          f'wanted {limits.rest_duration:g} s: leave the robot at rest after it')
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
-    noise, white, mean = noise or Noise(), _deviation_of_mean(corrected), float(corrected.mean())
-    change = _change_at_rest(corrected)
-    variance = rest_variance(noise, duration, white, change)
+    noise, white_deviation, mean = (noise or Noise(), _deviation_of_mean(corrected),
+                                    float(corrected.mean()))
+    half_difference = _half_difference(corrected)
+    variance = rest_variance(noise, duration, white_deviation, half_difference)
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
     scale = 1.0 + fit.scale_factor_error
-    check = RestCheck(mean, deviation,
-                      max(limits.drift, -float(ndtri(0.5 * false_refusals)) * deviation),
-                      _with_rest(fit, scale * mean, scale ** 2 * variance))
-    if change > 2.0 * max(CHANCE * white, _DRIVING):
+    check = RestCheck(
+        mean, deviation,
+        max(limits.max_rest_rate, -float(ndtri(0.5 * false_refusal_rate)) * deviation),
+        _update_with_rest(fit, scale * mean, scale ** 2 * variance))
+    if half_difference > 2.0 * max(MAX_NOISE_SIGMAS * white_deviation, _MIN_DRIVING_RATE_CHANGE):
         raise DataRefused('after the run the robot still moved, its rate changed by '
-                          f'{change / DEGREE:.2f} deg/s: leave it at rest after the run')
+                          f'{half_difference / DEGREE:.2f} deg/s: leave it at rest after the run')
     if abs(check.rate) > check.limit:
         raise DataRefused('after the run, at rest, the corrected rate is '
                           f'{check.rate / DEGREE:.4f} deg/s, at most '
@@ -403,7 +419,8 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
     return check
 
 
-def rest_variance(noise: Noise, duration: float, white: float, change: float) -> float:
+def rest_variance(noise: Noise, duration: float, white_deviation: float,
+                  half_difference: float) -> float:
     """
     Return the variance of a mean at rest about the bias, (rad/s)².
 
@@ -412,24 +429,24 @@ def rest_variance(noise: Noise, duration: float, white: float, change: float) ->
     Parameters
     ----------
     duration : of the rest, s
-    white : standard deviation of the mean by the white noise of the samples, rad/s
-    change : by how much the means of both halves differ, rad/s
+    white_deviation : standard deviation of the mean by the white noise of the samples, rad/s
+    half_difference : by how much the means of both halves differ, rad/s
 
     """
-    return (max(white, noise.angle_random_walk / math.sqrt(duration)) ** 2
-            + float(noise.wander(duration, duration)) + 0.25 * change ** 2)
+    return (max(white_deviation, noise.angle_random_walk / math.sqrt(duration)) ** 2
+            + float(noise.mean_change_variance(duration, duration)) + 0.25 * half_difference ** 2)
 
 
-def _with_rest(fit: Fit, rate: float, variance: float) -> Fit:
-    """Return the fit with its bias updated by a rest after its run, as in `combined_rest`."""
+def _update_with_rest(fit: ScaleBiasFit, rate: float, variance: float) -> ScaleBiasFit:
+    """Return the fit with its bias updated by a rest after its run, as in `combine_with_rest`."""
     if not np.isfinite(fit.covariance).all():
         return fit
-    gain, covariance = combined_rest(fit.covariance, rate, variance)
+    gain, covariance = combine_with_rest(fit.covariance, rate, variance)
     s, b = (gain * rate + (fit.scale_factor_error, fit.bias)).tolist()
     return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
 
 
-def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Array, Array]:
+def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[Array, Array]:
     """
     Combine a run with the rest after it.
 
@@ -448,26 +465,27 @@ def combined_rest(covariance: Array, rate: float, variance: float) -> tuple[Arra
     derivatives of s and b by that rate, shape (2,), and their covariance, shape (2, 2)
 
     """
-    stated, run = covariance[1, 1], covariance[:, 1]
+    stated_variance, run = covariance[1, 1], covariance[:, 1]
     ratios = np.append(0.0, np.tan(0.5 * math.pi * (np.arange(100) + 0.5) / 100))
-    total = (1.0 + ratios ** 2) * stated + variance
+    total = (1.0 + ratios ** 2) * stated_variance + variance
     weights = np.exp(-0.5 * rate ** 2 / total) / np.sqrt(total)
     weights[1:] /= len(weights) - 1
     weights /= weights.sum()
-    shared = run + np.outer(ratios ** 2 * stated, (0.0, 1.0))
+    shared = run + np.outer(ratios ** 2 * stated_variance, (0.0, 1.0))
     gains = shared / total[:, None]
     # the form of Joseph, which rounding does not make negative
     kept = np.eye(2) - np.einsum('ki,j->kij', gains, (0.0, 1.0))
-    priors = covariance + np.einsum('k,ij->kij', ratios ** 2 * stated, np.diag([0.0, 1.0]))
+    priors = (covariance
+              + np.einsum('k,ij->kij', ratios ** 2 * stated_variance, np.diag([0.0, 1.0])))
     within = (np.einsum('k,kia,kab,kjb->ij', weights, kept, priors, kept)
               + variance * (weights[:, None] * gains).T @ gains)
     return weights @ gains, within + rate ** 2 * np.cov(gains.T, aweights=weights, ddof=0)
 
 
-def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
-               limits: Limits | None = None) -> slice | None:
+def find_rest_after(time: Array, rate: Array, fit: ScaleBiasFit, motion: Motion,
+                    limits: RunLimits | None = None) -> slice | None:
     """
-    Return the samples of the rest after a run, from `SETTLED` s after the motion on.
+    Return the samples of the rest after a run, from `SETTLING_TIME` s after the motion on.
 
     It begins later, by up to its length in the limits, where the robot still moves then, as after
     an overshoot. It lasts until the robot moves, at most as long as the motion did. None where
@@ -479,32 +497,34 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
     rate : of the gyro as it went into the fit, rad/s, shape (n,)
 
     """
-    limits = limits or Limits()
-    begin = motion.duration + max(fit.time_offset, 0.0) + SETTLED
-    latest = max(min(float(time[-1]) - limits.rest, begin + motion.duration), begin)
+    limits = limits or RunLimits()
+    begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
+    latest = max(min(float(time[-1]) - limits.rest_duration, begin + motion.duration), begin)
     begins = np.arange(begin, latest + 1e-9, 0.25)
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
-    windows = [slice(*np.searchsorted(time, [each, each + limits.rest]).tolist())
+    windows = [slice(*np.searchsorted(time, [each, each + limits.rest_duration]).tolist())
                for each in begins]
-    if windows[0].stop - windows[0].start < 10 or time[-1] < begin + 0.9 * limits.rest:
+    if windows[0].stop - windows[0].start < 10 or time[-1] < begin + 0.9 * limits.rest_duration:
         return None
     # the standard deviation of a difference of halves is twice that of the mean
-    sizes = np.array([_change_at_rest(corrected[each])
-                      / max(2.0 * _deviation_of_mean(corrected[each]), 1e-300)
-                      for each in windows])
-    late = np.flatnonzero(begins <= begin + limits.rest)
-    first = next((each for each in late.tolist() if sizes[each] < 2.0), int(late[-1]))
+    relative_changes = np.array([_half_difference(corrected[each])
+                                 / max(2.0 * _deviation_of_mean(corrected[each]), 1e-300)
+                                 for each in windows])
+    allowed_starts = np.flatnonzero(begins <= begin + limits.rest_duration)
+    first = next((each for each in allowed_starts.tolist() if relative_changes[each] < 2.0),
+                 int(allowed_starts[-1]))
     means = np.array([part.mean() for part in np.array_split(corrected[windows[first]], 4)])
-    apart = max(CHANCE * 2.0 * _deviation_of_mean(corrected[windows[first]]), _DRIVING)
+    max_rate_change = max(MAX_NOISE_SIGMAS * 2.0 * _deviation_of_mean(corrected[windows[first]]),
+                          _MIN_DRIVING_RATE_CHANGE)
     # a slow and steady turn is no drive: the fit took it as a bias
-    if abs(means.mean()) > limits.bias or np.ptp(means) > 2.0 * apart:
+    if abs(means.mean()) > limits.max_bias or np.ptp(means) > 2.0 * max_rate_change:
         return None
-    moving = first + 1 + np.flatnonzero(sizes[first + 1:] > 4.0)
+    moving = first + 1 + np.flatnonzero(relative_changes[first + 1:] > 4.0)
     last = windows[int(moving[0])].start if len(moving) else windows[-1].stop
     return slice(windows[first].start, max(last, windows[first].stop))
 
 
-def _change_at_rest(rate: Array) -> float:
+def _half_difference(rate: Array) -> float:
     """Return the difference between the means of the halves of a rest, rad/s."""
     begun, ended = (float(half.mean()) for half in np.array_split(rate, 2))
     return abs(ended - begun)
@@ -512,15 +532,15 @@ def _change_at_rest(rate: Array) -> float:
 
 #: Time after the profile at which a robot is at rest, s; change of the rate within a rest above
 #: which the robot is driving, rad/s.
-SETTLED, _DRIVING = 1.0, 0.25 * DEGREE
+SETTLING_TIME, _MIN_DRIVING_RATE_CHANGE = 1.0, 0.25 * DEGREE
 
 
 def _deviation_of_mean(rate: Array) -> float:
     """Return the standard deviation of a mean at rest by white noise, rad/s."""
-    return white_noise(rate, 1) / math.sqrt(len(rate))
+    return white_noise_deviation(rate, 1) / math.sqrt(len(rate))
 
 
-def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None,
+def calibrate_bias(time: Array, rate: Array, limits: RunLimits | None = None,
                    noise: Noise | None = None, output: Array | None = None) -> tuple[float, float]:
     """
     Return the bias of a gyro at rest and its standard deviation, rad/s.
@@ -540,7 +560,7 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None,
     DataRefused : too few samples, a dead gyro, motion, or a mean that is no bias
 
     """
-    limits = limits or Limits()
+    limits = limits or RunLimits()
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     parts = np.array_split(rate, 10)
@@ -552,27 +572,30 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None,
     changes = np.abs(np.concatenate([blocks - np.median(blocks),
                                      (sums[-1] - sums[:-1]) / last - sums[:-1] / first]))
     deviations = within * np.sqrt(np.concatenate([np.ones(10), 1.0 / first + 1.0 / last]))
-    beyond = changes[changes > np.maximum(CHANCE * deviations, 0.05 * DEGREE)]
-    if len(beyond):
-        raise DataRefused(f'the gyro was moved: its mean changed by {beyond.max() / DEGREE:.2f} '
+    significant_changes = (changes[changes > np.maximum(MAX_NOISE_SIGMAS * deviations, 0.05
+                                                        * DEGREE)])
+    if len(significant_changes):
+        raise DataRefused('the gyro was moved: its mean changed by '
+                          f'{significant_changes.max() / DEGREE:.2f} '
                           'deg/s within the rest; keep it still and run again')
     noise = noise or Noise()
     # the standard deviation of ten blocks may by chance be half of the true one
-    white = max(blocks.var(ddof=1) / 10.0,
-                noise.angle_random_walk ** 2 / float(time[-1] - time[0]))
+    mean_variance = max(blocks.var(ddof=1) / 10.0,
+                        noise.angle_random_walk ** 2 / float(time[-1] - time[0]))
     bias = float(rate.mean())
-    if abs(bias) > limits.bias:
+    if abs(bias) > limits.max_bias:
         raise DataRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.bias / DEGREE:g} deg/s: the gyro turns, or is broken')
+                          f'{limits.max_bias / DEGREE:g} deg/s: the gyro turns, or is broken')
     expected = math.sqrt(noise.rate_variance(float(np.median(np.diff(time)))))
     if expected and rate.std() > 3.0 * expected:
         raise DataRefused(f'the rate varies by {rate.std() / DEGREE:.2f} deg/s where rest gives '
                           f'{expected / DEGREE:.2f} deg/s: '
                           'stop the robot and its motors, and run again')
-    return bias, math.sqrt(white + noise.floor ** 2)
+    return bias, math.sqrt(mean_variance + noise.allan_floor ** 2)
 
 
-def record(fit: Fit, method: str, time: str, temperature: float | None) -> SelfCalibration:
+def to_model_record(fit: ScaleBiasFit, method: str, time: str,
+                    temperature: float | None) -> SelfCalibration:
     """Return the record of a fit that a model keeps."""
     (a, b), (_, c) = fit.covariance.tolist()
     covariance = None if math.isnan(a) else ((a, b), (b, c))

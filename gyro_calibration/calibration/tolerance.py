@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 import math
 
 from gyro_calibration.calibration.dwells import Dwells
-from gyro_calibration.calibration.scatter import SMALLEST_TEMPERATURE_SPREAD, Whitener
+from gyro_calibration.calibration.scatter import MIN_TEMPERATURE_SPREAD, Whitener
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.gyro_model import Tolerance
@@ -34,14 +34,15 @@ import numpy as np
 #: Standard deviations between gyros, by data sheets: the change of the bias with temperature,
 #: rad/s/K (L3G4200D: 0.03 deg/s/K), that of the scale factor, 1/K (L3G4200D: 2 % over 60 K), and
 #: the nonlinearity at the fastest rate that is not fitted, 1 (L3G4200D: 0.2 %).
-BIAS_SLOPE, SCALE_SLOPE, NONLINEARITY = Prior().coefficient, 3e-4, 2e-3
+BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, NONLINEARITY_DEVIATION = (
+    Prior().coefficient, 3e-4, 2e-3)
 
 #: dwells at rates, rad/s, and temperatures, degC -> change of the output for each value, (n, m)
-Columns = Callable[[Array, Array], Array]
+ColumnFunction = Callable[[Array, Array], Array]
 
 
-def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Columns,
-                 covariance: Array) -> Tolerance:
+def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
+                       columns: ColumnFunction, covariance: Array) -> Tolerance:
     """
     Return the error of a rate that the covariance of the values does not contain.
 
@@ -53,56 +54,59 @@ def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Col
     ----------
     dwells : that were fitted
     whitener : of their scatter
-    sweeps : scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,)
+    sweep_scatter : scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,)
     columns : of the values
     covariance : of the values, shape (m, m)
 
     """
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
-    known = dwells.temperature is not None
-    temperature = (np.asarray(dwells.temperature) if known else np.zeros(len(dwells)))
+    has_temperature = dwells.temperature is not None
+    temperature = (np.asarray(dwells.temperature) if has_temperature else np.zeros(len(dwells)))
     low, high = float(temperature.min()), float(temperature.max())
     middle = 0.5 * (low + high)
-    half = max(0.5 * (high - low), 0.5 * SMALLEST_TEMPERATURE_SPREAD)
+    half_width = max(0.5 * (high - low), 0.5 * MIN_TEMPERATURE_SPREAD)
 
-    first = 0 if known else 4
+    first = 0 if has_temperature else 4
 
-    def larger(rate: Array, warm: Array) -> Array:
+    def extended_columns(rate: Array, warm: Array) -> Array:
         return np.column_stack([columns(rate, warm),
-                                _more(rate / fastest, warm - middle)[:, first:]])
+                                _unfitted_columns(rate / fastest, warm - middle)[:, first:]])
 
-    spread = np.array([*[math.inf] * len(covariance), *_priors(fastest)[first:]])
-    white = whitener.whiten(larger(dwells.rate, temperature))
+    prior_deviation = np.array(
+        [*[math.inf] * len(covariance), *_unfitted_deviations(fastest)[first:]])
+    white = whitener.whiten(extended_columns(dwells.rate, temperature))
     lengths = np.linalg.norm(white, axis=0)
     lengths = np.where(lengths > 0.0, lengths, 1.0)
-    gram = (white / lengths).T @ (white / lengths) + np.diag((spread * lengths) ** -2.0)
+    gram = (white / lengths).T @ (white / lengths) + np.diag((prior_deviation * lengths) ** -2.0)
     inverse = np.linalg.pinv(gram, hermitian=True)
 
-    def more(rate: Array, warm: Array) -> Array:
+    def excess_variance(rate: Array, warm: Array) -> Array:
         """Return the variance of the larger fit less that of the values, (rad/s)²."""
-        wide, row = larger(rate, warm) / lengths, columns(rate, warm)
+        wide, row = extended_columns(rate, warm) / lengths, columns(rate, warm)
         return np.maximum(((wide @ inverse) * wide).sum(axis=1)
                           - ((row @ covariance) * row).sum(axis=1), 0.0)
 
-    ends, sides = np.array([low - half, high + half]), np.array([-1.0, 1.0])
-    at_rest = more(np.zeros(2), ends).max()
-    turning = more(fastest * np.repeat(sides, 2), np.tile(ends, 2)).max()
-    faster = more(1.5 * fastest * sides, np.full(2, middle)).max()
-    unfitted = more(dwells.rate, temperature).mean()
-    return Tolerance(math.sqrt(sweeps[0] ** 2 + unfitted), float(sweeps[1]),
-                     math.sqrt(at_rest) / half,
-                     math.sqrt(max(turning - at_rest, 0.0)) / half / fastest,
+    ends, sides = np.array([low - half_width, high + half_width]), np.array([-1.0, 1.0])
+    at_rest = excess_variance(np.zeros(2), ends).max()
+    turning = excess_variance(fastest * np.repeat(sides, 2), np.tile(ends, 2)).max()
+    faster = excess_variance(1.5 * fastest * sides, np.full(2, middle)).max()
+    unfitted = excess_variance(dwells.rate, temperature).mean()
+    return Tolerance(math.sqrt(sweep_scatter[0] ** 2 + unfitted), float(sweep_scatter[1]),
+                     math.sqrt(at_rest) / half_width,
+                     math.sqrt(max(turning - at_rest, 0.0)) / half_width / fastest,
                      math.sqrt(faster) / (0.5 * fastest))
 
 
-def _more(speed: Array, warmer: Array) -> Array:
+def _unfitted_columns(relative_rate: Array, temperature_offset: Array) -> Array:
     """Return slopes and curves over temperature, and powers of the rate, shape (n, 6)."""
-    return np.column_stack([warmer, warmer ** 2, warmer * speed, warmer ** 2 * speed, speed ** 2,
-                            speed ** 3])
+    return np.column_stack([
+        temperature_offset, temperature_offset ** 2, temperature_offset * relative_rate,
+        temperature_offset ** 2 * relative_rate, relative_rate ** 2, relative_rate ** 3
+    ])
 
 
-def _priors(fastest: float) -> Sequence[float]:
-    """Return the standard deviations of the coefficients of `_more`."""
-    curve = 0.5 / Prior().length  # a slope changes by its own size over this length
-    return (BIAS_SLOPE, BIAS_SLOPE * curve, SCALE_SLOPE * fastest, SCALE_SLOPE * fastest * curve,
-            *[NONLINEARITY * fastest] * 2)
+def _unfitted_deviations(fastest: float) -> Sequence[float]:
+    """Return the standard deviations of the coefficients of `_unfitted_columns`."""
+    curve = 0.5 / Prior().correlation_length  # a slope changes by its own size over this length
+    return (BIAS_SLOPE_DEVIATION, BIAS_SLOPE_DEVIATION * curve, SCALE_SLOPE_DEVIATION * fastest,
+            SCALE_SLOPE_DEVIATION * fastest * curve, *[NONLINEARITY_DEVIATION * fastest] * 2)

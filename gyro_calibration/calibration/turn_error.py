@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, Numbers, take
+from gyro_calibration.calibration.dwells import Dwells, Numbers, select_dwells
 from gyro_calibration.calibration.rate_table import Calibration, fit_effects
 from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.calibration.self_calibration import refuse_scale
@@ -31,9 +31,9 @@ from gyro_calibration.model.compensation import compensate
 import numpy as np
 
 #: rad/s; the error of slower turns is mostly bias, not scale; as published.
-SLOWEST = 5.0 * DEGREE
+MIN_TURN_RATE = 5.0 * DEGREE
 #: A dwell that turns slower than this is a rest.
-AT_REST = 0.1 * DEGREE
+MAX_REST_RATE = 0.1 * DEGREE
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class TurnErrors:
     static : with the static bias only, rad per turn
     modelled : with the model, and the static bias after it, rad per turn
     sweep : that the turn was measured in
-    place : of each turn in its file
+    location : of each turn in its file
     remarks : on the source of the static bias, and on turns without an error, one sentence each
 
     """
@@ -58,14 +58,15 @@ class TurnErrors:
     static: Array
     modelled: Array
     sweep: Numbers
-    place: tuple[str, ...]
+    location: tuple[str, ...]
     remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rate)
 
 
-def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnErrors:
+def compute_turn_errors(dwells: Dwells, rate: Array,
+                        min_rate: float = MIN_TURN_RATE) -> TurnErrors:
     """
     Return the errors of full turns at the rates and temperatures of some dwells.
 
@@ -73,8 +74,8 @@ def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnEr
     ----------
     dwells : without those that are outlying
     rate : of each dwell by the model (eq. 13), rad/s, shape (n,); nan where there is none, as from
-        `predicted_rates`
-    slowest : of a turn, rad/s
+        `predict_left_out_rates`
+    min_rate : of a turn, rad/s
 
     Raises
     ------
@@ -83,38 +84,41 @@ def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnEr
 
     """
     known = np.isfinite(rate)
-    lost = int(np.count_nonzero(~known & (np.abs(dwells.rate) >= slowest)))
-    dwells, rate = take(dwells, known), rate[known]
-    wanted = np.abs(dwells.rate) >= slowest
+    lost = int(np.count_nonzero(~known & (np.abs(dwells.rate) >= min_rate)))
+    dwells, rate = select_dwells(dwells, known), rate[known]
+    wanted = np.abs(dwells.rate) >= min_rate
     if not wanted.any():
-        raise DataRefused(f'none of {len(known)} dwells turns at {slowest / DEGREE:g} deg/s or '
+        raise DataRefused(f'none of {len(known)} dwells turns at {min_rate / DEGREE:g} deg/s or '
                           'faster and has a rate by the model; '
                           'record faster turns, or several sweeps')
-    turns = take(dwells, wanted)
+    turns = select_dwells(dwells, wanted)
     scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
     refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
-    rests, remark = _rests(dwells)
-    nearest = [_nearest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()]
+    rests, remark = _find_rests(dwells)
+    nearest = [
+        _find_nearest_rest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()
+    ]
     # eq. 1 and 2, and eq. 13, 15 and 16
-    static, modelled = (_turned(dwells, error, wanted, nearest)
+    static, modelled = (_error_per_turn(dwells, error, wanted, nearest)
                         for error in (dwells.output - dwells.rate, rate - dwells.rate))
     remarks = [remark]
     if lost:
         remarks.append(f'{lost} turns are left out: the other sweeps do not determine the model')
-    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place,
+    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.location,
                       tuple(remarks))
 
 
-def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) -> Array:
+def _error_per_turn(dwells: Dwells, error: Array, is_turn: Mask,
+                    nearest: list[_SweepRest]) -> Array:
     """Return the integral over a turn of errors of a rate, less those at rest, rad (eq. 14)."""
-    bias = np.array([rest.bias(error) for rest in nearest])
-    return (error[wanted] - bias) * 2.0 * math.pi / np.abs(dwells.rate[wanted])
+    bias = np.array([rest.weighted_error(error) for rest in nearest])
+    return (error[is_turn] - bias) * 2.0 * math.pi / np.abs(dwells.rate[is_turn])
 
 
 # static bias
 
 @dataclass(frozen=True)
-class _Rest:
+class _SweepRest:
     """The dwells of a sweep that determine the static bias, and their weights, shape (k,)."""
 
     sweep: int
@@ -122,16 +126,16 @@ class _Rest:
     dwells: Numbers
     weights: Array
 
-    def bias(self, error: Array) -> float:
+    def weighted_error(self, error: Array) -> float:
         """Return the error at rest, rad/s, from that of all dwells, shape (n,)."""
         return float(self.weights @ error[self.dwells])
 
 
-def _rests(dwells: Dwells) -> tuple[list[_Rest], str]:
+def _find_rests(dwells: Dwells) -> tuple[list[_SweepRest], str]:
     """Return the rests of the sweeps, or where there is none the slowest turns both ways."""
     numbers = np.unique(dwells.sweep)
-    for find, words in ((_at_rest, 'the static bias is from the rest of each sweep'),
-                        (_between_turns, 'no rest; the static bias is the error between the '
+    for find, words in ((_find_standstill, 'the static bias is from the rest of each sweep'),
+                        (_find_slowest_turns, 'no rest; the static bias is the error between the '
                          'slowest turns both ways of each sweep')):
         found = [rest for number in numbers if (rest := find(dwells, int(number))) is not None]
         if found:
@@ -143,38 +147,38 @@ def _rests(dwells: Dwells) -> tuple[list[_Rest], str]:
                       'shows the static bias; record a rest before each sweep')
 
 
-def _at_rest(dwells: Dwells, number: int) -> _Rest | None:
+def _find_standstill(dwells: Dwells, number: int) -> _SweepRest | None:
     """Return the rests of a sweep (eq. 1)."""
-    rows = np.flatnonzero((dwells.sweep == number) & (np.abs(dwells.rate) <= AT_REST))
-    return _rest(dwells, number, rows, np.full(len(rows), 1.0)) if len(rows) else None
+    rows = np.flatnonzero((dwells.sweep == number) & (np.abs(dwells.rate) <= MAX_REST_RATE))
+    return _make_sweep_rest(dwells, number, rows, np.full(len(rows), 1.0)) if len(rows) else None
 
 
-def _between_turns(dwells: Dwells, number: int) -> _Rest | None:
+def _find_slowest_turns(dwells: Dwells, number: int) -> _SweepRest | None:
     """Return the slowest turn each way of a sweep; the bias is interpolated between them."""
     ways = [np.flatnonzero((dwells.sweep == number) & (way * dwells.rate > 0.0))
             for way in (1.0, -1.0)]
     if not all(map(len, ways)):
         return None
     rows = np.array([rows[np.argmin(np.abs(dwells.rate[rows]))] for rows in ways])
-    return _rest(dwells, number, rows, np.abs(dwells.rate[rows[::-1]]))
+    return _make_sweep_rest(dwells, number, rows, np.abs(dwells.rate[rows[::-1]]))
 
 
-def _rest(dwells: Dwells, number: int, rows: Numbers, weights: Array) -> _Rest:
+def _make_sweep_rest(dwells: Dwells, number: int, rows: Numbers, weights: Array) -> _SweepRest:
     temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[rows].mean())
-    return _Rest(number, temperature, rows, weights / weights.sum())
+    return _SweepRest(number, temperature, rows, weights / weights.sum())
 
 
-def _nearest(dwells: Dwells, place: int, rests: list[_Rest]) -> _Rest:
+def _find_nearest_rest(dwells: Dwells, index: int, rests: list[_SweepRest]) -> _SweepRest:
     """Return the rest of a dwell's sweep, or else the nearest in temperature, then in order."""
-    sweep = int(dwells.sweep[place])
-    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[place])
+    sweep = int(dwells.sweep[index])
+    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[index])
     return min(rests, key=lambda rest: (
         rest.sweep != sweep, abs(rest.temperature - temperature), abs(rest.sweep - sweep)))
 
 
 # rates by a model
 
-def predicted_rates(calibration: Calibration) -> Array:
+def predict_left_out_rates(calibration: Calibration) -> Array:
     """
     Return the rate of each dwell by a model not fitted to its sweep, rad/s, shape (n,).
 
@@ -186,19 +190,20 @@ def predicted_rates(calibration: Calibration) -> Array:
     dwells, rates = calibration.dwells, np.full(len(calibration.dwells), np.nan)
     groups = dwells.sweep if len(np.unique(dwells.sweep)) > 1 else np.arange(len(dwells))
     for number in np.unique(groups):
-        hidden = groups == number
-        scatter = replace(calibration.scatter, kept=calibration.scatter.kept[~hidden])
+        is_left_out = groups == number
+        scatter = replace(calibration.scatter, inliers=calibration.scatter.inliers[~is_left_out])
         try:
-            model = fit_effects(take(dwells, ~hidden), calibration.effects, scatter).model
+            model = (fit_effects(select_dwells(dwells, ~is_left_out), calibration.effects,
+                                 scatter).model)
         except DataRefused:
             continue
-        left_out = take(dwells, hidden)
-        rates[hidden] = compensate(model, left_out.output, left_out.temperature).rate
+        left_out = select_dwells(dwells, is_left_out)
+        rates[is_left_out] = compensate(model, left_out.output, left_out.temperature).rate
     return rates
 
 
 @dataclass(frozen=True)
-class Size:
+class ErrorSummary:
     """Root mean square and largest absolute value of errors, rad per turn, and their count."""
 
     rms: float
@@ -206,6 +211,6 @@ class Size:
     count: int
 
 
-def size(errors: Array) -> Size:
+def summarize_errors(errors: Array) -> ErrorSummary:
     """Return how large some errors are, shape (n,) with n above 0."""
-    return Size(rms(errors), float(np.abs(errors).max()), len(errors))
+    return ErrorSummary(rms(errors), float(np.abs(errors).max()), len(errors))

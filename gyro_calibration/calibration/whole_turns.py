@@ -21,36 +21,36 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.calibration.likelihood import CHANCE, Fit
-from gyro_calibration.calibration.run_faults import unit_error
-from gyro_calibration.calibration.self_calibration import Limits, refuse_samples, refuse_scale
+from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS, ScaleBiasFit
+from gyro_calibration.calibration.run_faults import describe_unit_error
+from gyro_calibration.calibration.self_calibration import refuse_samples, refuse_scale, RunLimits
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
-from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise
+from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise_deviation
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import ndtri
 
-TURN = 2.0 * math.pi
+FULL_TURN = 2.0 * math.pi
 #: Standard deviation of the heading of a robot put on a mark by hand or eye, rad: two marks a
 #: finger's width apart at half a metre.
-MARKING = 1.0 * DEGREE
+MARK_DEVIATION = 1.0 * DEGREE
 #: Shortest rest, s, and the time at its end that is left out while the robot stops or starts, s.
-REST, _SETTLING = 1.0, 0.25
+MIN_REST_DURATION, _REST_MARGIN = 1.0, 0.25
 #: Length of the means that separate rest from motion, s, and the smallest deviation that is
 #: motion for any noise of the gyro, rad/s.
-_PART, _MOVING = 0.25, 0.5 * DEGREE
+_PART_DURATION, _MIN_MOVING_RATE = 0.25, 0.5 * DEGREE
 #: Largest difference between the angle and the number of turns, in turns; half a turn would be as
 #: near to the next number.
-AMBIGUOUS = 0.35
+MAX_COUNT_ERROR = 0.35
 #: Scale factor error up to which the turns are counted by the gyro itself, 1.
-COUNTED = 0.05
+MAX_COUNTING_SCALE_ERROR = 0.05
 #: Probability of refusing two rests of equal bias as different.
-_FALSE_REFUSALS = 1e-4
+_FALSE_REFUSAL_RATE = 1e-4
 
 
 @dataclass(frozen=True)
-class Turns:
+class TurnCalibration:
     """
     The result of a calibration by whole turns.
 
@@ -59,25 +59,26 @@ class Turns:
     fit : s and b with their covariance
     turns : number, counter-clockwise positive
     duration : from rest to rest, s
-    rests : durations of the rests at both ends, s
+    rest_durations : durations of the rests at both ends, s
 
     """
 
-    fit: Fit
+    fit: ScaleBiasFit
     turns: int
     duration: float
-    rests: tuple[float, float]
+    rest_durations: tuple[float, float]
 
 
 def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
-                    limits: Limits | None = None, noise: Noise | None = None,
-                    marking: float = MARKING, output: Array | None = None) -> Turns:
+                    limits: RunLimits | None = None, noise: Noise | None = None,
+                    mark_deviation: float = MARK_DEVIATION,
+                    output: Array | None = None) -> TurnCalibration:
     """
     Find scale factor error and bias from whole turns between two rests on one mark.
 
     The rates of the turns do not matter, only the net number of turns. The number is accepted only
-    where the gyro agrees to less than `AMBIGUOUS` of a turn; so a gyro with a large scale factor
-    error needs few turns.
+    where the gyro agrees to less than `MAX_COUNT_ERROR` of a turn; so a gyro with a large scale
+    factor error needs few turns.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
         factor error up to `COUNTED`
     noise : of the gyro, if it is known; the standard deviations include the wander of the bias
-    marking : standard deviation of the angle between the two rests on the mark, rad
+    mark_deviation : standard deviation of the angle between the two rests on the mark, rad
     output : of the gyro before its model, where that differs, shape (n,)
 
     Raises
@@ -94,87 +95,94 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     DataRefused : with the reason and the remedy
 
     """
-    limits, noise = limits or Limits(), noise or Noise()
+    limits, noise = limits or RunLimits(), noise or Noise()
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)
     # N², rad²/s: by differences between neighbours, and at least the known one
-    white = max(white_noise(rate) ** 2 * float(np.median(np.diff(time))),
-                noise.angle_random_walk ** 2)
-    begin, end = _motion(time, rate, white)
-    rests = float(begin - time[0]), float(time[-1] - end)
+    white_density = max(white_noise_deviation(rate) ** 2 * float(np.median(np.diff(time))),
+                        noise.angle_random_walk ** 2)
+    begin, end = _find_turns(time, rate, white_density)
+    rest_durations = float(begin - time[0]), float(time[-1] - end)
     first, last = float(rate[time <= begin].mean()), float(rate[time >= end].mean())
     duration = end - begin
-    wander = noise.wander(duration, min(rests))
-    of_both = white / rests[0] + white / rests[1]
-    bias, variance = 0.5 * (first + last), 0.25 * of_both + 0.5 * wander
-    _refuse_bias(last - first, math.sqrt(of_both + wander), bias, limits)
+    wander_variance = noise.mean_change_variance(duration, min(rest_durations))
+    difference_variance = white_density / rest_durations[0] + white_density / rest_durations[1]
+    bias, variance = 0.5 * (first + last), 0.25 * difference_variance + 0.5 * wander_variance
+    _refuse_bias(last - first, math.sqrt(difference_variance + wander_variance), bias, limits)
     integral = np.interp((begin, end), time, integrate(time, rate))
-    turned = float(integral[1] - integral[0]) - bias * duration
-    count = _counted(turned / TURN, turns, limits)
-    scale = turned / (count * TURN)
-    if abs(scale - 1.0) > limits.scale_factor_error:
+    gyro_angle = float(integral[1] - integral[0]) - bias * duration
+    count = _count_turns(gyro_angle / FULL_TURN, turns, limits)
+    scale = gyro_angle / (count * FULL_TURN)
+    if abs(scale - 1.0) > limits.max_scale_factor_error:
         raise DataRefused(
             f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
-            f'{100 * limits.scale_factor_error:.0f} %: count the turns again, and look at the '
+            f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, and look at the '
             'sensitivity')
-    of_turned = white * duration + variance * duration ** 2 + (scale * marking) ** 2
-    shared = -variance * duration / (count * TURN)
-    covariance = np.array([[of_turned / (count * TURN) ** 2, shared], [shared, variance]])
-    return Turns(Fit(scale - 1.0, bias, covariance), count, duration, rests)
+    angle_variance = (white_density * duration + variance * duration ** 2 +
+                      (scale * mark_deviation) ** 2)
+    shared = -variance * duration / (count * FULL_TURN)
+    covariance = np.array([[angle_variance / (count * FULL_TURN) ** 2, shared],
+                           [shared, variance]])
+    return TurnCalibration(ScaleBiasFit(scale - 1.0, bias, covariance), count, duration,
+                           rest_durations)
 
 
-def _motion(time: Array, rate: Array, white: float) -> tuple[float, float]:
+def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, float]:
     """Return the times at which the turns begin and end, s, after and before the rests."""
-    part = ((time - time[0]) / _PART).astype(int)
+    part = ((time - time[0]) / _PART_DURATION).astype(int)
     means = np.bincount(part, rate) / np.maximum(np.bincount(part), 1)
-    limit = max(CHANCE * math.sqrt(white / _PART), _MOVING)
+    limit = max(MAX_NOISE_SIGMAS * math.sqrt(white_density / _PART_DURATION), _MIN_MOVING_RATE)
     lengths = []
     for name, values in (('before', means), ('after', means[:-1][::-1])):
         # number of means, from the first on, whose differences are within the noise
         middle = np.array([np.median(values[:end]) for end in range(1, len(values) + 1)])
         steady = int(np.argmax(np.append(np.abs(values - middle) > limit, True)))
-        lengths.append(steady * _PART - _SETTLING)
-        if lengths[-1] < REST:
+        lengths.append(steady * _PART_DURATION - _REST_MARGIN)
+        if lengths[-1] < MIN_REST_DURATION:
             raise DataRefused(
                 f'the robot rests for {max(lengths[-1], 0.0):.1f} s {name} the turns, wanted '
-                f'{REST:g} s at least: leave it at rest on the mark, and record until after that')
-    if sum(lengths) >= time[-1] - time[0] - 2.0 * _SETTLING:
+                f'{MIN_REST_DURATION:g} s at least: leave it at rest on the mark, and record '
+                'until after that')
+    if sum(lengths) >= time[-1] - time[0] - 2.0 * _REST_MARGIN:
         raise DataRefused('the gyro rests all the time: did the robot turn, '
                           'and does the gyro respond?')
     return float(time[0] + lengths[0]), float(time[-1] - lengths[1])
 
 
-def _refuse_bias(difference: float, expected: float, bias: float, limits: Limits) -> None:
-    """Refuse rests that differ significantly (`expected` is 1 sigma), or a large bias, rad/s."""
-    if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSALS)) * expected, limits.drift):
+def _refuse_bias(difference: float, deviation: float, bias: float, limits: RunLimits) -> None:
+    """Refuse rests that differ significantly (`deviation` is 1 sigma), or a large bias, rad/s."""
+    if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSAL_RATE)) * deviation,
+                             limits.max_rest_rate):
         raise DataRefused(
             f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
-            f'{abs(difference) / expected:.1f} standard deviations: the robot did not rest at '
+            f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
             'both ends, or the gyro still warms up; wait, and run again')
-    if abs(bias) > limits.bias:
+    if abs(bias) > limits.max_bias:
         raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.bias / DEGREE:g} deg/s: did the robot rest at both ends?')
+                          f'{limits.max_bias / DEGREE:g} deg/s: did the robot rest at both ends?')
 
 
-def _counted(measured: float, turns: int | None, limits: Limits) -> int:
+def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
     """Return the number of turns, or refuse an angle that is no whole number of turns."""
     count = round(measured) if turns is None else turns
     if not count:
         raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
                           'turn once at least, all in one direction or nearly so')
-    if turns is None and COUNTED * (2 * abs(count) + 1) > 1.0:
+    if turns is None and MAX_COUNTING_SCALE_ERROR * (2 * abs(count) + 1) > 1.0:
         raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
-                          f'off by {100 * COUNTED:g} %: give the number of turns')
+                          f'off by {100 * MAX_COUNTING_SCALE_ERROR:g} %: give the number of turns')
     if turns is not None:
         # another unit or sign explains the scale; a factor of two may be a wrong count
         scale = measured / turns
-        beyond = abs(scale - 1.0) > limits.scale_factor_error and not 0.4 < abs(scale) < 2.5
-        if beyond and (unit := unit_error(scale, by_profile=False)):
+        is_implausible = (abs(scale - 1.0) > limits.max_scale_factor_error
+                          and not 0.4 < abs(scale) < 2.5)
+        if is_implausible and (unit := describe_unit_error(scale, profile_suspect=False)):
             raise DataRefused(unit)
         refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
                      "else set the driver's parameter invert")
-    if abs(measured - count) > (AMBIGUOUS if turns else COUNTED * abs(count)):
+    if abs(measured - count) > (MAX_COUNT_ERROR if turns else MAX_COUNTING_SCALE_ERROR
+                                * abs(count)):
         given = f', and {turns} were given' if turns else ''
         raise DataRefused(
             f'the gyro counts {measured:.2f} turns{given}, which is not near '

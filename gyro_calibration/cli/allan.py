@@ -19,33 +19,34 @@ from typing import Any
 from gyro_calibration.allan import (
     allan_deviation,
     AllanChart,
-    even_record,
-    Figure,
+    build_rest_record,
     fit_noise,
+    NoiseFigure,
     NoiseFit,
-    Record,
+    RestRecord,
 )
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_allan
-from gyro_calibration.cli.verb import Answer, under_way, UsageError
+from gyro_calibration.cli.verb import Answer, show_progress, UsageError
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 
 #: Symbol -> usual unit, and the factor from SI to it.
-UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE),
-         'K': ('deg/h/√h', 216000.0 / DEGREE), 'Q': ('arcsec', 3600.0 / DEGREE),
-         'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
+DISPLAY_UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE),
+                 'K': ('deg/h/√h', 216000.0 / DEGREE), 'Q': ('arcsec', 3600.0 / DEGREE),
+                 'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'allan', _allan,
-                      'find the noise figures of a gyro in a record at rest, by its Allan '
-                      'deviation', 'rest.csv --rate 100 --picture allan.png --model model.yaml '
-                      '--out model.yaml')
-    verb.add_log(parser)
-    verb.add_picture(parser, 'the chart')
+    parser = verb.add_verb(verbs, 'allan', _allan,
+                           'find the noise figures of a gyro in a record at rest, by its Allan '
+                           'deviation', 'rest.csv --rate 100 --picture allan.png --model '
+                                        'model.yaml '
+                           '--out model.yaml')
+    verb.add_log_options(parser)
+    verb.add_picture_option(parser, 'the chart')
     parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model to add the '
                         'noise figures to; default: a new one')
     parser.add_argument('--out', metavar='MODEL.yaml',
@@ -58,69 +59,72 @@ def _allan(given: argparse.Namespace) -> Answer:
         raise UsageError('--model was given without --out; give the file to write with --out')
     model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
     try:
-        time = verb.time_of(given, log)
-        record = even_record(time, verb.output_of(given, log), log.moving,
-                             log.reference_heading)
-        with under_way('noise figures from the Allan deviation'):
+        time = verb.require_time(given, log)
+        record = build_rest_record(time, verb.require_output(given, log), log.moving,
+                                   log.reference_heading)
+        with show_progress('noise figures from the Allan deviation'):
             chart = allan_deviation(record.rate, record.interval)
             fit = fit_noise(record.rate, record.interval)
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error}') from None
     if given.picture:
-        draw_allan(given.picture, chart, fit, names(fit))
+        draw_allan(given.picture, chart, fit, figure_labels(fit))
     if given.out:
-        write_model(given.out, replace(verb.with_origin(given, model), noise=fit.noise,
+        write_model(given.out, replace(verb.add_origin(given, model), noise=fit.noise,
                                        noise_bounds=fit.noise_bounds))
-    return Answer(lines(record, chart, fit), _data(given, record, chart, fit),
+    return Answer(answer_lines(record, chart, fit), _data(given, record, chart, fit),
                   (given.picture, given.out))
 
 
-def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
+def answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[str]:
     """Return the noise figures as lines for people."""
     lost = int(np.isnan(record.rate).sum())
     return [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
             f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks,
             _floor_line(chart, fit),
-            *(_line(symbol, figure) for symbol, figure in fit.figures.items()),
+            *(_figure_line(symbol, figure) for symbol, figure in fit.figures.items()),
             _fit_line(fit)]
 
 
-def _line(symbol: str, figure: Figure) -> str:
-    unit, factor = UNITS[symbol]
-    name = f'{_words(figure).capitalize()} {symbol}'
+def _figure_line(symbol: str, figure: NoiseFigure) -> str:
+    unit, factor = DISPLAY_UNITS[symbol]
+    name = f'{_figure_name(figure).capitalize()} {symbol}'
     if not figure.value:
         return (f'{name}: not seen; below {figure.upper * factor:.3g} {unit} '
-                f'({figure.upper:.3g} {figure.part.unit}).')
+                f'({figure.upper:.3g} {figure.term.unit}).')
     return (f'{name}: {figure.value * factor:.4g} {unit}, '
             f'95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '
-            f'({figure.value:.4g} {figure.part.unit}, {figure.lower:.4g} to {figure.upper:.4g}).')
+            f'({figure.value:.4g} {figure.term.unit}, {figure.lower:.4g} to {figure.upper:.4g}).')
 
 
-def names(fit: NoiseFit) -> dict[str, str]:
+def figure_labels(fit: NoiseFit) -> dict[str, str]:
     """Return the labels in a chart of the detected figures, by symbol."""
-    return {symbol: f'{_words(figure)} {symbol} = {figure.value * UNITS[symbol][1]:.3g} '
-            f'{UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value}
+    return {
+        symbol: f'{_figure_name(figure)} {symbol} = '
+        f'{figure.value * DISPLAY_UNITS[symbol][1]:.3g} '
+        f'{DISPLAY_UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value
+    }
 
 
-def _words(figure: Figure) -> str:
-    return figure.part.name.replace('_', ' ')
+def _figure_name(figure: NoiseFigure) -> str:
+    return figure.term.name.replace('_', ' ')
 
 
 def _floor_line(chart: AllanChart, fit: NoiseFit) -> str:
-    unit, factor = UNITS['B']
+    unit, factor = DISPLAY_UNITS['B']
     floor = chart.floor
     text = (f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} '
             f'at {floor.time:.4g} s, 95 %: {floor.lower * factor:.4g} '
             f'to {floor.upper * factor:.4g}')
-    if fit.floor_reached:
+    if fit.is_floor_reached:
         return f'{text}.'
     return (f'{text}. The deviation still falls at the end of the chart; record longer to reach '
             'its minimum.')
 
 
 def _fit_line(fit: NoiseFit) -> str:
-    text = f'The figures describe averaging times from {fit.shortest:.3g} to {fit.longest:.4g} s'
-    if fit.shortest > fit.chart.time[0]:
+    text = f'The figures describe averaging times from {fit.min_time:.3g} to {fit.max_time:.4g} s'
+    if fit.min_time > fit.chart.time[0]:
         text += '; shorter ones are affected by filters or interference in the gyro'
     if fit.misfit:
         text += (f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation '
@@ -129,28 +133,29 @@ def _fit_line(fit: NoiseFit) -> str:
         others = ' or '.join(' + '.join(each) for each in fit.alternatives)
         text += f'; {others} fit nearly as well, and a longer record would distinguish them'
     if fit.process:
-        text += (f'; a Gauss-Markov process of {fit.process.deviation * UNITS["B"][1]:.3g} deg/h '
+        text += ('; a Gauss-Markov process of '
+                 f'{fit.process.standard_deviation * DISPLAY_UNITS["B"][1]:.3g} deg/h '
                  f'with a correlation time of {fit.process.correlation_time:.3g} s describes them '
                  'better than B and K, which approximate it and may be zero')
     return f'{text}.'
 
 
-def _data(given: argparse.Namespace, record: Record, chart: AllanChart,
+def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
           fit: NoiseFit) -> dict[str, Any]:
-    figures = {figure.part.name: {
-        'symbol': symbol, 'unit': figure.part.unit, 'value': figure.value, 'lower': figure.lower,
+    figures = {figure.term.name: {
+        'symbol': symbol, 'unit': figure.term.unit, 'value': figure.value, 'lower': figure.lower,
         'upper': figure.upper, 'seen': bool(figure.value),
         'standard_deviation': figure.standard_deviation} for symbol, figure in fit.figures.items()}
     columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower,
                'upper': chart.upper, 'degrees_of_freedom': chart.degrees_of_freedom,
-               'differences': chart.differences, 'fit': fit.deviation(chart.time)}
+               'differences': chart.difference_count, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval,
             'remarks': list(record.remarks), **figures,
-            'floor': {**vars(chart.floor), 'reached': fit.floor_reached},
-            'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit,
+            'floor': {**vars(chart.floor), 'reached': fit.is_floor_reached},
+            'fitted_from_s': fit.min_time, 'fitted_to_s': fit.max_time, 'misfit': fit.misfit,
             'rivals': list(fit.alternatives),
             'gauss_markov': None if fit.process is None else {
-                'standard_deviation': fit.process.deviation,
+                'standard_deviation': fit.process.standard_deviation,
                 'correlation_time_s': fit.process.correlation_time},
             'chart': {name: values.tolist() for name, values in columns.items()},
             'picture': given.picture, 'out': given.out}

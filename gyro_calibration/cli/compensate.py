@@ -27,31 +27,31 @@ from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
 from gyro_calibration.heading.integration import BlockIntegrator, Threshold
 from gyro_calibration.heading.log_compensation import (
-    in_hindsight,
     LogCompensation,
-    none_plausible,
-    plausible,
+    no_plausible_row_message,
+    plausible_rows,
     rows_of,
+    smooth_track,
 )
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
-from gyro_calibration.model.compensation import covariance, quadratic_form
+from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'compensate', _compensate,
-                      'add compensated rates, and for samples in time the heading, to a log',
-                      'drive.csv --model model.yaml --out compensated.csv')
-    verb.add_log(parser)
+    parser = verb.add_verb(verbs, 'compensate', _compensate,
+                           'add compensated rates, and for samples in time the heading, to a log',
+                           'drive.csv --model model.yaml --out compensated.csv')
+    verb.add_log_options(parser)
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')
-    parser.add_argument('--threshold', type=verb.not_negative, default=0.0, metavar='DPS',
+    parser.add_argument('--threshold', type=verb.non_negative_number, default=0.0, metavar='DPS',
                         help='rates below it are set to 0, as below 0.3 in the node; '
                         'default: 0, off')
-    parser.add_argument('--window', type=verb.not_negative, default=0.2, metavar='S',
+    parser.add_argument('--window', type=verb.non_negative_number, default=0.2, metavar='S',
                         help='averaging time of the threshold filter; 0: single samples; '
                         'default: %(default)g')
     parser.add_argument('--rest', action='store_true', help='detect standstill, as the node does: '
@@ -62,16 +62,16 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _compensate(given: argparse.Namespace) -> Answer:
-    model, found = read_model(given.model), _Found()
+    model, found = read_model(given.model), _Totals()
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
         raise UsageError('--rest and --hindsight need no --threshold and a model with an angle '
                          'random walk; run allan to add it to the model')
-    write_log_blocks(given.out, _compensated(given, model, found))
+    write_log_blocks(given.out, _compensate_and_count(given, model, found))
     return _answer(given, model, found)
 
 
 #: Other inputs of effects: quantity of a log -> channel, and the sentence where the log lacks it.
-_WORDS = {
+_MISSING_INPUTS = {
     'specific_force': ('specific_force',
                        'The log has no specific force: 0 m/s² was assumed.'),
     'supply': ('supply', 'The log has no supply voltage: its effect was left out.'),
@@ -81,7 +81,7 @@ _WORDS = {
 
 
 @dataclass
-class _Found:
+class _Totals:
     """Counts over the blocks so far; heading and deviation of the last sample, rad."""
 
     rows: int = 0
@@ -98,9 +98,10 @@ class _Found:
     lost_samples: int = 0
     longest_gap_s: float = 0.0
 
-    def add(self, piece: Piece) -> None:
+    def add(self, piece: CompensatedBlock) -> None:
         log, columns = piece.log, piece.columns
-        self.lost_samples, self.longest_gap_s = piece.intervals.lost, piece.intervals.longest
+        self.lost_samples, self.longest_gap_s = (piece.intervals.lost_samples,
+                                                 piece.intervals.longest_gap)
         self.rows += len(log)
         without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
         self.rows_without_output += without
@@ -108,12 +109,13 @@ class _Found:
         self.temperature_clipped += int(columns['temperature_clipped'].sum())
         self.beyond_range += int(columns['beyond_range'].sum())
         self.temperature_known = log.temperature is not None
-        self.unknown = tuple(quantity for quantity in _WORDS if getattr(log, quantity) is None)
+        self.unknown = tuple(
+            quantity for quantity in _MISSING_INPUTS if getattr(log, quantity) is None)
         if len(columns.get('heading_rad', ())):
             self.heading, self.deviation = (
                 float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
             if log.reference_heading is not None:
-                error = columns['heading_rad'] - log.reference_heading[piece.known]
+                error = columns['heading_rad'] - log.reference_heading[piece.is_plausible]
                 if len(error := error[np.isfinite(error)]):
                     # both headings count from the first row with a reference
                     self.first_error = self.first_error if self.errors else error[0]
@@ -122,114 +124,120 @@ class _Found:
 
 
 @dataclass(frozen=True)
-class Piece:
+class CompensatedBlock:
     """A block of a log, its plausible rows, their new columns, and the intervals so far."""
 
     log: Log
-    known: Mask
+    is_plausible: Mask
     columns: dict[str, Array]
     intervals: Intervals
 
-    def rows(self) -> dict[str, Array]:
+    def full_columns(self) -> dict[str, Array]:
         """Return the new columns of all rows; nan where the row is not plausible."""
-        found = {name: np.full(len(self.known), np.nan) for name in self.columns}
+        found = {name: np.full(len(self.is_plausible), np.nan) for name in self.columns}
         for name, values in self.columns.items():
-            found[name][self.known] = values
+            found[name][self.is_plausible] = values
         return found
 
 
-def _compensated(given: argparse.Namespace, model: GyroModel,
-                 found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
+def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
+                          found: _Totals) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and update the counts."""
     if given.rest or given.hindsight:
         log = verb.read(given)
-        blocks = followed(replace(log, output=verb.output_of(given, log)), model, given.hindsight,
-                          given.log)
+        blocks = track_log(replace(log, output=verb.require_output(given, log)), model,
+                           given.hindsight, given.log)
     else:
         threshold = Threshold(given.threshold * DEGREE, given.window,
                               model.noise.angle_random_walk)
-        blocks = pieces((replace(log, output=verb.output_of(given, log))
-                         for log in verb.read_blocks(given)), model, threshold, given.log)
+        blocks = integrate_log((replace(log, output=verb.require_output(given, log))
+                                for log in verb.read_blocks(given)), model, threshold, given.log)
     for piece in blocks:
         found.add(piece)
-        yield piece.log, piece.rows()
+        yield piece.log, piece.full_columns()
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no gyro output is finite; record again')
     if found.rows == found.rows_without_output + found.refused_samples:
-        raise DataRefused(f'{given.log}: {none_plausible(model)}')
+        raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
 
 
-def _checked(pieces: Iterator[Piece], model: GyroModel, file: str) -> Iterator[Piece]:
+def _check_finite(pieces: Iterator[CompensatedBlock], model: GyroModel,
+                  file: str) -> Iterator[CompensatedBlock]:
     """Refuse a sample for which the model gives no finite rate or heading."""
-    for piece in _on_stamps(pieces) if model.moves_stamps else pieces:
+    for piece in _interpolate_to_stamps(pieces) if model.moves_stamps else pieces:
         for name, values in piece.columns.items():
             # a standard deviation may be unknown, nan
             finite = ~np.isinf(values) if '_std_' in name else np.isfinite(values)
             if not finite.all():
                 row, log = int(np.argmin(finite)), piece.log
-                output = float(np.asarray(log.output)[piece.known][row])
-                at = '' if log.time is None else f' at {log.time[piece.known][row]:g} s'
+                output = float(np.asarray(log.output)[piece.is_plausible][row])
+                at = '' if log.time is None else f' at {log.time[piece.is_plausible][row]:g} s'
                 raise DataRefused(
                     f'{file}: {name} is not finite for an output of {output:g} rad/s{at}; '
                     'remove the sample, or check columns, units and the model')
         yield piece
 
 
-def pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold,
-           name: str) -> Iterator[Piece]:
+def integrate_log(logs: Iterable[Log], model: GyroModel, threshold: Threshold,
+                  name: str) -> Iterator[CompensatedBlock]:
     """Give the blocks of a log, each with its rates and, where it has a time, its heading."""
-    yield from _checked(_pieces(logs, model, threshold), model, name)
+    yield from _check_finite(_integrate_blocks(logs, model, threshold), model, name)
 
 
-def _pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold) -> Iterator[Piece]:
-    integrator, compensation = (BlockIntegrator(threshold, model.noise, covariance(model)),
+def _integrate_blocks(logs: Iterable[Log], model: GyroModel,
+                      threshold: Threshold) -> Iterator[CompensatedBlock]:
+    integrator, compensation = (BlockIntegrator(threshold, model.noise,
+                                                uncertainty_covariance(model)),
                                 LogCompensation(model))
     variance: float | None = None
     for log in logs:
-        known = plausible(model, log)
+        known = plausible_rows(model, log)
         if variance is None:
             # The noise of a rate depends on the interval between samples. That of the first block
             # is used for all rates, since a lost sample does not reduce the noise of a gyro. Rows
             # without output may lie between samples.
             variance = 0.0 if log.time is None else model.noise.rate_variance(float(np.median(
                 np.diff(log.time[known] if known.sum() > 1 else log.time))))
-        yield Piece(
-            log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)),
+        yield CompensatedBlock(
+            log, known,
+            _compensated_columns(model, compensation, integrator, variance, rows_of(log, known)),
             integrator.intervals)
 
 
-def followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Iterator[Piece]:
+def track_log(log: Log, model: GyroModel, hindsight: bool,
+              name: str) -> Iterator[CompensatedBlock]:
     """Give the whole log as one piece, with heading and bias tracked as by the node."""
-    yield from _checked(iter([_followed(log, model, hindsight, name)]), model, name)
+    yield from _check_finite(iter([_track_block(log, model, hindsight, name)]), model, name)
 
 
-def _followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Piece:
+def _track_block(log: Log, model: GyroModel, hindsight: bool, name: str) -> CompensatedBlock:
     known = np.abs(np.asarray(log.output)) <= model.rate_limit
     if log.time is None or known.sum() < 2:
         raise DataRefused(f'{name}: standstill detection needs two or more samples with a time; '
                           'give a log with time_s, or --rate')
-    if log.temperature is not None and not plausible(model, log).any():
-        raise DataRefused(f'{name}: {none_plausible(model)}')
+    if log.temperature is not None and not plausible_rows(model, log).any():
+        raise DataRefused(f'{name}: {no_plausible_row_message(model)}')
     rows = rows_of(log, known)
     time, output = LogCompensation(model).true_time(np.asarray(rows.time)), np.asarray(rows.output)
-    estimator, begun = _begun(model, rows, hindsight)
+    estimator, start_date = _make_estimator(model, rows, hindsight)
     # the state of the wheels
     moving = None if rows.moving is None else [bool(each) for each in rows.moving]
-    found = estimator.follow(time, output, begun, rows.temperature, moving, rows.specific_force,
-                             rows.supply)
+    found = estimator.follow(time, output, start_date, rows.temperature, moving,
+                             rows.specific_force, rows.supply)
     heading, variance, rate, rate_variance, resting, corrected, clipped, beyond = found.T
     if hindsight:
         if not np.isfinite(found).all():
             raise DataRefused(f'{name}: the variance of the heading is not finite; '
                               'check columns, units and the model')
-        heading, variance, resting = in_hindsight(estimator.tracker, time, corrected)
-    return Piece(log, known, {
+        heading, variance, resting = smooth_track(estimator.tracker, time, corrected)
+    return CompensatedBlock(log, known, {
         'rate_rad_s': rate, 'heading_rad': heading, 'heading_std_rad': np.sqrt(variance),
         'rate_std_rad_s': np.sqrt(rate_variance), 'resting': resting.astype(float),
         'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals)
 
 
-def _begun(model: GyroModel, log: Log, keep: bool) -> tuple[HeadingEstimator, float]:
+def _make_estimator(model: GyroModel, log: Log,
+                    keeps_history: bool) -> tuple[HeadingEstimator, float]:
     """
     Return the estimator of the log, and the date of time 0, s since 1970.
 
@@ -238,25 +246,26 @@ def _begun(model: GyroModel, log: Log, keep: bool) -> tuple[HeadingEstimator, fl
     """
     assert log.time is not None
     # stamps beyond 1e9 are s since 1970
-    dated, calibration = log.time[0] > 1e9, model.self_calibration
-    begun = 0.0 if dated else 1e9
-    now = begun + float(log.time[0])
-    if not dated and calibration is not None and calibration.temperature is None:
+    has_dates, calibration = log.time[0] > 1e9, model.self_calibration
+    start_date = 0.0 if has_dates else 1e9
+    now = start_date + float(log.time[0])
+    if not has_dates and calibration is not None and calibration.temperature is None:
         known = (np.zeros(0) if log.temperature is None
                  else log.temperature[np.isfinite(log.temperature)])
         if len(known):
             model = with_self_calibration(model, replace(calibration, temperature=float(known[0])))
     estimator = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(),
-                                 TEMPERATURE_TIMEOUT, now, keep)
-    if not dated and calibration is not None:
+                                 TEMPERATURE_TIMEOUT, now, keeps_history)
+    if not has_dates and calibration is not None:
         when = datetime.fromtimestamp(now, timezone.utc).isoformat()
-        estimator.use(with_self_calibration(model, replace(
+        estimator.use_calibration(with_self_calibration(model, replace(
             model.self_calibration or calibration, time=when)), now)
-    return estimator, begun
+    return estimator, start_date
 
 
-def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockIntegrator,
-             variance: float, log: Log) -> dict[str, Array]:
+def _compensated_columns(model: GyroModel, compensation: LogCompensation,
+                         integrator: BlockIntegrator, variance: float,
+                         log: Log) -> dict[str, Array]:
     result, sensitivity = compensation.add(log)
     columns = {'rate_rad_s': result.rate}
     if log.time is not None:
@@ -264,8 +273,9 @@ def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockI
         (columns['rate_rad_s'], columns['heading_rad'],
          columns['heading_std_rad']) = integrator.add(time, result.rate, sensitivity)
         if model.moves_stamps:
-            columns[_TRUE_TIME] = time
-    columns['rate_std_rad_s'] = np.sqrt(variance + quadratic_form(covariance(model), sensitivity))
+            columns[_TRUE_TIME_COLUMN] = time
+    columns['rate_std_rad_s'] = np.sqrt(
+        variance + quadratic_form(uncertainty_covariance(model), sensitivity))
     columns['temperature_clipped'], columns['beyond_range'] = (result.temperature_clipped,
                                                                result.beyond_range)
     return columns
@@ -273,43 +283,46 @@ def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockI
 
 #: Column of the true times of samples, where a model moves stamps, and the columns at these times,
 #: which are interpolated to the stamps of the rows.
-_TRUE_TIME, _MOVED = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad',
-                                   'rate_std_rad_s')
+_TRUE_TIME_COLUMN, _MOVED_COLUMNS = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad',
+                                                  'rate_std_rad_s')
 
 
-def _on_stamps(pieces: Iterator[Piece]) -> Iterator[Piece]:
+def _interpolate_to_stamps(pieces: Iterator[CompensatedBlock]) -> Iterator[CompensatedBlock]:
     """Interpolate columns at true times to the stamps of the rows, with neighbouring blocks."""
-    before: Piece | None = None
+    before: CompensatedBlock | None = None
     here = next(pieces, None)
     while here is not None:
         after = next(pieces, None)
         around = [each.columns for each in (before, here, after)
-                  if each is not None and _TRUE_TIME in each.columns]
-        yield _brought(here, around) if around else here
+                  if each is not None and _TRUE_TIME_COLUMN in each.columns]
+        yield _interpolate_block(here, around) if around else here
         before, here = here, after
 
 
-def _brought(piece: Piece, around: list[dict[str, Array]]) -> Piece:
+def _interpolate_block(piece: CompensatedBlock,
+                       around: list[dict[str, Array]]) -> CompensatedBlock:
     assert piece.log.time is not None
-    true = np.concatenate([columns[_TRUE_TIME] for columns in around])
-    stamps, columns = piece.log.time[piece.known], {
-        name: values for name, values in piece.columns.items() if name != _TRUE_TIME}
+    true = np.concatenate([columns[_TRUE_TIME_COLUMN] for columns in around])
+    stamps, columns = piece.log.time[piece.is_plausible], {
+        name: values for name, values in piece.columns.items() if name != _TRUE_TIME_COLUMN}
     if len(true):
-        columns.update({name: np.interp(
-            stamps, true, np.concatenate([each[name] for each in around])) for name in _MOVED})
+        columns.update({
+            name: np.interp(stamps, true, np.concatenate([each[name] for each in around]))
+            for name in _MOVED_COLUMNS
+        })
     return replace(piece, columns=columns)
 
 
-def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answer:
+def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answer:
     data: dict[str, Any] = {'out': given.out, **asdict(found)}
     heading, deviation, *_ = (data.pop(name) for name in (
         'heading', 'deviation', 'unknown', 'errors', 'first_error'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
     if heading is not None:
         # The deviation is zero where the model has neither noise nor covariance.
-        sure = deviation if deviation > 0.0 else None
-        data.update(heading_rad=heading, heading_std_rad=sure)
-        known = '' if sure is None else f' +- {sure / DEGREE:.2f}'
+        known_deviation = deviation if deviation > 0.0 else None
+        data.update(heading_rad=heading, heading_std_rad=known_deviation)
+        known = '' if known_deviation is None else f' +- {known_deviation / DEGREE:.2f}'
         lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
     if found.errors:
         sums, counts, last = zip(*found.errors)
@@ -319,13 +332,13 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
                      f'end {last[-1] / DEGREE:.3f} deg.')
         lines.append('Both headings start at 0 at the first row with a reference. The error that '
                      'fit states excludes the mean error and a delay of the reference.')
-    if not found.temperature_known and model.looks_at('temperature'):
+    if not found.temperature_known and model.uses_channel('temperature'):
         lines.append('The log has no temperature: '
                      'the model was used at its reference temperature.')
-    lines += [words for quantity, (channel, words) in _WORDS.items()
-              if quantity in found.unknown and model.looks_at(channel)]
-    lines += [f'{term.effect.name}: {term.effect.undone}' for term in model.terms
-              if term.effect.undone]
+    lines += [words for quantity, (channel, words) in _MISSING_INPUTS.items()
+              if quantity in found.unknown and model.uses_channel(channel)]
+    lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms
+              if term.effect.not_compensated]
     for name, words in (
             ('rows_without_output',
              'rows have no output of the gyro; the heading is integrated across them.'),

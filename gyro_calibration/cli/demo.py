@@ -21,11 +21,11 @@ from gyro_calibration.cli.verb import Answer, UsageError
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'demo', _demo, 'run an emulated gyro, its driver, compensation, '
-                      'self-calibration and a drive on this machine', '--out demo')
+    parser = verb.add_verb(verbs, 'demo', _demo, 'run an emulated gyro, its driver, compensation, '
+                           'self-calibration and a drive on this machine', '--out demo')
     parser.add_argument('--out', default='demo', metavar='DIR',
                         help='folder for picture, table and log; default: %(default)s')
-    parser.add_argument('--seed', type=verb.whole, default=0,
+    parser.add_argument('--seed', type=verb.non_negative_integer, default=0,
                         help='seed of the noise; default: %(default)s')
     return parser
 

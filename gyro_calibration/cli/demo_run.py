@@ -36,13 +36,13 @@ from geometry_msgs.msg import Twist
 from gyro_calibration.cli.plots import draw_headings
 from gyro_calibration.cli.verb import Answer
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find, Sample
+from gyro_calibration.driver.protocols import find_protocol, Sample
 from gyro_calibration.files import write_atomically
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
 from gyro_calibration.logs.log import Array, DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import CALIBRATION, Motion, turns
+from gyro_calibration.model.motion import CALIBRATION_MOTION, constant_rate_motion, Motion
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.ros.runner import SENSOR_QOS
 from gyro_calibration_reproduction.hong_park import TABLE_1
@@ -55,19 +55,19 @@ from tqdm import tqdm
 
 PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
-INTERVAL = 0.01  # s between samples
-ACCELERATION = 3.0  # rad/s², limit of the robot's wheels
-ATTEMPTS = 3  # to calibrate
-DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20),
-               (4, 0), (1, 0)])
+SAMPLE_INTERVAL = 0.01  # s between samples
+MAX_ACCELERATION = 3.0  # rad/s², limit of the robot's wheels
+MAX_ATTEMPTS = 3  # to calibrate
+DRIVE_MOTION = constant_rate_motion([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20),
+                                     (4, 0), (5, -20), (4, 0), (1, 0)])
 
 
-class Refused(OSError):
+class CallRefused(OSError):
     """A service refused a call."""
 
 
 @dataclass
-class Robot:
+class SimulatedRobot:
     """
     A robot that turns as commanded, within the acceleration limit, with the gyro of a model.
 
@@ -77,18 +77,19 @@ class Robot:
 
     Attributes
     ----------
-    noise : of each phase (start, each attempt to calibrate, drive), rad/s
+    phase_noise : of each phase (start, each attempt to calibrate, drive), rad/s
     phase : number of the phase
     commands : not yet applied, each with the time of its receipt, s, and the rate, rad/s
-    truth : of each sample the time by the clock of this machine, s, and the true heading, rad
+    true_headings : of each sample the time by the clock of this machine, s, and the true heading,
+        rad
 
     """
 
     model: GyroModel
-    noise: list[Array]
+    phase_noise: list[Array]
     phase: int = 0
     commands: deque[tuple[float, float]] = field(default_factory=deque)
-    truth: list[tuple[float, float]] = field(default_factory=list)
+    true_headings: list[tuple[float, float]] = field(default_factory=list)
 
     def set_rate(self, message: Twist) -> None:
         """Turn from now on as commanded."""
@@ -97,40 +98,41 @@ class Robot:
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
         command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
-        for number, noise in enumerate(self._noise()):
-            due = begin + number * INTERVAL
+        for number, noise in enumerate(self._phase_samples()):
+            due = begin + number * SAMPLE_INTERVAL
             time.sleep(max(0.0, due - time.monotonic()))
             while self.commands and self.commands[0][0] <= due:
                 command = self.commands.popleft()[1]
-            change = np.clip(command - rate, -ACCELERATION * INTERVAL, ACCELERATION * INTERVAL)
-            heading += INTERVAL * (rate + 0.5 * change)
+            change = np.clip(command - rate, -MAX_ACCELERATION * SAMPLE_INTERVAL,
+                             MAX_ACCELERATION * SAMPLE_INTERVAL)
+            heading += SAMPLE_INTERVAL * (rate + 0.5 * change)
             rate += change
-            self.truth.append((time.time() - (time.monotonic() - due), heading))
+            self.true_headings.append((time.time() - (time.monotonic() - due), heading))
             yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
-                         time=number * INTERVAL)
+                         time=number * SAMPLE_INTERVAL)
 
-    def _noise(self) -> Iterator[float]:
-        for phase, values in enumerate(self.noise):
+    def _phase_samples(self) -> Iterator[float]:
+        for phase, values in enumerate(self.phase_noise):
             for value in values:
                 if self.phase > phase:
                     break
                 yield value
 
 
-class Client:
+class DemoClient:
     """
     Subscribes to the nodes and calls their services, spinning in a thread of its own.
 
     Attributes
     ----------
-    raw, headings : of each message the time, s, with the raw rate, rad/s, and with the published
-        heading, rad
+    raw_rates, headings : of each message the time, s, with the raw rate, rad/s, and with the
+        published heading, rad
 
     """
 
-    def __init__(self, robot: Robot):
+    def __init__(self, robot: SimulatedRobot):
         """Subscribe; the robot receives ``cmd_vel`` from now on."""
-        self.raw: list[tuple[float, float]] = []
+        self.raw_rates: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
         self._node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
         self._node.create_subscription(Imu, 'imu/data_raw', self._add_raw, SENSOR_QOS)
@@ -144,7 +146,7 @@ class Client:
         self._thread.start()
 
     def _add_raw(self, message: Imu) -> None:
-        self.raw.append((_seconds(message), message.angular_velocity.z))
+        self.raw_rates.append((_seconds(message), message.angular_velocity.z))
 
     def _add_heading(self, message: Imu) -> None:
         yaw = 2.0 * math.atan2(message.orientation.z, message.orientation.w)
@@ -154,7 +156,7 @@ class Client:
         while not self._stop.is_set():
             self._executor.spin_once(timeout_sec=0.1)
 
-    def call(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
+    def call_service(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
         """Call a service, wait again and again until it answers, and return its message."""
         client = self._node.create_client(Trigger, name)
         if not client.wait_for_service(20.0):
@@ -165,14 +167,15 @@ class Client:
                 raise OSError(f'{name} did not answer within {timeout:g} s')
             wait()
         if not answer.result().success:
-            raise Refused(f'{name}: {answer.result().message}')
+            raise CallRefused(f'{name}: {answer.result().message}')
         return answer.result().message
 
     def is_ready(self) -> bool:
         """Return whether gyro and heading are received and another node commands the robot."""
-        return bool(self.raw and self.headings) and self._node.count_publishers('cmd_vel') > 1
+        return (bool(self.raw_rates and self.headings)
+                and self._node.count_publishers('cmd_vel') > 1)
 
-    def turn(self, rate: float) -> None:
+    def command_rate(self, rate: float) -> None:
         """Command a rate, rad/s."""
         command = Twist()
         command.angular.z = rate
@@ -191,12 +194,12 @@ def _seconds(message: Imu) -> float:
 
 
 @contextmanager
-def _process(module: str, **parameters: object) -> Iterator[None]:
+def _node_process(module: str, **parameters: object) -> Iterator[None]:
     """Run a node in a process of its own."""
     arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    quiet = ['-r', f'__ns:=/{_NAMESPACE}', '--log-level', 'error']
+    ros_options = ['-r', f'__ns:=/{_NAMESPACE}', '--log-level', 'error']
     process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}',
-                                '--ros-args', *arguments, *quiet])
+                                '--ros-args', *arguments, *ros_options])
     try:
         yield
     finally:
@@ -221,27 +224,28 @@ def run_demo(out: Path, seed: int) -> Answer:
     # it needs no permissions in a secured one.
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
-    model = read_model(_share('config', 'xv3500.yaml'))
+    model = read_model(_find_shared_file('config', 'xv3500.yaml'))
     write_model(model_file, GyroModel(noise=model.noise))  # only the noise of the gyro is known
     generator = np.random.default_rng(seed)
-    start, run, drive = (simulate_noise(model.noise, 6000, INTERVAL, generator) for _ in range(3))
-    robot = Robot(model, [start, *[run] * ATTEMPTS, drive])
+    start, run, drive = (simulate_noise(model.noise, 6000, SAMPLE_INTERVAL, generator)
+                         for _ in range(3))
+    robot = SimulatedRobot(model, [start, *[run] * MAX_ATTEMPTS, drive])
     with ExitStack() as stack:
-        stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port,
+        stack.enter_context(Emulator(find_protocol(PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))
-        stack.enter_context(_process('driver_node', port=port, protocol=PROTOCOL))
-        stack.enter_context(_process('compensation_node', model_file=model_file,
-                                     calibration_file=calibration_file,
-                                     **{'calibration.drive': True}))
+        stack.enter_context(_node_process('driver_node', port=port, protocol=PROTOCOL))
+        stack.enter_context(_node_process('compensation_node', model_file=model_file,
+                                          calibration_file=calibration_file,
+                                          **{'calibration.drive': True}))
         rclpy.init()
         stack.callback(rclpy.try_shutdown)
-        client = Client(robot)
+        client = DemoClient(robot)
         stack.callback(client.close)
-        begin = _perform(client, robot)
+        begin = _calibrate_and_drive(client, robot)
     return _evaluate(out, robot, client, begin, seed)
 
 
-def _share(*parts: str) -> Path:
+def _find_shared_file(*parts: str) -> Path:
     """Return a file of the package's share folder, or of its sources where it runs from them."""
     prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
     roots = [Path(prefix, 'share', 'gyro_calibration') for prefix in prefixes if prefix]
@@ -251,24 +255,24 @@ def _share(*parts: str) -> Path:
     raise FileNotFoundError(f'{"/".join(parts)} is not installed; install the package again')
 
 
-def _perform(client: Client, robot: Robot) -> float:
+def _calibrate_and_drive(client: DemoClient, robot: SimulatedRobot) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
-    total = round(CALIBRATION.duration + 4.0 + DRIVE.duration)
+    total = round(CALIBRATION_MOTION.duration + 4.0 + DRIVE_MOTION.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
               disable=None) as bar:
         bar.set_description('starting driver and compensation')
-        _until(client.is_ready, 60.0)
+        _wait_until(client.is_ready, 60.0)
         bar.set_description('calibrating on the motion profile')
         calibrate(client, robot, bar)
-        client.call('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
+        client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
-        robot.phase = len(robot.noise) - 1
+        robot.phase = len(robot.phase_noise) - 1
         begin = time.time()
-        _drive(client, DRIVE, bar)
+        _drive(client, DRIVE_MOTION, bar)
     return begin
 
 
-def calibrate(client: Client, robot: Robot, bar: tqdm) -> None:
+def calibrate(client: DemoClient, robot: SimulatedRobot, bar: tqdm) -> None:
     """
     Calibrate; a refused run is repeated, since this robot turns late on a busy machine.
 
@@ -277,20 +281,20 @@ def calibrate(client: Client, robot: Robot, bar: tqdm) -> None:
     Refused : so is the last attempt
 
     """
-    for attempt in range(1, ATTEMPTS + 1):
+    for attempt in range(1, MAX_ATTEMPTS + 1):
         robot.phase = attempt
         try:
-            client.call('compensation_node/calibrate', 60.0, lambda: _pass(bar, 0.2))
+            client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
             return
-        except Refused as refusal:
-            if attempt == ATTEMPTS:
+        except CallRefused as refusal:
+            if attempt == MAX_ATTEMPTS:
                 raise
-            bar.total += CALIBRATION.duration + 4.0
+            bar.total += CALIBRATION_MOTION.duration + 4.0
             bar.write(f'{refusal}; once more', file=sys.stderr)
-            _pass(bar, 2.0)  # until the robot stands
+            _wait(bar, 2.0)  # until the robot stands
 
 
-def _until(condition: Callable[[], object], timeout: float) -> None:
+def _wait_until(condition: Callable[[], object], timeout: float) -> None:
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:
@@ -299,24 +303,25 @@ def _until(condition: Callable[[], object], timeout: float) -> None:
         time.sleep(0.02)
 
 
-def _pass(bar: tqdm, seconds: float) -> None:
+def _wait(bar: tqdm, seconds: float) -> None:
     time.sleep(seconds)
     bar.update(seconds)
 
 
-def _drive(client: Client, motion: Motion, bar: tqdm) -> None:
+def _drive(client: DemoClient, motion: Motion, bar: tqdm) -> None:
     begin = time.monotonic()
     while (now := time.monotonic() - begin) < motion.duration:
-        client.turn(float(motion.rate_at(np.array(now))))
-        _pass(bar, 0.02)
-    client.turn(0.0)
-    _pass(bar, 0.5)
+        client.command_rate(float(motion.rate_at(np.array(now))))
+        _wait(bar, 0.02)
+    client.command_rate(0.0)
+    _wait(bar, 0.5)
 
 
-def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) -> Answer:
+def _evaluate(out: Path, robot: SimulatedRobot, client: DemoClient, begin: float,
+              seed: int) -> Answer:
     """Compare five headings of the drive with the truth."""
-    clock, truth = np.array(robot.truth).T
-    time_, raw = np.array([pair for pair in client.raw if pair[0] >= begin]).T
+    clock, truth = np.array(robot.true_headings).T
+    time_, raw = np.array([pair for pair in client.raw_rates if pair[0] >= begin]).T
     stamp, yaw = np.array([pair for pair in client.headings if pair[0] >= begin]).T
     true = np.interp(time_, clock, truth)
     calibration = read_model(out / 'calibration.yaml').self_calibration
@@ -338,7 +343,7 @@ def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) 
     text = (f'{table}\nSelf-calibration: {calibration}.\n'
             f'Seed {seed}. Picture, table and log are in {out}.')
     means = {name: float(error.mean()) for name, error in errors.items()}
-    return Answer([text], {'seed': seed, **calibration.figures(), 'mean_error_deg': means})
+    return Answer([text], {'seed': seed, **calibration.to_dict(), 'mean_error_deg': means})
 
 
 def _table(errors: dict[str, Array]) -> str:

@@ -20,34 +20,35 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, under_way, UsageError
-from gyro_calibration.diagnosis.data_quality import KINDS
-from gyro_calibration.diagnosis.extended_model import calibrated
+from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.diagnosis.data_quality import REFERENCE_KINDS
+from gyro_calibration.diagnosis.extended_model import merge_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
-from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.steps import OnProgress
-from gyro_calibration.diagnosis.words import lines, offered
+from gyro_calibration.diagnosis.words import is_model_extended, terminal_lines
 from gyro_calibration.files import write_atomically
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.model_file import model_text, read_model
+from gyro_calibration.model.model_file import format_model, read_model
 import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'diagnose', _diagnose, 'measure the error of a simulation, name the '
-                      'cause, extend the model, measure the gain',
-                      'drive.csv --model gyro.yaml --out diagnosis')
-    verb.add_log(parser, nargs='+')
+    parser = verb.add_verb(verbs, 'diagnose', _diagnose, 'measure the error of a simulation, name '
+                                                         'the '
+                           'cause, extend the model, measure the gain',
+                           'drive.csv --model gyro.yaml --out diagnosis')
+    verb.add_log_options(parser, nargs='+')
     parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
                         'ideal gyro with the bias and scale factor error that fit the logs best')
-    parser.add_argument('--reference-kind', choices=KINDS,
+    parser.add_argument('--reference-kind', choices=REFERENCE_KINDS,
                         help='kind of the reference; default: detected from the log')
     parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and '
                         'model.yaml, the extended model')
-    parser.add_argument('--seed', type=verb.whole, default=0, metavar='N',
+    parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
                         help='seed of the random draws of significance tests; default: 0')
     return parser
 
@@ -55,36 +56,37 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _diagnose(given: argparse.Namespace) -> Answer:
     logs = list(verb.read_each(given))
     model = None if given.model is None else read_model(given.model)
-    with under_way('diagnosis') as on_progress:
-        found = diagnosed(logs, model, given.seed, given.reference_kind, given.log, on_progress)
+    with show_progress('diagnosis') as on_progress:
+        found = diagnose_logs(logs, model, given.seed, given.reference_kind, given.log,
+                              on_progress)
     found = replace(found, logs=tuple(given.log))
     if found.model is not model:
         found = replace(found, model=replace(
-            found.model, origin={**found.model.origin, **verb.origin_of(found.logs)}))
+            found.model, origin={**found.model.origin, **verb.make_origin(found.logs)}))
     written = write_diagnosis(given.out, found) if given.out else []
-    return Answer([*lines(found), *written], found.figures())
+    return Answer([*terminal_lines(found), *written], found.to_dict())
 
 
-def diagnosed(logs: Sequence[Log], model: GyroModel | None, seed: int, kind: str | None = None,
-              names: Sequence[str] = (), on_progress: OnProgress = lambda share, words: None
-              ) -> Diagnosis:
+def diagnose_logs(logs: Sequence[Log], model: GyroModel | None, seed: int, kind: str | None = None,
+                  names: Sequence[str] = (),
+                  on_progress: OnProgress = lambda share, words: None) -> Diagnosis:
     """Diagnose logs in time, or a rate table; a model that is not extended is unchanged."""
     table = any(log.time is None for log in logs)
     if table and len(logs) > 1:
         raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
                          'alone, or give the sample rate in Hz with --rate')
-    found = (diagnose_table(logs[0], None if model is None else calibrated(model),
+    found = (diagnose_table(logs[0], None if model is None else merge_self_calibration(model),
                             on_progress=on_progress) if table
              else diagnose(logs, np.random.default_rng(seed), model, names=names,
-                           on_progress=on_progress, kind=kind))
-    return (found if model is None or offered(found)
+                           on_progress=on_progress, reference_kind=kind))
+    return (found if model is None or is_model_extended(found)
             else replace(found, before=model, model=model))
 
 
 def write_diagnosis(folder: str | Path, found: Diagnosis) -> list[str]:
     """Write all files; their content is made before the first one is written."""
-    content = {'diagnosis.json': json.dumps(found.figures(), indent=2, allow_nan=False) + '\n',
-               'report.html': report(found), 'model.yaml': model_text(found.model)}
+    content = {'diagnosis.json': json.dumps(found.to_dict(), indent=2, allow_nan=False) + '\n',
+               'report.html': render_report(found), 'model.yaml': format_model(found.model)}
     for name in content:
         if (Path(folder) / name).is_dir():
             raise IsADirectoryError(f'{Path(folder) / name} is a folder, but must be a file; '

@@ -21,58 +21,60 @@ import sys
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.simulate import add_motion, simulated
+from gyro_calibration.cli.simulate import add_motion_options, simulate_log
 from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.emulator import emulate, Emulator
-from gyro_calibration.driver.protocols import find, Protocol, PROTOCOLS, Sample, Settings
-from gyro_calibration.files import plain
+from gyro_calibration.driver.protocols import find_protocol, Protocol, PROTOCOLS, Sample, Settings
+from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from a '
-                      'model and a motion or from a log; prints its path',
-                      '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
+    parser = verb.add_verb(verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from '
+                                                       'a '
+                           'model and a motion or from a log; prints its path',
+                           '--protocol kvh_dsp3000 --model model.yaml --motion robot --link '
+                           '/tmp/gyro')
     parser.add_argument('--protocol', required=True, metavar='NAME',
                         help=f'one of {", ".join(PROTOCOLS)}')
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument('--log', metavar='LOG', help='send a recording')
     source.add_argument('--model', metavar='MODEL.yaml', help='send samples of a simulated gyro')
-    add_motion(parser, default='rest')
-    parser.add_argument('--rate', type=verb.positive, metavar='HZ',
+    add_motion_options(parser, default='rest')
+    parser.add_argument('--rate', type=verb.positive_number, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=verb.positive, metavar='DPS',
+    parser.add_argument('--sensitivity', type=verb.positive_number, metavar='DPS',
                         help='deg/s per count of the wire format; default: that of the protocol')
     parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc',
                         help='columns of the protocol csv; default: %(default)s')
     parser.add_argument('--link', metavar='PATH',
                         help='symbolic link to the pseudo-terminal, whose own name varies')
-    parser.add_argument('--speed', type=verb.positive, default=1.0,
+    parser.add_argument('--speed', type=verb.positive_number, default=1.0,
                         help='factor to real time; default: 1')
     parser.add_argument('--wait', action='store_true',
                         help='start when a program has opened the port')
     parser.add_argument('--repeat', action='store_true', help='start again at the end')
-    verb.add_topics(parser)
-    parser.set_defaults(**verb.AS_IT_IS)
+    verb.add_topic_options(parser)
+    parser.set_defaults(**verb.DEFAULT_LOG_OPTIONS)
     return parser
 
 
 def _emulate(given: argparse.Namespace) -> None:
     """Print the path at once, since this verb sends until it ends."""
-    protocol, settings = _wire(given)
-    log = verb.read(given) if given.log else simulated(given)[0]
-    time, output = verb.time_of(given, log), verb.output_of(given, log)
+    protocol, settings = _parse_wire_format(given)
+    log = verb.read(given) if given.log else simulate_log(given)[0]
+    time, output = verb.require_time(given, log), verb.require_output(given, log)
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
                           'have an output; give a log with two or more')
-    samples = _samples(time, output, log.temperature, given.repeat)
+    samples = _iterate_samples(time, output, log.temperature, given.repeat)
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
     _handle_signals(lambda *_: emulator.stop())
 
     def answer(path: str) -> None:
         print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json
-              else plain(path), flush=True)
+              else to_printable(path), flush=True)
     try:
         emulate(emulator, answer)
     finally:
@@ -85,24 +87,24 @@ def _handle_signals(handler: Any) -> None:
         signal.signal(number, handler)
 
 
-def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
+def _parse_wire_format(given: argparse.Namespace) -> tuple[Protocol, Settings]:
     try:
-        protocol, settings = find(given.protocol), Settings(
+        protocol, settings = find_protocol(given.protocol), Settings(
             sensitivity=verb.sensitivity(given), columns=tuple(given.columns.split(',')))
-        protocol.check(settings)
+        protocol.check_settings(settings)
     except ValueError as error:
         raise UsageError(str(error)) from None
     return protocol, settings
 
 
-def _samples(time: Array, output: Array, temperature: Array | None,
-             again: bool) -> Iterator[Sample]:
+def _iterate_samples(time: Array, output: Array, temperature: Array | None,
+                     repeats: bool) -> Iterator[Sample]:
     """Give the samples of a log that have an output, once or, on request, again and again."""
     known = np.isfinite(output)
     times, outputs = time[known] - time[known][0], output[known].tolist()
     temperatures = repeat(None) if temperature is None else temperature[known].tolist()
     length = float(times[-1] + np.median(np.diff(times)))
     for start in chain([0.0], (length * number
-                               for number in range(1, sys.maxsize if again else 1))):
+                               for number in range(1, sys.maxsize if repeats else 1))):
         yield from (Sample(output, temperature, start + time) for time, output, temperature
                     in zip(times.tolist(), outputs, temperatures))

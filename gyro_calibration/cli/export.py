@@ -20,21 +20,21 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.files import write_atomically
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.simulator_export import exported, figures, SIMULATORS
+from gyro_calibration.model.simulator_export import export_model, simulator_parameters, SIMULATORS
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'export', _export, 'write a model as robot simulators read it',
-                      '--to sdf model.yaml --sample-rate 100')
+    parser = verb.add_verb(verbs, 'export', _export, 'write a model as robot simulators read it',
+                           '--to sdf model.yaml --sample-rate 100')
     parser.add_argument('model', metavar='MODEL.yaml')
     parser.add_argument('--to', required=True, choices=SIMULATORS,
                         help='sdf: noise of an <imu> of Gazebo; isaac: noise of an observation '
                         'of Isaac Lab; mujoco: a <gyro> sensor of MuJoCo')
-    parser.add_argument('--sample-rate', type=verb.positive, default=100.0, metavar='HZ',
+    parser.add_argument('--sample-rate', type=verb.positive_number, default=100.0, metavar='HZ',
                         help='sample rate of the simulated gyro; default: 100')
     parser.add_argument('--temperature', type=verb.degrees_celsius, metavar='DEGC',
                         help='default: the reference temperature of the model')
-    parser.add_argument('--span', type=verb.positive, default=3600.0, metavar='S',
+    parser.add_argument('--span', type=verb.positive_number, default=3600.0, metavar='S',
                         help='longest time over which the bias drifts as modelled; default: 3600')
     parser.add_argument('--out', metavar='FILE', help='default: the text is printed')
     return parser
@@ -47,15 +47,15 @@ def _export(given: argparse.Namespace) -> Answer:
                          f'{2.0 / given.sample_rate:g} s')
     temperature = (model.reference_temperature if given.temperature is None
                    else given.temperature)
-    held, error = figures(model, given.sample_rate, temperature, given.span)
-    text, left_out = exported(held, model, given.to)
+    noise_figures, error = simulator_parameters(model, given.sample_rate, temperature, given.span)
+    text, left_out = export_model(noise_figures, model, given.to)
     data = {'to': given.to, 'out': given.out, 'text': text, 'left_out': left_out,
-            'figures': asdict(held), 'allan_deviation_error': error}
+            'figures': asdict(noise_figures), 'allan_deviation_error': error}
     if given.out is None:
         return Answer([text.rstrip('\n')], data)
     write_atomically(given.out, text.encode())
     lines = [f'written to {given.out}.']
-    if held.wander.density and given.to == 'sdf':
+    if noise_figures.wander.density and given.to == 'sdf':
         lines.append('One Gauss-Markov process replaces the drift of the bias: the Allan '
                      f'deviation is accurate to {100.0 * error:.0f} % up to {given.span:g} s.')
     if left_out:

@@ -19,40 +19,46 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwells import dwells, join, listed, take
+from gyro_calibration.calibration.dwells import (
+    extract_dwells,
+    format_list,
+    join_dwells,
+    select_dwells,
+)
 from gyro_calibration.calibration.encoder import (
     calibrate_encoder,
     EncoderCalibration,
-    FEWEST_DWELLS,
-    is_motion,
+    is_continuous_motion,
+    MIN_DWELLS,
 )
-from gyro_calibration.calibration.rate_table import Bin, binned, Calibration, fit_effects
-from gyro_calibration.calibration.scatter import FEWEST_SWEEPS
-from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGIES
+from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration, fit_effects
+from gyro_calibration.calibration.scatter import MIN_SWEEPS
+from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
-from gyro_calibration.cli.verb import Answer, under_way, UsageError, wrapped
-from gyro_calibration.logs.log import DEGREE, Log, NORMAL_95
+from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
     polynomial_to_matrix,
     rate_temperature_polynomial,
-    STEADY,
+    STATIC_EFFECTS,
 )
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import POLYNOMIAL, write_model
 import numpy as np
 
 #: SI unit -> unit in tables for people, and the factor to it.
-_UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
-          'rad/s/K²': ('deg/s/K²', 1 / DEGREE), 's/rad': ('s/deg', DEGREE),
-          's²/rad²': ('s²/deg²', DEGREE ** 2)}
+_DISPLAY_UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
+                  'rad/s/K²': ('deg/s/K²', 1 / DEGREE), 's/rad': ('s/deg', DEGREE),
+                  's²/rad²': ('s²/deg²', DEGREE ** 2)}
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an encoder, '
-                      'or any log with a reference',
-                      'table.csv --out model.yaml')
-    verb.add_log(parser, nargs='+')
+    parser = verb.add_verb(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an '
+                                               'encoder, '
+                           'or any log with a reference',
+                           'table.csv --out model.yaml')
+    verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
                         help='dwells: means at constant rates; '
@@ -61,33 +67,35 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'rate: the rate of the reference heading, sample by sample. '
                         'Default: by the columns of the log')
     what = parser.add_mutually_exclusive_group()
-    what.add_argument('--effects', type=_effects, metavar='NAME,...', help='effects to fit, of '
-                      f'{", ".join(STEADY)}; default: those that the data support')
-    what.add_argument('--polynomial', type=_orders, nargs='?', const='3,2', metavar='P,Q',
+    what.add_argument(
+        '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
+        f'{", ".join(STATIC_EFFECTS)}; default: those that the data support')
+    what.add_argument('--polynomial', type=_parse_orders, nargs='?', const='3,2', metavar='P,Q',
                       help='fit the polynomial over output and temperature of these orders '
                       'instead; default: 3,2')
-    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='technology of the gyro; '
-                        'selects between effects that the data do not distinguish, and the prior '
-                        'with a reference heading (default there: mems)')
+    parser.add_argument(
+        '--technology', choices=list(TECHNOLOGY_EFFECTS), help='technology of the gyro; '
+        'selects between effects that the data do not distinguish, and the prior '
+        'with a reference heading (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
                         help='name of the gyro, stored in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
     parser.add_argument('--matrix', action='store_true', help='print the polynomial as the '
                         'matrix C of Ojeda et al., in deg/s and degC')
-    verb.add_picture(parser, 'the errors before and after')
-    verb.add_picture(parser, 'the error over rate and temperature', '--surface')
+    verb.add_picture_option(parser, 'the errors before and after')
+    verb.add_picture_option(parser, 'the error over rate and temperature', '--surface')
     return parser
 
 
-def _effects(text: str) -> list[Effect]:
-    unknown = [name for name in text.split(',') if name not in STEADY]
+def _parse_effects(text: str) -> list[Effect]:
+    unknown = [name for name in text.split(',') if name not in STATIC_EFFECTS]
     if unknown:
         raise argparse.ArgumentTypeError(f'{unknown[0]!r} is an unknown effect; '
-                                         f'choose from {", ".join(STEADY)}')
-    return [STEADY[name] for name in dict.fromkeys(text.split(','))]
+                                         f'choose from {", ".join(STATIC_EFFECTS)}')
+    return [STATIC_EFFECTS[name] for name in dict.fromkeys(text.split(','))]
 
 
-def _orders(text: str) -> list[Effect]:
+def _parse_orders(text: str) -> list[Effect]:
     try:
         rate_order, temperature_order = (int(order) for order in text.split(','))
         if not (0 <= rate_order <= 9 and 0 <= temperature_order <= 9):
@@ -100,12 +108,12 @@ def _orders(text: str) -> list[Effect]:
 
 def _fit(given: argparse.Namespace) -> Answer:
     logs = dict(zip(given.log, verb.read_each(given)))
-    if _method(given, logs) == 'dwells':
+    if _select_method(given, logs) == 'dwells':
         return _fit_dwells(given, logs)
     return _fit_heading(given, logs)
 
 
-def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
+def _select_method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
     """Return the method, given or by the logs; '' selects it by the reference heading."""
     if given.method:
         return str(given.method)
@@ -116,12 +124,12 @@ def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
     return '' if heading_alone and not chosen else 'dwells'
 
 
-def _stored(given: argparse.Namespace, model: GyroModel) -> GyroModel:
+def _store_model(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     """Return the model with its origin, and write it where --out is given."""
     identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
                 'technology': given.technology}
     model = replace(model, gyro={name: value for name, value in identity.items() if value},
-                    origin=verb.origin_of(given.log))
+                    origin=verb.make_origin(given.log))
     if given.out:
         write_model(given.out, model)
     return model
@@ -131,21 +139,22 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.matrix and not given.polynomial:
         raise UsageError('--matrix needs --polynomial: other effects have no matrix')
     effects = given.effects or given.polynomial
-    with under_way('dwells') as on_progress:
-        table = join([dwells(log, name=Path(path).name if len(logs) > 1 else '')
-                      for path, log in logs.items()])
-        if not effects and given.method is None and is_motion(list(logs.values()), table):
+    with show_progress('dwells') as on_progress:
+        table = join_dwells([extract_dwells(log, name=Path(path).name if len(logs) > 1 else '')
+                             for path, log in logs.items()])
+        if (not effects and given.method is None
+                and is_continuous_motion(list(logs.values()), table)):
             return _fit_heading(given, logs)
         on_progress(None, 'fit of effects')
         selection = (Selection(fit_effects(table, effects), (), ()) if effects
                      else select_effects(table, given.technology))
     fit = selection.calibration
-    model = _stored(given, fit.model)
+    model = _store_model(given, fit.model)
     if given.picture:
         plots.draw_residuals(given.picture, fit)
     if given.surface:
-        plots.draw_error_surface(given.surface, model, model.rate_range,
-                                 model.temperature_range, take(table, fit.scatter.kept))
+        plots.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range,
+                                 select_dwells(table, fit.scatter.inliers))
     matrix = next((polynomial_to_matrix(term.effect, term.values).tolist() for term in model.terms
                    if term.effect.name == POLYNOMIAL), None)
     lines = list(dwell_lines(model, selection))
@@ -171,27 +180,34 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         raise UsageError('a reference heading determines bias and scale_factor_error only; for '
                          'other effects, --matrix and --surface use --method dwells')
     (path, log), = logs.items()
-    with under_way('fit of scale factor error, bias and delay'):
+    with show_progress('fit of scale factor error, bias and delay'):
         found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
-    model, fit = _stored(given, found.model), found.fit
+    model, fit = _store_model(given, found.model), found.fit
     if given.picture:
         draw_headings(given.picture, found)
     remarks = list(found.remarks)
     if log.reference_heading is None:
         remarks.insert(
-            0, f'the log has a reference rate, and fewer than {FEWEST_DWELLS} stretches of '
+            0, f'the log has a reference rate, and fewer than {MIN_DWELLS} stretches of '
             'constant rate; so the rate is integrated, and headings are compared. For other '
             'effects than bias and scale factor error, hold each rate for some seconds')
     return Answer(
-        [f'{len(log)} samples of {path}, {found.lost_samples} lost.',
-         *heading_lines(model, found, remarks)],
-        {'out': given.out, 'method': found.method, **_model_data(model),
-         'time_offset_s': fit.time_offset,
-         'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
-         'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
-         'rms_heading_before_rad': found.before.rms, 'rms_heading_after_rad': found.after.rms,
-         'largest_heading_before_rad': found.before.largest,
-         'largest_heading_after_rad': found.after.largest, 'remarks': remarks}, (given.out,))
+        [
+            f'{len(log)} samples of {path}, {found.lost_samples} lost.',
+            *heading_lines(model, found, remarks)
+        ], {
+            'out': given.out,
+            'method': found.method,
+            **_model_data(model), 'time_offset_s': fit.time_offset,
+            'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
+            'reference_noise_rad': fit.reference_noise,
+            'lost_samples': found.lost_samples,
+            'rms_heading_before_rad': found.residual_before.rms,
+            'rms_heading_after_rad': found.residual_after.rms,
+            'largest_heading_before_rad': found.residual_before.largest,
+            'largest_heading_after_rad': found.residual_after.largest,
+            'remarks': remarks
+        }, (given.out, ))
 
 
 def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
@@ -199,7 +215,7 @@ def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
     name = 'course over ground' if found.method == 'course' else 'reference'
     motion = found.reference
     return plots.draw_reference(path, motion.time, motion.heading - motion.heading[0],
-                                found.before.heading, found.after.heading, name)
+                                found.residual_before.heading, found.residual_after.heading, name)
 
 
 # as data, in SI
@@ -209,9 +225,13 @@ def _model_data(model: GyroModel) -> dict[str, Any]:
     values: dict[str, dict[str, Any]] = {}
     for effect, parameter, value, deviation in model.estimates():
         values.setdefault(effect, {})[parameter.name] = {
-            'estimate': value, 'standard_deviation': deviation,
-            'ci95': [value - NORMAL_95 * deviation, value + NORMAL_95 * deviation]
-            if math.isfinite(deviation) else None, 'unit': parameter.unit}
+            'estimate': value,
+            'standard_deviation': deviation,
+            'ci95': [
+                value - NORMAL_QUANTILE_975 * deviation, value + NORMAL_QUANTILE_975 * deviation
+            ] if math.isfinite(deviation) else None,
+            'unit': parameter.unit
+        }
     return {'effects': values,
             'covariance': None if model.covariance is None else model.covariance.tolist(),
             'rate_range_rad_s': model.rate_range,
@@ -225,30 +245,45 @@ def _dwell_data(selection: Selection) -> dict[str, Any]:
     fit = selection.calibration
     table, scatter = fit.dwells, fit.scatter
     return {
-        'dwells': len(table), 'sweeps': len(np.unique(table.sweep)),
-        'outlying': [table.place[row] for row in np.flatnonzero(~scatter.kept)],
-        'condition': fit.condition, 'folded_beyond_rad_s': fit.folded_beyond,
-        'rms_before_rad_s': fit.before_rms, 'rms_residual_rad_s': fit.residual_rms,
+        'dwells': len(table),
+        'sweeps': len(np.unique(table.sweep)),
+        'outlying': [table.location[row] for row in np.flatnonzero(~scatter.inliers)],
+        'condition': fit.condition_number,
+        'folded_beyond_rad_s': fit.min_non_monotonic_rate,
+        'rms_before_rad_s': fit.uncorrected_rms,
+        'rms_residual_rad_s': fit.residual_rms,
         'rms_left_out_rad_s': fit.left_out_rms,
-        'scatter': {'dwell_rad_s': scatter.dwell, 'dwell_scale': scatter.dwell_scale,
-                    'sweep_bias_rad_s': scatter.sweep_bias, 'sweep_scale': scatter.sweep_scale},
+        'scatter': {
+            'dwell_rad_s': scatter.dwell_bias,
+            'dwell_scale': scatter.dwell_scale,
+            'sweep_bias_rad_s': scatter.sweep_bias,
+            'sweep_scale': scatter.sweep_scale
+        },
         'choices': [{
-            'effect': choice.effect, 'taken': choice.taken,
-            'left_out_without_rad_s': choice.without, 'left_out_with_rad_s': choice.with_it,
-            'chance': choice.chance, 'reason': choice.reason} for choice in selection.choices],
+            'effect': choice.effect,
+            'taken': choice.taken,
+            'left_out_without_rad_s': choice.error_without,
+            'left_out_with_rad_s': choice.error_with,
+            'chance': choice.p_value,
+            'reason': choice.reason
+        } for choice in selection.choices],
         'look_alikes': [{
-            'taken': pair.taken, 'other': pair.other, 'sigmas': pair.sigmas,
-            'parted': pair.distinguishable, 'parting_rate_rad_s': pair.rate,
-            'reason': pair.reason} for pair in selection.confounders],
-        'by_rate': [_bin_data(part, 'rad_s') for part in binned(fit, table.rate)],
-        'by_temperature': [] if table.temperature is None
-        else [_bin_data(part, 'degc') for part in binned(fit, table.temperature)],
+            'taken': pair.taken,
+            'other': pair.other,
+            'sigmas': pair.sigmas,
+            'parted': pair.is_distinguishable,
+            'parting_rate_rad_s': pair.distinguishing_rate,
+            'reason': pair.reason
+        } for pair in selection.confounders],
+        'by_rate': [_bin_data(part, 'rad_s') for part in bin_errors(fit, table.rate)],
+        'by_temperature': [] if table.temperature is None else
+        [_bin_data(part, 'degc') for part in bin_errors(fit, table.temperature)],
     }
 
 
 def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
     return {f'from_{unit}': part.low, f'to_{unit}': part.high, 'dwells': part.count,
-            'mean_before_rad_s': part.before, 'mean_residual_rad_s': part.residual,
+            'mean_before_rad_s': part.uncorrected, 'mean_residual_rad_s': part.residual,
             'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
 
 
@@ -257,7 +292,7 @@ def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
 def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
     """Give the result of a fit to dwells, its accuracy, and the reasons for its effects."""
     fit = selection.calibration
-    yield from (*_measured_lines(fit), '', *_value_lines(model), '', *_quality_lines(fit), '',
+    yield from (*_dwell_count_lines(fit), '', *_value_lines(model), '', *_quality_lines(fit), '',
                 *_bin_lines(fit), *_choice_lines(selection))
 
 
@@ -268,36 +303,36 @@ def heading_lines(model: GyroModel, found: EncoderCalibration,
     if math.isfinite(found.fit.time_offset):
         yield (f'Delay of the gyro behind the reference: {1000.0 * found.fit.time_offset:.1f} ms; '
                'the errors are corrected for it.')
-    for name, residual in (('before', found.before), ('after', found.after)):
+    for name, residual in (('before', found.residual_before), ('after', found.residual_after)):
         yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '
                f'{residual.largest / DEGREE:.3f} deg at most.')
-    if found.after.rms > 5.0 * DEGREE:
-        yield wrapped('The error is above 5 deg rms. If the gyro is nonlinear or depends on '
-                      'temperature, use --method dwells; it needs stretches of constant rate in '
-                      'the log.')
-    yield from _sentences(remarks)
+    if found.residual_after.rms > 5.0 * DEGREE:
+        yield wrap_line('The error is above 5 deg rms. If the gyro is nonlinear or depends on '
+                        'temperature, use --method dwells; it needs stretches of constant rate in '
+                        'the log.')
+    yield from _remark_lines(remarks)
 
 
-def _sentences(remarks: Iterable[str]) -> Iterator[str]:
-    yield from (wrapped(f'{remark[0].upper()}{remark[1:]}.') for remark in remarks)
+def _remark_lines(remarks: Iterable[str]) -> Iterator[str]:
+    yield from (wrap_line(f'{remark[0].upper()}{remark[1:]}.') for remark in remarks)
 
 
 def _value_lines(model: GyroModel) -> Iterator[str]:
     """Give the table of fitted values."""
     yield f'{"value":38s} {"estimate":>12s} {"std. dev.":>10s}   {"95 % interval":27s} unit'
     for effect, parameter, value, deviation in model.estimates():
-        unit, factor = _UNITS.get(parameter.unit, (parameter.unit, 1.0))
+        unit, factor = _DISPLAY_UNITS.get(parameter.unit, (parameter.unit, 1.0))
         name = effect if parameter.name == effect else f'{effect} {parameter.name}'
-        low, high = ((value + sign * NORMAL_95 * deviation) * factor for sign in (-1, 1))
-        sure = (f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}'
-                if math.isfinite(deviation) else f'{"-":>10s}   {"-":27s}')
-        yield f'{name:38s} {value * factor:12.5g} {sure} {unit}'
+        low, high = ((value + sign * NORMAL_QUANTILE_975 * deviation) * factor for sign in (-1, 1))
+        uncertainty = (f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}'
+                       if math.isfinite(deviation) else f'{"-":>10s}   {"-":27s}')
+        yield f'{name:38s} {value * factor:12.5g} {uncertainty} {unit}'
     for temperature in {term.values[0] for term in model.terms
                         if term.effect.parameters[0].name == 'reference_temperature'}:
         yield f'Temperatures are counted from {temperature:g} degC.'
 
 
-def _measured_lines(fit: Calibration) -> Iterator[str]:
+def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
     """Give the dwells that were measured, and those that were not fitted."""
     table = fit.dwells
     slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
@@ -306,41 +341,42 @@ def _measured_lines(fit: Calibration) -> Iterator[str]:
     sweeps = len(np.unique(table.sweep))
     yield (f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, '
            f'{slowest:.1f} to {fastest:.1f} deg/s{temperatures}.')
-    outlying = np.flatnonzero(~fit.scatter.kept)
+    outlying = np.flatnonzero(~fit.scatter.inliers)
     if len(outlying):
-        named = listed([f'{table.place[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
-                        for row in outlying])
-        yield wrapped(f'{len(outlying)} outlying, not fitted: {named}.')
-    yield from _sentences(table.remarks)
+        named = format_list([f'{table.location[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
+                             for row in outlying])
+        yield wrap_line(f'{len(outlying)} outlying, not fitted: {named}.')
+    yield from _remark_lines(table.remarks)
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:
     """Give the size of the errors, and warnings."""
-    scatter, several = fit.scatter, len(np.unique(fit.dwells.sweep)) >= FEWEST_SWEEPS
-    part = 'sweeps' if several else 'blocks of time'
-    yield (f'Error {fit.before_rms / DEGREE:.4f} deg/s rms before, '
+    scatter, has_sweeps = fit.scatter, len(np.unique(fit.dwells.sweep)) >= MIN_SWEEPS
+    part = 'sweeps' if has_sweeps else 'blocks of time'
+    yield (f'Error {fit.uncorrected_rms / DEGREE:.4f} deg/s rms before, '
            f'{fit.residual_rms / DEGREE:.4f} after; '
            + (f'{fit.left_out_rms / DEGREE:.4f} in {part} left out of the fit.'
               if math.isfinite(fit.left_out_rms)
               else f'no cross-validation, since some values depend on one of the {part} only.'))
-    wander = (f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s '
-              f'and {100.0 * scatter.sweep_scale:.3f} %' if several
-              else f'the scatter of sweeps needs at least {FEWEST_SWEEPS} sweeps')
-    yield wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s '
-                  f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {wander}. '
-                  f'Condition number {fit.condition:.1f}.')
-    excess = math.sqrt(fit.misfit / fit.freedom) if fit.freedom else 1.0
+    sweep_scatter = (f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s '
+                     f'and {100.0 * scatter.sweep_scale:.3f} %' if has_sweeps
+                     else f'the scatter of sweeps needs at least {MIN_SWEEPS} sweeps')
+    yield wrap_line(f'Dwells scatter by {scatter.dwell_bias / DEGREE:.4f} deg/s '
+                    f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {sweep_scatter}. '
+                    f'Condition number {fit.condition_number:.1f}.')
+    excess = math.sqrt(fit.misfit / fit.dof) if fit.dof else 1.0
     if excess > 1.2:
-        yield wrapped(f'The residual is {excess:.1f} times the scatter of the dwells about a '
-                      'smooth surface: the model lacks an effect. The intervals are widened by '
-                      'this factor.')
-    if fit.folded_beyond is not None:
-        yield wrapped(f'Above {fit.folded_beyond / DEGREE:.0f} deg/s the modelled output does '
-                      'not increase with the rate, so one output has two rates: do not use the '
-                      'model there.')
-    if not fit.freedom:
-        yield wrapped('There are as many values as dwells, so their standard deviations are '
-                      'unknown: add dwells.')
+        yield wrap_line(f'The residual is {excess:.1f} times the scatter of the dwells about a '
+                        'smooth surface: the model lacks an effect. The intervals are widened by '
+                        'this factor.')
+    if fit.min_non_monotonic_rate is not None:
+        yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s the modelled '
+                        'output does '
+                        'not increase with the rate, so one output has two rates: do not use the '
+                        'model there.')
+    if not fit.dof:
+        yield wrap_line('There are as many values as dwells, so their standard deviations are '
+                        'unknown: add dwells.')
 
 
 def _bin_lines(fit: Calibration) -> Iterator[str]:
@@ -352,10 +388,11 @@ def _bin_lines(fit: Calibration) -> Iterator[str]:
             continue
         yield (f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} '
                f'{"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s')
-        for part in binned(fit, values):
+        for part in bin_errors(fit, values):
             place = f'{part.low * factor:.1f} to {part.high * factor:.1f}'
-            before, residual, deviation, rms = (
-                value / DEGREE for value in (part.before, part.residual, part.deviation, part.rms))
+            before, residual, deviation, rms = (value / DEGREE
+                                                for value in (part.uncorrected, part.residual,
+                                                              part.deviation, part.rms))
             yield (f'{place:22s} {part.count:6d} {before:18.4f} {residual:10.4f} '
                    f'{deviation:8.4f} {rms:8.4f}')
         yield ''
@@ -366,19 +403,19 @@ def _choice_lines(selection: Selection) -> Iterator[str]:
     if selection.choices:
         yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"chance":>7s}'
     for choice in selection.choices:
-        without, with_it = (f'{_shown(value / DEGREE, ".4f"):>8s}'
-                            for value in (choice.without, choice.with_it))
-        numbers = f'{without} {with_it} {_shown(choice.chance, ".1g"):>7s}'
-        yield wrapped(f'{choice.effect:26s} {numbers}  '
-                      f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
+        without, with_it = (f'{_format_finite(value / DEGREE, ".4f"):>8s}'
+                            for value in (choice.error_without, choice.error_with))
+        numbers = f'{without} {with_it} {_format_finite(choice.p_value, ".1g"):>7s}'
+        yield wrap_line(f'{choice.effect:26s} {numbers}  '
+                        f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
     for pair in selection.confounders:
-        remedy = ('no rate up to three times the fastest' if pair.rate is None
-                  else f'two dwells each way at {pair.rate / DEGREE:.0f} deg/s')
-        if not pair.distinguishable:
-            yield wrapped(f'These data do not distinguish {pair.taken} from {pair.other}: '
-                          f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
-                          'would distinguish them.')
+        remedy = ('no rate up to three times the fastest' if pair.distinguishing_rate is None
+                  else f'two dwells each way at {pair.distinguishing_rate / DEGREE:.0f} deg/s')
+        if not pair.is_distinguishable:
+            yield wrap_line(f'These data do not distinguish {pair.taken} from {pair.other}: '
+                            f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
+                            'would distinguish them.')
 
 
-def _shown(value: float, form: str) -> str:
-    return format(value, form) if math.isfinite(value) else '-'
+def _format_finite(value: float, format_spec: str) -> str:
+    return format(value, format_spec) if math.isfinite(value) else '-'

@@ -22,117 +22,136 @@ from pathlib import Path
 import re
 from typing import Any
 
-from gyro_calibration.calibration.course_over_ground import PRIORS
+from gyro_calibration.calibration.course_over_ground import TECHNOLOGY_PRIORS
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, under_way, UsageError, wrapped
-from gyro_calibration.diagnosis.gates import is_confused
-from gyro_calibration.diagnosis.words import amount
-from gyro_calibration.files import plain, write_atomically
+from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.diagnosis.gates import is_degree_ratio
+from gyro_calibration.diagnosis.words import format_amount
+from gyro_calibration.files import to_printable, write_atomically
 from gyro_calibration.fleet.pooling import DRIVES, POWER_ONS, UNITS
-from gyro_calibration.fleet.report import report, tables
-from gyro_calibration.fleet.run import cluster, finished, Lost, processes, usual_workers
+from gyro_calibration.fleet.report import render_report, table_files
+from gyro_calibration.fleet.run import (
+    cluster_executors,
+    count_cores,
+    process_executors,
+    run_tasks,
+    WorkerLost,
+)
+from gyro_calibration.fleet.summary import (
+    build_models,
+    describe_type,
+    FALSE_ALARM_RATE,
+    format_interval,
+    summarize_types,
+    TypeSummary,
+)
 from gyro_calibration.fleet.summary import (
     data as type_data,
 )
-from gyro_calibration.fleet.summary import (
-    FALSE_ALARMS,
-    in_words,
-    models,
-    sentences,
-    summarized,
-    TypeFound,
+from gyro_calibration.fleet.table import compile_file_pattern, find_logs
+from gyro_calibration.fleet.work import (
+    DONE,
+    LogTask,
+    make_refused_record,
+    NO_EVIDENCE,
+    process_log,
 )
-from gyro_calibration.fleet.table import entries, pattern
-from gyro_calibration.fleet.work import DONE, done, NO_EVIDENCE, refused, Task
 from gyro_calibration.logs.log import DataRefused
-from gyro_calibration.model.model_file import model_text
+from gyro_calibration.model.model_file import format_model
 import numpy as np
 
-_SPOKEN = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
-           (DRIVES, 'between drives'))
+_COMPONENT_LABELS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
+                     (DRIVES, 'between drives'))
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'fleet', _fleet, 'calibrate and diagnose many logs of many gyros, '
-                      'and attribute errors to the unit, the type and the reference',
-                      'drives/ --out fleet')
+    parser = verb.add_verb(verbs, 'fleet', _fleet, 'calibrate and diagnose many logs of many '
+                                                   'gyros, '
+                           'and attribute errors to the unit, the type and the reference',
+                           'drives/ --out fleet')
     parser.add_argument('logs', metavar='LOGS', nargs='+', help='logs, folders or globs of them, '
                         'a list (.txt), or a table (.csv) with the columns log and any of unit, '
                         'type, drive, date, temperature')
     parser.add_argument('--out', metavar='DIR', required=True, help='folder of the results; logs '
                         'with a result there are not processed again')
-    parser.add_argument('--pattern', type=_pattern, metavar='TEXT', help='pattern of the file '
-                        "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
+    parser.add_argument(
+        '--pattern', type=_parse_pattern, metavar='TEXT', help='pattern of the file '
+        "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
     parser.add_argument('--type', metavar='NAME', dest='gyro_type', help='type of the gyro in '
                         'logs without a type')
-    parser.add_argument('--rate', type=verb.positive, metavar='HZ',
+    parser.add_argument('--rate', type=verb.positive_number, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
-    parser.add_argument('--technology', choices=list(PRIORS), default='mems',
+    parser.add_argument('--technology', choices=list(TECHNOLOGY_PRIORS), default='mems',
                         help='technology of the gyros; default: mems')
     parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only, which is '
                         'faster')
-    parser.add_argument('--seed', type=verb.whole, default=0, metavar='N', help='seed of the '
+    parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
+                        help='seed of the '
                         'random draws of a diagnosis; default: 0')
     parser.add_argument('--workers', type=verb.positive_integer, metavar='N',
                         help='number of processes; default: one per core')
-    parser.add_argument('--memory', type=verb.positive, metavar='GB', help='memory limit per '
+    parser.add_argument('--memory', type=verb.positive_number, metavar='GB',
+                        help='memory limit per '
                         'worker; default: an equal share of this machine')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
                         'as tcp://host:8786; its workers need the same files')
     return parser
 
 
-def _pattern(text: str) -> re.Pattern[str]:
+def _parse_pattern(text: str) -> re.Pattern[str]:
     try:
-        return pattern(text)
+        return compile_file_pattern(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _fleet(given: argparse.Namespace) -> Answer:
-    listed = entries(given.logs, without=given.out)
+    logs = find_logs(given.logs, excluded_folder=given.out)
     folder = os.path.abspath(given.out)
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise UsageError(f'{given.out}: is a file, but must be a folder; give another name')
-    drawn = None if given.no_diagnosis else np.random.default_rng(given.seed)
-    records = _records(given, [
-        Task(entry, folder, given.technology, given.pattern, drawn, given.gyro_type or '',
-             given.rate) for entry in listed])
+    generator = None if given.no_diagnosis else np.random.default_rng(given.seed)
+    records = _process_logs(given, [
+        LogTask(entry, folder, given.technology, given.pattern, generator, given.gyro_type or '',
+                given.rate) for entry in logs])
     used = [each for each in records if each['status'] == DONE]
     if not used:
         first = records[0]
         raise DataRefused(f'none of {len(records)} logs can be used; '
                           f'{first["log"]}: {first["reason"]}')
-    left = [each for each in records if each['status'] == NO_EVIDENCE]
+    excluded = [each for each in records if each['status'] == NO_EVIDENCE]
     lines = [f'{len(used)} of {len(records)} logs are calibrated.']
-    lines += [f'{each["log"]}: excluded, {each["reason"]}.' for each in left]
-    with under_way('units, types and references'):
-        types = summarized(used)
+    lines += [f'{each["log"]}: excluded, {each["reason"]}.' for each in excluded]
+    with show_progress('units, types and references'):
+        types = summarize_types(used)
     for found in types:
-        lines += ['', *(wrapped(each, 2 + len(each) - len(each.lstrip()))
-                        for each in _lines(found))]
+        lines += ['', *(wrap_line(each, 2 + len(each) - len(each.lstrip()))
+                        for each in _type_lines(found))]
     data = {'schema': 'gyro_calibration/fleet/1', 'out': given.out, 'logs': len(records),
-            'false_alarm_rate': FALSE_ALARMS,
-            'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in left],
+            'false_alarm_rate': FALSE_ALARM_RATE,
+            'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in excluded],
             'types': [type_data(found) for found in types]}
-    written = _written(given, types, records, data)
+    written = _write_results(given, types, records, data)
     lines += ['', f'Written to {given.out}: {", ".join(written)}.']
     return Answer(lines, data)
 
 
-def _written(given: argparse.Namespace, types: Sequence[TypeFound],
-             records: Sequence[dict[str, Any]], data: dict[str, Any]) -> list[str]:
+def _write_results(given: argparse.Namespace, types: Sequence[TypeSummary],
+                   records: Sequence[dict[str, Any]], data: dict[str, Any]) -> list[str]:
     """Write the results, and return the names of their files."""
-    content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
-               'report.html': report(types, records).encode(), **tables(types, records)}
+    content = {
+        'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
+        'report.html': render_report(types, records).encode(),
+        **table_files(types, records)
+    }
     names = list(content)
     for found in types:
-        for unit, model in models(found):
+        for unit, model in build_models(found):
             words = [found.name or 'type', *(['unit', unit] if unit else [])]
             name = 'models/' + '-'.join(re.sub(r'[^\w.-]', '_', each)[:60] for each in words)
             while f'{name}.yaml' in content:
                 name += '_'
-            text = model_text(replace(model, origin={**model.origin, **verb.origin_of([])}))
+            text = format_model(replace(model, origin={**model.origin, **verb.make_origin([])}))
             content[f'{name}.yaml'] = text.encode()
             names += [] if unit else [f'{name}.yaml']
     for name, each in content.items():
@@ -140,53 +159,54 @@ def _written(given: argparse.Namespace, types: Sequence[TypeFound],
     return names
 
 
-def _lines(found: TypeFound) -> Iterator[str]:
+def _type_lines(summary: TypeSummary) -> Iterator[str]:
     """Give the estimates of a type, and of its units."""
     counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
-        (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
-    yield f'{found.name or "Type not stated, pooled as one"}: {counts}.'
-    for each in found.values.values():
+        (summary.records, 'log'), (summary.units, 'unit'), (summary.drives, 'drive')) if each)
+    yield f'{summary.name or "Type not stated, pooled as one"}: {counts}.'
+    for each in summary.values.values():
         # the upper bound of a standard deviation that may be zero
         parts = [f'{spoken} {"" if of.low > 0.0 else "less than "}'
-                 f'{amount(of.estimate if of.low > 0.0 else of.high, each.unit, each.name)}'
-                 for name, spoken in _SPOKEN if (of := each.components.get(name))]
-        mean = in_words(each.mean, 0, each.unit, each.name)
+                 f'{format_amount(of.estimate if of.low > 0.0 else of.high, each.unit, each.name)}'
+                 for name, spoken in _COMPONENT_LABELS if (of := each.components.get(name))]
+        mean = format_interval(each.mean, 0, each.unit, each.name)
         yield f'  {each.name}: {mean}; {", ".join(parts)}'
-        if not each.slow:
-            yield '    ' + '; '.join(
-                f'unit {plain(name)} {in_words(each.units, place, each.unit, each.name)}'
-                for place, name in enumerate(found.units) if np.isfinite(each.units.value[place]))
-    yield from (f'  {text}.' for text in sentences(found))
+        if not each.is_slow:
+            yield '    ' + '; '.join(f'unit {to_printable(name)} '
+                                     f'{format_interval(each.units, place, each.unit, each.name)}'
+                                     for place, name in enumerate(summary.units)
+                                     if np.isfinite(each.units.value[place]))
+    yield from (f'  {text}.' for text in describe_type(summary))
 
 
-def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str, Any]]:
+def _process_logs(given: argparse.Namespace, tasks: Sequence[LogTask]) -> list[dict[str, Any]]:
     """Return the record of each log, in the order of the logs."""
     found: dict[str, dict[str, Any]] = {}
     try:
-        with (_executors(given) as (workers, create),
-              under_way(f'0 of {len(tasks)} logs') as on_progress):
-            for task, record in finished(done, tasks, workers, create):
-                found[task.entry.log] = (refused(task.entry, str(record))
-                                         if isinstance(record, Lost) else record)
+        with (_make_executors(given) as (workers, create),
+              show_progress(f'0 of {len(tasks)} logs') as on_progress):
+            for task, record in run_tasks(process_log, tasks, workers, create):
+                found[task.entry.log] = (make_refused_record(task.entry, str(record))
+                                         if isinstance(record, WorkerLost) else record)
                 on_progress(len(found) / len(tasks), f'{len(found)} of {len(tasks)} logs')
     except KeyboardInterrupt:
         raise DataRefused(f'interrupted after {len(found)} of {len(tasks)} logs; run the same '
                           'command again to continue') from None
-    return _usable([found[task.entry.log] for task in tasks])
+    return _exclude_invalid([found[task.entry.log] for task in tasks])
 
 
 @contextmanager
-def _executors(given: argparse.Namespace) -> Iterator[Any]:
+def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
     """Give the number of workers, and the function that makes executors of them."""
-    workers = given.workers or usual_workers()
+    workers = given.workers or count_cores()
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
         memory = 1e9 * given.memory if given.memory else 0.8 * machine / workers
-        with processes(workers, memory, ['gyro_calibration.fleet.work']) as create:
+        with process_executors(workers, memory, ['gyro_calibration.fleet.work']) as create:
             yield workers, create
         return
     try:
-        with cluster(given.scheduler) as create:
+        with cluster_executors(given.scheduler) as create:
             yield given.workers or 64, create
     except ImportError:
         raise UsageError('--scheduler needs distributed, which is not installed; install '
@@ -197,28 +217,30 @@ def _executors(given: argparse.Namespace) -> Iterator[Any]:
                          'tcp://host:8786') from None
 
 
-def _usable(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _exclude_invalid(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the records, with those excluded whose fault only the whole fleet shows."""
-    first: dict[str, str] = {}
+    first_log: dict[str, str] = {}
     for each in sorted(records, key=lambda one: not one['unit']):
-        first.setdefault(each['content'], each['log'])
-    usual = {each['type']: float(np.median([
-        _noise(one) for one in records if _noise(one) and one['type'] == each['type']]))
-        for each in records if _noise(each)}
+        first_log.setdefault(each['content'], each['log'])
+    median_noise = {each['type']: float(np.median([
+        _rest_noise(one) for one in records if _rest_noise(one) and one['type'] == each['type']]))
+        for each in records if _rest_noise(each)}
     found = []
     for each in records:
-        why = ''
-        if each['status'] == DONE and first[each['content']] != each['log']:
-            why = f'it is a copy of {first[each["content"]]}'
+        exclusion = ''
+        if each['status'] == DONE and first_log[each['content']] != each['log']:
+            exclusion = f'it is a copy of {first_log[each["content"]]}'
         elif each['status'] == DONE and not each['unit']:
-            why = 'its unit is unknown; give a table or --pattern'
-        elif _noise(each) and is_confused(ratio := _noise(each) / usual[each['type']]):
-            why = (f'its white noise is {ratio:.3g} times the median of its type, as by deg/s in '
-                   'place of rad/s; correct the unit of its column, or state its type')
-        found.append({**each, 'status': NO_EVIDENCE, 'reason': why} if why else each)
+            exclusion = 'its unit is unknown; give a table or --pattern'
+        elif (_rest_noise(each)
+                and is_degree_ratio(ratio := _rest_noise(each) / median_noise[each['type']])):
+            exclusion = (f'its white noise is {ratio:.3g} times the median of its type, as by '
+                         'deg/s in '
+                         'place of rad/s; correct the unit of its column, or state its type')
+        found.append({**each, 'status': NO_EVIDENCE, 'reason': exclusion} if exclusion else each)
     return found
 
 
-def _noise(record: dict[str, Any]) -> float:
+def _rest_noise(record: dict[str, Any]) -> float:
     """Return the angle random walk of a log at rest; 0 for other logs, whose motion adds to it."""
     return record['noise']['angle_random_walk'] if record.get('method') == 'rest' else 0.0

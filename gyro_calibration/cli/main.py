@@ -30,20 +30,20 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 # ruff: noqa: E402
 from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
-from gyro_calibration.cli.verb import say, UsageError
+from gyro_calibration.cli.verb import print_message, UsageError
 from gyro_calibration.diagnosis.causes import add_causes
-from gyro_calibration.files import explained, InputError, plain, reason
+from gyro_calibration.files import describe_error, describe_os_error, InputError, to_printable
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.effects import add_effects
 import numpy as np
 
-_DONE, _NO_ANSWER, _WRONG_USE = 0, 1, 2
+_EXIT_DONE, _EXIT_NO_ANSWER, _EXIT_WRONG_USE = 0, 1, 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb, print its answer, and return 0 (done), 1 (no answer) or 2 (wrong use)."""
     words = sys.argv[1:] if arguments is None else arguments
-    given = _parser(words[0] if words else '').parse_args(words)
+    given = _make_parser(words[0] if words else '').parse_args(words)
     try:
         for name, value in vars(given).items():
             # for example from a shell variable that is not set
@@ -53,23 +53,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _load_effects(path)
         answer = given.verb(given)
         text = (None if answer is None else answer.text if not given.json
-                else json.dumps(_numbers(answer.data), allow_nan=False))
+                else json.dumps(_replace_non_finite(answer.data), allow_nan=False))
     except DataRefused as error:
-        say(error)
-        return _NO_ANSWER
+        print_message(error)
+        return _EXIT_NO_ANSWER
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
-        say(f'the values exceed the range of computation ({reason(error)}); '
-            'check columns and units')
-        return _NO_ANSWER
+        print_message(f'the values exceed the range of computation ({describe_error(error)}); '
+                      'check columns and units')
+        return _EXIT_NO_ANSWER
     except InputError as error:
-        say(error)
-        return _WRONG_USE
+        print_message(error)
+        return _EXIT_WRONG_USE
     except OSError as error:
-        say(explained(error))
-        return _WRONG_USE
+        print_message(describe_os_error(error))
+        return _EXIT_WRONG_USE
     if text is not None:
-        _show(text)
-    return _DONE
+        _print_text(text)
+    return _EXIT_DONE
 
 
 def _load_effects(path: str) -> None:
@@ -97,21 +97,22 @@ def _load_effects(path: str) -> None:
                          'Effect') from None
 
 
-def _numbers(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     """Return JSON data: numbers that are not finite become null."""
     if isinstance(value, dict):
-        return {name: _numbers(each) for name, each in value.items()}
+        return {name: _replace_non_finite(each) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_numbers(each) for each in value]
+        return [_replace_non_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _show(text: str) -> None:
+def _print_text(text: str) -> None:
     """Print; a closed pipe, such as of `head`, or a file name that is not text is no error."""
     encoding = sys.stdout.encoding or 'utf-8'
     try:
-        print(plain(text, kept='\n').encode(encoding, 'backslashreplace').decode(encoding),
-              flush=True)
+        print(
+            to_printable(text, allowed='\n').encode(encoding, 'backslashreplace').decode(encoding),
+            flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -120,7 +121,7 @@ class _Parser(argparse.ArgumentParser):
     """Reports wrong arguments without control characters, which names of files may contain."""
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        super()._print_message(plain(message, kept='\n'), file)
+        super()._print_message(to_printable(message, allowed='\n'), file)
 
     def error(self, message: str) -> NoReturn:
         if '--technology' in message and message.startswith('unrecognized arguments'):
@@ -130,18 +131,18 @@ class _Parser(argparse.ArgumentParser):
         super().error(message)
 
 
-def _parser(called: str = '') -> argparse.ArgumentParser:
+def _make_parser(verb_name: str = '') -> argparse.ArgumentParser:
     """Return the parser of the called verb, or of all verbs."""
     parser = _Parser(prog='gyro_calibration',
                      description='Calibrate, compensate and diagnose gyros with one axis.')
     parser.add_argument('--version', action='version', version=__version__)
     verbs = parser.add_subparsers(required=True, metavar='VERB')
-    name = str(called).replace('-', '_')
+    name = str(verb_name).replace('-', '_')
     for verb in [name] if name in VERBS else VERBS:
-        of_verb = import_module(f'gyro_calibration.cli.{verb}').add(verbs)
-        of_verb.add_argument('--json', action='store_true',
-                             help='print one JSON object and nothing else')
-        of_verb.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
-                             help='Python file, which is executed, with EFFECTS, a list of '
-                             'further effects for models and diagnoses')
+        verb_parser = import_module(f'gyro_calibration.cli.{verb}').add(verbs)
+        verb_parser.add_argument('--json', action='store_true',
+                                 help='print one JSON object and nothing else')
+        verb_parser.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
+                                 help='Python file, which is executed, with EFFECTS, a list of '
+                                 'further effects for models and diagnoses')
     return parser

@@ -17,27 +17,32 @@ from dataclasses import asdict
 from typing import Any
 
 from gyro_calibration.calibration.motion_design import (
-    Ability,
-    able,
-    best,
-    Forecast,
-    plain,
+    CalibrationForecast,
+    can_follow,
+    find_best_motion,
+    plain_motion,
     Plan,
     Prediction,
+    RobotLimits,
 )
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_motion
-from gyro_calibration.cli.verb import Answer, under_way, UsageError
-from gyro_calibration.files import reason, write_atomically
+from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.files import describe_error, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import CALIBRATION, Motion, motion_by_name, NAMED
+from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_by_name, NAMED_MOTIONS
 from gyro_calibration.model.presets import XV3500
-from gyro_calibration.model.settings_file import checked, number, read_settings, WrongValue
+from gyro_calibration.model.settings_file import (
+    InvalidValue,
+    parse_number,
+    read_settings,
+    validate,
+)
 import numpy as np
 
-#: Name of a limit in a file -> its name in `Ability`, its unit, and the range of its numbers.
-LIMITS = {
+#: Name of a limit in a file -> its name in `RobotLimits`, its unit, and the range of its numbers.
+LIMIT_FIELDS = {
     'maximum_rate_dps': ('rate', DEGREE, 0.01, 1e5),
     'maximum_acceleration_dps2': ('acceleration', DEGREE, 0.01, 1e6),
     'maximum_jerk_dps3': ('jerk', DEGREE, 0.01, 1e9),
@@ -47,37 +52,37 @@ LIMITS = {
     'rest_s': ('rest', 1.0, 0.1, 100.0),
 }
 #: Lengths for which the answer predicts the accuracy, s, and the longest that is planned.
-LENGTHS, LONGEST = (20.0, 30.0, 60.0, 120.0), 300.0
+COMPARED_DURATIONS, MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'plan', _plan,
-                      'compute the motion that calibrates best within the limits of a robot',
-                      '--limits limits.yaml --seconds 20 --out profile.csv')
+    parser = verb.add_verb(verbs, 'plan', _plan,
+                           'compute the motion that calibrates best within the limits of a robot',
+                           '--limits limits.yaml --seconds 20 --out profile.csv')
     parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
                         help='limits of the robot; config/limits.yaml is an example')
-    parser.add_argument('--seconds', type=verb.positive, default=20.0, metavar='S',
+    parser.add_argument('--seconds', type=verb.positive_number, default=20.0, metavar='S',
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
-    verb.add_picture(parser, 'the motion')
+    verb.add_picture_option(parser, 'the motion')
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model with noise figures; default: that of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
                         help='drive after the calibration whose heading error is predicted, one '
-                        f'of {", ".join(NAMED)} or a profile; default: robot')
-    parser.add_argument('--drive', type=verb.positive, metavar='S',
+                        f'of {", ".join(NAMED_MOTIONS)} or a profile; default: robot')
+    parser.add_argument('--drive', type=verb.positive_number, metavar='S',
                         help='length of that drive, which is repeated; default: its own length')
-    parser.add_argument('--seed', type=verb.whole, default=1,
+    parser.add_argument('--seed', type=verb.non_negative_integer, default=1,
                         help='seed of the search; default: 1')
     return parser
 
 
 def _plan(given: argparse.Namespace) -> Answer:
-    if given.seconds > LONGEST:
-        raise UsageError(f'--seconds {given.seconds:g} is above {LONGEST:g}; '
+    if given.seconds > MAX_DURATION:
+        raise UsageError(f'--seconds {given.seconds:g} is above {MAX_DURATION:g}; '
                          'plan a shorter motion and repeat it')
-    ability = read_limits(given.limits)
+    robot = read_limits(given.limits)
     noise = read_model(given.model).noise if given.model else XV3500.noise
     if not noise.angle_random_walk:
         raise UsageError(f'{given.model}: has no angle_random_walk; '
@@ -85,30 +90,32 @@ def _plan(given: argparse.Namespace) -> Answer:
     drive = motion_by_name(given.motion)
     given.drive = given.drive or drive.duration
 
-    def planned(seconds: float, generations: int = 30) -> tuple[Plan, Forecast]:
-        forecast = Forecast(noise, seconds, drive, given.drive)
-        return best(ability, forecast, seconds, np.random.default_rng(given.seed),
-                    generations), forecast
-    lengths = [each for each in LENGTHS if each > given.seconds]
-    with under_way(f'search for the best motion of {given.seconds:g} s') as on_progress:
-        plan, forecast = planned(given.seconds, 60)
-        more = {}
+    def find_plan(seconds: float, generations: int = 30) -> tuple[Plan, CalibrationForecast]:
+        forecast = CalibrationForecast(noise, seconds, drive, given.drive)
+        return find_best_motion(robot, forecast, seconds, np.random.default_rng(given.seed),
+                                generations), forecast
+    lengths = [each for each in COMPARED_DURATIONS if each > given.seconds]
+    with show_progress(f'search for the best motion of {given.seconds:g} s') as on_progress:
+        plan, forecast = find_plan(given.seconds, 60)
+        longer = {}
         for seconds in lengths:
             on_progress(None, f'for comparison, the best motion of {seconds:g} s')
-            more[seconds] = planned(seconds)[0].prediction
-    built_in = Forecast(noise, CALIBRATION.duration, drive, given.drive).predict(CALIBRATION)
+            longer[seconds] = find_plan(seconds)[0].prediction
+    built_in = CalibrationForecast(noise, CALIBRATION_MOTION.duration, drive,
+                                   given.drive).predict(CALIBRATION_MOTION)
     rows = {'planned': plan.prediction,
-            'plain': forecast.predict(plain(ability, given.seconds)), 'built_in': built_in}
+            'plain': forecast.predict(plain_motion(robot, given.seconds)), 'built_in': built_in}
     if given.out:
         write_motion(given.out, plan.motion)
     if given.picture:
-        draw_motion(given.picture, plan.motion, ability.rate)
-    fits = able(ability, CALIBRATION)
-    return Answer(_lines(given, plan, rows, more, fits), _data(given, plan, rows, more, fits),
+        draw_motion(given.picture, plan.motion, robot.rate)
+    is_built_in_feasible = can_follow(robot, CALIBRATION_MOTION)
+    return Answer(_lines(given, plan, rows, longer, is_built_in_feasible),
+                  _data(given, plan, rows, longer, is_built_in_feasible),
                   (given.picture, given.out))
 
 
-def read_limits(path: str) -> Ability:
+def read_limits(path: str) -> RobotLimits:
     """
     Read the limits of a robot.
 
@@ -121,27 +128,27 @@ def read_limits(path: str) -> Ability:
     try:
         content = read_settings(path)
     except (OSError, ValueError) as error:
-        raise UsageError(f'{path}: cannot be read as YAML ({reason(error)}); '
+        raise UsageError(f'{path}: cannot be read as YAML ({describe_error(error)}); '
                          'start with a copy of config/limits.yaml') from error
     try:
-        given = checked('the file', content, dict.fromkeys(LIMITS, _limit))
-    except WrongValue as error:
+        given = validate('the file', content, dict.fromkeys(LIMIT_FIELDS, _check_limit))
+    except InvalidValue as error:
         raise UsageError(f'{path}: {error}; config/limits.yaml is an example') from None
     missing = [name for name in ('maximum_rate_dps', 'maximum_acceleration_dps2')
                if name not in given]
     if missing:
         raise UsageError(f'{path}: {missing[0]} is missing; add the limit of the robot')
-    ability = Ability(**{LIMITS[name][0]: value * LIMITS[name][1]
-                         for name, value in given.items()})
-    if ability.slowest > ability.rate:
+    robot = RobotLimits(**{LIMIT_FIELDS[name][0]: value * LIMIT_FIELDS[name][1]
+                           for name, value in given.items()})
+    if robot.slowest > robot.rate:
         raise UsageError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
                          'them')
-    return ability
+    return robot
 
 
-def _limit(place: str, value: Any) -> float:
+def _check_limit(place: str, value: Any) -> float:
     name = place.rpartition('.')[2]
-    return number(name, value, *LIMITS[name][2:])
+    return parse_number(name, value, *LIMIT_FIELDS[name][2:])
 
 
 def write_motion(path: str, motion: Motion) -> None:
@@ -152,25 +159,30 @@ def write_motion(path: str, motion: Motion) -> None:
     write_atomically(path, ('\n'.join(lines) + '\n').encode())
 
 
-_NAMES = {'planned': 'planned', 'plain': 'one turn there and back',
-          'built_in': 'built-in profile, 20 s'}
+_MOTION_LABELS = {'planned': 'planned', 'plain': 'one turn there and back',
+                  'built_in': 'built-in profile, 20 s'}
 
 
 def _lines(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
-           more: dict[float, Prediction], fits: bool) -> list[str]:
+           longer: dict[float, Prediction], is_built_in_feasible: bool) -> list[str]:
     rate, angle = plan.motion.rate_at(plan.motion.time) / DEGREE, plan.motion.heading / DEGREE
     lines = [
         f'A motion of {given.seconds:g} s with rates of {rate.min():.1f} to {rate.max():.1f} '
         f'deg/s and headings of {angle.min():.0f} to {angle.max():.0f} deg.', '',
         f'Expected of a calibration, and of the heading over {given.drive:g} s after it:']
-    lines += [_row(_NAMES[name] + ('' if fits or name != 'built_in' else ', beyond the limits'),
-                   row) for name, row in rows.items()]
-    lines += [_row(f'planned, {seconds:g} s', row) for seconds, row in more.items()]
-    scale, less = _gains(rows)
+    lines += [
+        _row(
+            _MOTION_LABELS[name] +
+            ('' if is_built_in_feasible or name != 'built_in' else ', beyond the limits'), row)
+        for name, row in rows.items()
+    ]
+    lines += [_row(f'planned, {seconds:g} s', row) for seconds, row in longer.items()]
+    scale_gain, heading_gain = _gains(rows)
     return lines + [
         '', 'Compared with one turn there and back, the scale factor is '
-        f'{scale:.2f} times as accurate, and the mean heading error is {100 * abs(less):.2f} % '
-        f'{"smaller" if less >= 0.0 else "larger"}.',
+        f'{scale_gain:.2f} times as accurate, and the mean heading error is '
+        f'{100 * abs(heading_gain):.2f} % '
+        f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
         f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the error, '
         'independent of the calibration.']
 
@@ -189,12 +201,22 @@ def _gains(rows: dict[str, Prediction]) -> tuple[float, float]:
 
 
 def _data(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
-          more: dict[float, Prediction], fits: bool) -> dict[str, Any]:
-    scale, heading = _gains(rows)
-    return {'duration_s': plan.motion.duration, 'time_s': plan.motion.time.tolist(),
-            'rate_rad_s': plan.motion.rate_at(plan.motion.time).tolist(),
-            **{name: asdict(row) for name, row in rows.items()},
-            'built_in_within_limits': fits, 'scale_gain': scale, 'heading_gain': heading,
-            'more_seconds': [{'duration_s': seconds, **asdict(row)}
-                             for seconds, row in more.items()],
-            'drive_s': given.drive, 'seed': given.seed, 'out': given.out}
+          longer: dict[float, Prediction], is_built_in_feasible: bool) -> dict[str, Any]:
+    scale_gain, heading_gain = _gains(rows)
+    return {
+        'duration_s': plan.motion.duration,
+        'time_s': plan.motion.time.tolist(),
+        'rate_rad_s': plan.motion.rate_at(plan.motion.time).tolist(),
+        **{
+            name: asdict(row) for name, row in rows.items()
+        }, 'built_in_within_limits': is_built_in_feasible,
+        'scale_gain': scale_gain,
+        'heading_gain': heading_gain,
+        'more_seconds': [{
+            'duration_s': seconds,
+            **asdict(row)
+        } for seconds, row in longer.items()],
+        'drive_s': given.drive,
+        'seed': given.seed,
+        'out': given.out
+    }

@@ -29,7 +29,7 @@ from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration
 from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.calibration.turn_error import TurnErrors
-from gyro_calibration.files import replacing
+from gyro_calibration.files import open_replacement
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE, Mask
 from gyro_calibration.model.gyro_model import GyroModel
@@ -37,10 +37,10 @@ from gyro_calibration.model.motion import Motion
 import numpy as np
 
 #: Lines that are distinguished without colour.
-_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
+_LINE_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
 #: Colour maps of values with a sign, symmetric about zero, and of others; both are suitable for
 #: the colour-blind.
-_DIVERGING, _SEQUENTIAL = 'RdBu_r', 'cividis'
+_DIVERGING_COLORMAP, _SEQUENTIAL_COLORMAP = 'RdBu_r', 'cividis'
 
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
@@ -48,7 +48,7 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
     """Draw headings, rad, against the truth, and their errors (figure 10 of Hong and Park)."""
     figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1.3))
     above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='truth')
-    for (name, heading), style in zip(headings.items(), _STYLES * len(headings)):
+    for (name, heading), style in zip(headings.items(), _LINE_STYLES * len(headings)):
         above.plot(time, heading / DEGREE, linestyle=style, linewidth=1)
         below.plot(time, (heading - true) / DEGREE, linestyle=style, label=name)
     above.set(ylabel='heading [deg]', title='Heading of the robot by its gyro')
@@ -56,7 +56,8 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')
-    return _save(figure, path, 'Below: the flatter a line and the nearer to zero, the better.')
+    return _save_figure(figure, path, 'Below: the flatter a line and the nearer to zero, the '
+                                      'better.')
 
 
 def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
@@ -80,9 +81,11 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
         axes.set(ylabel='difference [deg]',
                  title=f'Gyro {when}, less the {name}: rms {rms(error) / DEGREE:.3g} deg')
     below.set_xlabel('time [s]')
-    return _save(figure, path, 'The lower panels show the difference about its mean, each on its '
-                 'own scale. A slope is bias; what follows the turns is scale factor error; an '
-                 'even band is the resolution of the reference.')
+    return _save_figure(figure, path, 'The lower panels show the difference about its mean, each '
+                                      'on its '
+                        'own scale. A slope is bias; what follows the turns is scale factor '
+                        'error; an '
+                        'even band is the resolution of the reference.')
 
 
 def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array,
@@ -101,8 +104,9 @@ def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')
-    return _save(figure, path, 'Above: the rates coincide if the log belongs to the motion. '
-                 'Below: the error before follows the turns; after, it stays near zero.')
+    return _save_figure(figure, path, 'Above: the rates coincide if the log belongs to the '
+                                      'motion. '
+                        'Below: the error before follows the turns; after, it stays near zero.')
 
 
 def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
@@ -115,8 +119,9 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
     above.set(ylabel='rate [deg/s]', title=f'Motion of {motion.duration:.3g} s to calibrate by')
     below.plot(time, motion.heading_at(time) / DEGREE, color='black')
     below.set(xlabel='time [s]', ylabel='heading [deg]')
-    return _save(figure, path, 'Dotted: rate limit of the robot. Turns both ways separate scale '
-                 'factor error and bias; rests show the bias.')
+    return _save_figure(figure, path, 'Dotted: rate limit of the robot. Turns both ways separate '
+                                      'scale '
+                        'factor error and bias; rests show the bias.')
 
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
@@ -137,12 +142,13 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
     axes.loglog(times, fit.deviation(times) * hour, '-', color='black', linewidth=1,
                 label='sum of the parts')
     lowest, highest = 0.4 * float(chart.lower.min()), 2.5 * float(chart.upper.max())
-    for each, style in zip((each for each in fit.figures.values() if each.value), _STYLES[1:]):
-        line = each.value * np.sqrt(each.part.variance(times))
+    for each, style in zip((each for each in fit.figures.values() if each.value),
+                           _LINE_STYLES[1:]):
+        line = each.value * np.sqrt(each.term.allan_variance(times))
         shown = (line > lowest) & (line < highest)
         axes.loglog(times[shown], line[shown] * hour, linestyle=style, linewidth=1.2,
-                    color='0.25', label=names[each.part.symbol])
-        symbol, along, up = each.part.symbol, times[shown], line[shown] * hour
+                    color='0.25', label=names[each.term.symbol])
+        symbol, along, up = each.term.symbol, times[shown], line[shown] * hour
         # IEEE Std 952 reads angle random walk at 1 s; the others are named along their line
         at = (int(np.argmin(np.abs(along - 1.0))) if symbol == 'N'
               else len(along) * (1 if symbol in 'BQ' else 2) // 3)
@@ -154,8 +160,9 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
              ylim=(lowest * hour, highest * hour), title='Allan deviation of the gyro at rest')
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
-    return _save(figure, path, 'Slope -1/2: white noise, N at 1 s. Flat: flicker, at 0.664 B. '
-                 'Slope +1/2: random walk of the bias.')
+    return _save_figure(figure, path, 'Slope -1/2: white noise, N at 1 s. Flat: flicker, at 0.664 '
+                                      'B. '
+                        'Slope +1/2: random walk of the bias.')
 
 
 # rate tables
@@ -171,26 +178,29 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
 
     """
     output = np.linspace(*rate_range, 161)
-    thermal = bool(np.isfinite(temperature_range).all()
-                   and temperature_range[0] < temperature_range[1])
-    figure, panels = _panels(1, 2 if thermal else 1, (11, 5) if thermal else (7, 5))
-    if thermal:
+    has_temperature = bool(np.isfinite(temperature_range).all()
+                           and temperature_range[0] < temperature_range[1])
+    figure, panels = _panels(1, 2 if has_temperature else 1, (11, 5) if has_temperature else
+                             (7, 5))
+    if has_temperature:
         _draw_contours(panels[0, 0], model, output, np.linspace(*temperature_range, 81), dwells)
-    temperatures = (np.linspace(*temperature_range, 4) if thermal
+    temperatures = (np.linspace(*temperature_range, 4) if has_temperature
                     else np.array([model.reference_temperature]))
     axes = panels[0, -1]
     if dwells is not None:
         axes.plot(dwells.output / DEGREE, (dwells.output - dwells.rate) / DEGREE, '.',
                   color='0.6', markersize=3, label='measured')
-    for temperature, style in zip(temperatures, _STYLES):
+    for temperature, style in zip(temperatures, _LINE_STYLES):
         error = output - model.rate(output, np.full(len(output), temperature))
-        name = f'model at {temperature:.1f} °C' if thermal else 'model'
+        name = f'model at {temperature:.1f} °C' if has_temperature else 'model'
         axes.plot(output / DEGREE, error / DEGREE, linestyle=style, color='black', label=name)
     axes.set(xlabel='gyro output [deg/s]', ylabel='error: output less rate [deg/s]',
              title='Error over the output')
     axes.legend(loc='best')
-    return _save(figure, path, 'The error that the model removes; red: the output is above the '
-                 'true rate, blue: below it.' if thermal else 'The error that the model removes.')
+    return _save_figure(
+        figure, path, 'The error that the model removes; red: the output is above '
+        'the '
+        'true rate, blue: below it.' if has_temperature else 'The error that the model removes.')
 
 
 def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Array,
@@ -203,7 +213,7 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
         low, high if high > low else low + 1e-6)
     largest = float(np.abs(levels).max())
     axes.grid(False)
-    axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING, alpha=0.8,
+    axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING_COLORMAP, alpha=0.8,
                   vmin=-largest, vmax=largest, extend='both')
     lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
     if dwells is not None and dwells.temperature is not None:
@@ -227,52 +237,53 @@ def _label_places(levels: Sequence[Sequence[Array]]) -> list[tuple[float, float]
 
 def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
     """Draw the errors of dwells before and after a model (figures 5 and 7 of Ojeda et al.)."""
-    dwells, kept = calibration.dwells, calibration.scatter.kept
+    dwells, kept = calibration.dwells, calibration.scatter.inliers
     rate = dwells.rate / DEGREE
     columns = [(rate, 'rate [deg/s]', dwells.temperature, 'temperature [°C]')]
     if dwells.temperature is not None:
         columns.append((dwells.temperature, 'temperature [°C]', rate, 'rate [deg/s]'))
     rows = [(dwells.output - dwells.rate, 'output less rate [deg/s]', 'Before', ''),
             (calibration.residual, 'residual [deg/s]', 'After',
-             f', left-out sweeps {rms(calibration.left_out[kept]) / DEGREE:.3g} deg/s')]
+             f', left-out sweeps {rms(calibration.left_out_residual[kept]) / DEGREE:.3g} deg/s')]
     figure, panels = _panels(2, len(columns), (5.5 * len(columns) + 0.5, 8))
     for column, (across, label, shade, shade_label) in enumerate(columns):
         for row, (error, name, when, more) in enumerate(rows):
             axes = panels[row, column]
             dots = _draw_errors(axes, across, error / DEGREE, kept, shade,
-                                _DIVERGING if shade is rate else _SEQUENTIAL)
+                                _DIVERGING_COLORMAP if shade is rate else _SEQUENTIAL_COLORMAP)
             axes.set(xlabel=label, ylabel=name,
                      title=f'{when}: rms {rms(error[kept]) / DEGREE:.3g} deg/s' + more)
         if shade is not None:
             figure.colorbar(dots, ax=panels[:, column], label=shade_label, location='bottom',
                             aspect=40, shrink=0.9)
-    return _save(figure, path, 'Below: dots without a shape and without bands of one colour are '
-                 'noise; a curve or a band is an effect that the model lacks.')
+    return _save_figure(figure, path, 'Below: dots without a shape and without bands of one '
+                                      'colour are '
+                        'noise; a curve or a band is an effect that the model lacks.')
 
 
-def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Array | None,
-                 colours: str) -> Any:
+def _draw_errors(axes: Any, across: Array, error: Array, is_inlier: Mask,
+                 colour_values: Array | None, colours: str) -> Any:
     """Draw errors as coloured dots, on the scale of those kept; others beyond it at the edge."""
-    dots = _draw_dots(axes, across[kept], error[kept], None if shade is None else shade[kept],
-                      colours)
-    low, high = float(error[kept].min()), float(error[kept].max())
+    dots = _draw_dots(axes, across[is_inlier], error[is_inlier],
+                      None if colour_values is None else colour_values[is_inlier], colours)
+    low, high = float(error[is_inlier].min()), float(error[is_inlier].max())
     margin = 0.12 * (high - low) or 1e-3
     axes.set_ylim(low - margin, high + margin)
-    if not kept.all():
-        shown = np.clip(error[~kept], low - 0.6 * margin, high + 0.6 * margin)
-        beyond = ', at the edge: beyond it' if (shown != error[~kept]).any() else ''
-        axes.plot(across[~kept], shown, 'x', color='black', markersize=8,
+    if not is_inlier.all():
+        shown = np.clip(error[~is_inlier], low - 0.6 * margin, high + 0.6 * margin)
+        beyond = ', at the edge: beyond it' if (shown != error[~is_inlier]).any() else ''
+        axes.plot(across[~is_inlier], shown, 'x', color='black', markersize=8,
                   label=f'{len(shown)} outlying{beyond}')
         axes.legend(loc='best')
     axes.axhline(0.0, color='black', linewidth=0.5)
     return dots
 
 
-def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float) -> Any:
+def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: float) -> Any:
     """
     Draw the errors of full turns with a static bias only and with the model.
 
-    Each has its own scale (figures 8 and 9 of Ojeda et al.); slower turns than `slowest`, rad/s,
+    Each has its own scale (figures 8 and 9 of Ojeda et al.); slower turns than `min_rate`, rad/s,
     are left out.
 
     """
@@ -282,7 +293,7 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float
                                   ('static bias only', 'the model and its static bias')):
         dots = _draw_dots(axes, errors.rate / DEGREE, error / DEGREE, temperature)
         limit = 1.15 * float(np.abs(error).max()) / DEGREE or 1e-3
-        axes.axvspan(-slowest / DEGREE, slowest / DEGREE, facecolor='none', edgecolor='0.7',
+        axes.axvspan(-min_rate / DEGREE, min_rate / DEGREE, facecolor='none', edgecolor='0.7',
                      hatch='///', linewidth=0)
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set(xlabel='rate [deg/s]', ylabel='error [deg per turn]', ylim=(-limit, limit),
@@ -293,9 +304,12 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float
         percent.set_ylabel('error [% of a turn]')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
-    return _save(figure, path, 'Greys in order: temperature. A step between the senses: scale '
-                 'factor error; a curve: nonlinearity; growth towards slow turns: bias or noise. '
-                 f'Hatched: slower than {slowest / DEGREE:g} deg/s, left out. Scales differ.')
+    return _save_figure(figure, path, 'Greys in order: temperature. A step between the senses: '
+                                      'scale '
+                        'factor error; a curve: nonlinearity; growth towards slow turns: bias or '
+                        'noise. '
+                        f'Hatched: slower than {min_rate / DEGREE:g} deg/s, left out. Scales '
+                        'differ.')
 
 
 def _panels(rows: int, columns: int, inches: tuple[float, float],
@@ -310,23 +324,23 @@ def _panels(rows: int, columns: int, inches: tuple[float, float],
     return figure, panels
 
 
-def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None,
+def _draw_dots(axes: Any, across: Array, up: Array, colour_values: Array | None,
                colours: str = 'Greys') -> Any:
     """Draw dots, each in the colour that a quantity gives it; no dot is white."""
-    if shade is None:
+    if colour_values is None:
         return axes.scatter(across, up, s=9, linewidths=0, color='black')
-    largest, span = float(np.abs(shade).max()), float(np.ptp(shade))
-    low, high = ((-largest, largest) if colours == _DIVERGING
-                 else (float(shade.min()) - (0.35 * span if colours == 'Greys' else 0.0),
-                       float(shade.max())))
-    return axes.scatter(across, up, s=14, linewidths=0.3, edgecolors='0.3', c=shade, cmap=colours,
-                        vmin=low, vmax=high)
+    largest, span = float(np.abs(colour_values).max()), float(np.ptp(colour_values))
+    low, high = ((-largest, largest) if colours == _DIVERGING_COLORMAP
+                 else (float(colour_values.min()) - (0.35 * span if colours == 'Greys' else 0.0),
+                       float(colour_values.max())))
+    return axes.scatter(across, up, s=14, linewidths=0.3, edgecolors='0.3', c=colour_values,
+                        cmap=colours, vmin=low, vmax=high)
 
 
-def _save(figure: Any, path: str | Path | None, caption: str) -> Any:
+def _save_figure(figure: Any, path: str | Path | None, caption: str) -> Any:
     # 13 letters of this size go into an inch
     figure.supxlabel(fill(caption, int(13 * figure.get_figwidth())), fontsize=9)
     if path is not None:
-        with replacing(path) as file:
+        with open_replacement(path) as file:
             figure.savefig(file, dpi=110, format=Path(path).suffix[1:])
     return figure

@@ -25,49 +25,49 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.driver.connection import AUTO, Connection, State
+from gyro_calibration.driver.connection import AUTO, Connection, ConnectionState
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.recorder import (
-    about,
     CsvRecorder,
     DiskFull,
-    KINDS,
+    FILE_SUFFIXES,
     McapRecorder,
-    Notes,
-    PIECE,
+    NotesCallback,
+    recording_notes,
+    WRITE_INTERVAL,
 )
-from gyro_calibration.driver.timestamps import ClockSteps, steady
-from gyro_calibration.files import InputError, plain
+from gyro_calibration.driver.timestamps import ClockStepDetector, read_steady_clock
+from gyro_calibration.files import InputError, to_printable
 from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
-from gyro_calibration.logs.recording import read_recording, Topics, wrong_kind
+from gyro_calibration.logs.recording import read_recording, topic_type_fault, Topics
 from gyro_calibration.logs.ros_bag import Message
 from tqdm import tqdm
 
 _Recorder = CsvRecorder | McapRecorder
 
-_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
-_INCREMENTS = {'always': True, 'never': False, 'default': None}
-_LARGEST_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
-_PATIENCE = 5.0  # s; after which topics without a publisher are named
+_DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
+_INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
+_MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
+_PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'record', _record,
-                      'record a gyro, from its port or from topics, until Ctrl-C',
-                      '--port /dev/ttyUSB0 --out drive.csv')
+    parser = verb.add_verb(verbs, 'record', _record,
+                           'record a gyro, from its port or from topics, until Ctrl-C',
+                           '--port /dev/ttyUSB0 --out drive.csv')
     parser.add_argument('--out', required=True, metavar='FILE',
-                        help=f'a new file, {", ".join(KINDS)}')
-    parser.add_argument('--seconds', type=verb.positive, metavar='N',
+                        help=f'a new file, {", ".join(FILE_SUFFIXES)}')
+    parser.add_argument('--seconds', type=verb.positive_number, metavar='N',
                         help='duration, s; default: until interrupted')
     topics = parser.add_argument_group('from topics, with ROS 2')
     topics.add_argument('--topic', metavar='TOPIC',
-                        help=f'topic of the gyro; default: {_TOPICS["gyro"]}')
+                        help=f'topic of the gyro; default: {_DEFAULT_TOPICS["gyro"]}')
     topics.add_argument('--temperature-topic', metavar='TOPIC',
-                        help=f'default: {_TOPICS["temperature"]}')
+                        help=f'default: {_DEFAULT_TOPICS["temperature"]}')
     topics.add_argument('--reference-topic', metavar='TOPIC', action='append', default=[],
                         help='topic of a reference; several are possible with .mcap')
     topics.add_argument('--all', action='store_true', help='all topics, with .mcap')
@@ -80,32 +80,32 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                       help='bit/s; default: that of the protocol')
     port.add_argument('--columns', metavar='NAME,...', help='columns of the protocol csv; '
                       f'default: {",".join(Settings().columns)}')
-    port.add_argument('--sensitivity', type=verb.positive, metavar='DPS',
+    port.add_argument('--sensitivity', type=verb.positive_number, metavar='DPS',
                       help='deg/s per count; default: that of the protocol')
     port.add_argument('--axis', default='z', choices=['x', 'y', 'z'],
                       help='axis of a gyro with three; default: z')
     port.add_argument('--invert', action='store_true', default=None,
                       help='the gyro reports clockwise turns as positive')
-    port.add_argument('--increments', choices=list(_INCREMENTS), default='default',
+    port.add_argument('--increments', choices=list(_INCREMENT_OPTIONS), default='default',
                       help='whether the gyro sends angles, not rates; '
                       'default: that of the protocol')
-    port.add_argument('--sample-rate', type=verb.positive, metavar='HZ',
+    port.add_argument('--sample-rate', type=verb.positive_number, metavar='HZ',
                       help='sample rate of the gyro; default: that of the protocol')
     return parser
 
 
 def _record(given: argparse.Namespace) -> Answer:
-    if not given.out.endswith(KINDS):
+    if not given.out.endswith(FILE_SUFFIXES):
         raise UsageError(f'{given.out} is no recording file; give a name that ends in '
-                         f'{", ".join(KINDS[:-1])} or {KINDS[-1]}')
-    with _stopping(given.seconds) as stop:
+                         f'{", ".join(FILE_SUFFIXES[:-1])} or {FILE_SUFFIXES[-1]}')
+    with _stop_event(given.seconds) as stop:
         session = (_PortSession if given.port else _TopicSession)(given, stop)
         session.run()
     return session.answer()
 
 
 @contextmanager
-def _stopping(seconds: float | None) -> Iterator[threading.Event]:
+def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
     """
     Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets.
 
@@ -114,9 +114,11 @@ def _stopping(seconds: float | None) -> Iterator[threading.Event]:
 
     """
     stop = threading.Event()
-    numbers = [signal.SIGINT, signal.SIGTERM, *(
+    signals = [signal.SIGINT, signal.SIGTERM, *(
         [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else [])]
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
+    previous_handlers = ({
+        number: signal.signal(number, lambda *_: stop.set()) for number in signals
+    })
     timer = threading.Timer(seconds, stop.set) if seconds else None
     if timer is not None:
         timer.daemon = True
@@ -126,21 +128,21 @@ def _stopping(seconds: float | None) -> Iterator[threading.Event]:
     finally:
         if timer is not None:
             timer.cancel()
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
 @contextmanager
-def _prints_on_standard_error() -> Iterator[None]:
+def _redirect_stdout() -> Iterator[None]:
     """Redirect prints of the ROS 2 middleware to standard error; standard output is the answer."""
     sys.stdout.flush()
-    before = os.dup(1)
+    stdout_copy = os.dup(1)
     os.dup2(2, 1)
     try:
         yield
     finally:
-        os.dup2(before, 1)
-        os.close(before)
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)
 
 
 class _Session:
@@ -152,9 +154,9 @@ class _Session:
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         self._given, self._stop = given, stop
         self._is_mcap = bool(given.out.endswith('.mcap'))
-        self._begin = self._flushed = time.monotonic()
-        self._full: DiskFull | None = None
-        self._recorder: _Recorder = self._open()
+        self._start_time = self._last_flush = time.monotonic()
+        self._disk_full: DiskFull | None = None
+        self._recorder: _Recorder = self._open_recorder()
 
     @property
     def samples(self) -> int:
@@ -171,14 +173,14 @@ class _Session:
         """Path of the file that is being written."""
         return str(self._given.out)
 
-    def _open(self) -> _Recorder:
+    def _open_recorder(self) -> _Recorder:
         raise NotImplementedError
 
-    def _take(self, tick: Callable[[], None]) -> None:
+    def _record_until_stopped(self, tick: Callable[[], None]) -> None:
         raise NotImplementedError
 
     @staticmethod
-    def _create(path: str, notes: Notes) -> _Recorder:
+    def _create_recorder(path: str, notes: NotesCallback) -> _Recorder:
         try:
             return (McapRecorder if path.endswith('.mcap') else CsvRecorder)(path, notes)
         except FileExistsError:
@@ -188,48 +190,51 @@ class _Session:
     def run(self) -> None:
         """Record until the end, and close the file also after an error."""
         try:
-            with tqdm(desc=plain(self._given.out), unit=' samples', leave=False,
-                      disable=None) as shown:
+            with tqdm(desc=to_printable(self._given.out), unit=' samples', leave=False,
+                      disable=None) as bar:
                 try:
-                    self._take(lambda: self._tick(shown))
+                    self._record_until_stopped(lambda: self._flush_if_due(bar))
                 finally:
                     self._recorder.close()
         except DiskFull as error:
-            self._full = error
+            self._disk_full = error
 
-    def _tick(self, shown: Any) -> None:
-        if time.monotonic() - self._flushed < PIECE:
+    def _flush_if_due(self, bar: Any) -> None:
+        if time.monotonic() - self._last_flush < WRITE_INTERVAL:
             return
         self._recorder.flush()
-        self._flushed = time.monotonic()
-        shown.set_postfix_str(f'{self.lost} lost', refresh=False)
-        shown.update(self.samples - shown.n)
+        self._last_flush = time.monotonic()
+        bar.set_postfix_str(f'{self.lost} lost', refresh=False)
+        bar.update(self.samples - bar.n)
 
     def answer(self) -> Answer:
         """Return what was recorded."""
-        seconds = time.monotonic() - self._begin
-        if self._full is not None:
+        seconds = time.monotonic() - self._start_time
+        if self._disk_full is not None:
             written = (f'{self._recorder.size} bytes remain in {self._path}, '
-                       f'which is complete but for the last {PIECE:g} s')
+                       f'which is complete but for the last {WRITE_INTERVAL:g} s')
             written = written if self._recorder.size else 'nothing was written'
-            raise DataRefused(f'{self._full.strerror}; {written}: make room, then record again')
+            raise DataRefused(f'{self._disk_full.strerror}; {written}: make room, then record '
+                              'again')
         if not self.samples:
-            raise DataRefused(f'no sample was received in {seconds:.1f} s{self._why()}; '
+            raise DataRefused(f'no sample was received in {seconds:.1f} '
+                              f's{self._describe_failure()}; '
                               f'no file was written: {self.remedy}')
         data = {'out': self._given.out, 'samples': self.samples, 'lost': self.lost,
-                'seconds': seconds, **self._details()}
+                'seconds': seconds, **self._answer_data()}
         lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, '
                  f'written to {self._given.out}.', *self._remarks()]
         return Answer(lines, {**data, 'remarks': self._remarks()})
 
-    def _why(self) -> str:
+    def _describe_failure(self) -> str:
         return ''
 
-    def _details(self) -> dict[str, Any]:
+    def _answer_data(self) -> dict[str, Any]:
         return {'bytes': os.path.getsize(self._given.out)}
 
     def _remarks(self) -> list[str]:
-        missed = sorted(self._recorder.missed) if isinstance(self._recorder, CsvRecorder) else []
+        missed = (sorted(self._recorder.late_columns)
+                  if isinstance(self._recorder, CsvRecorder) else [])
         return ([f'{", ".join(missed)} began after the header of the log was written, and is '
                  'not in it; record into .mcap instead.']
                 if missed else [])
@@ -244,22 +249,22 @@ class _PortSession(_Session):
         if given.topic or given.temperature_topic or given.reference_topic or given.all:
             raise UsageError('--port and topics were both given; record one of them, '
                              'or the topics of a driver on that port')
-        if not 0 <= given.baud <= _LARGEST_BAUD:
-            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_LARGEST_BAUD}; '
+        if not 0 <= given.baud <= _MAX_BAUD:
+            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_MAX_BAUD}; '
                              'leave it out for that of the protocol')
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         try:
             self._settings = Settings(
                 sensitivity=verb.sensitivity(given), invert=given.invert, axis=given.axis,
-                columns=columns, increments=_INCREMENTS[given.increments],
+                columns=columns, increments=_INCREMENT_OPTIONS[given.increments],
                 sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
-                                          self._settings, on_change=self._report)
+                                          self._settings, on_change=self._report_state)
         except ValueError as error:
             raise UsageError(str(error)) from None
         self._last_message = ''
         # Constant, so that the stamps do not jump when the clock is set.
-        self._since = time.time_ns() - round(steady() * NSEC_PER_SEC)
+        self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         super().__init__(given, stop)
 
     @property
@@ -270,35 +275,35 @@ class _PortSession(_Session):
     def lost(self) -> int:
         return self._connection.counts().lost_samples
 
-    def _open(self) -> _Recorder:
-        return self._create(self._given.out, self._about)
+    def _open_recorder(self) -> _Recorder:
+        return self._create_recorder(self._given.out, self._file_notes)
 
-    def _about(self) -> dict[str, str]:
+    def _file_notes(self) -> dict[str, str]:
         found, protocol = self._connection, self._connection.protocol
-        return about(port=self._given.port, device=found.path,
-                     protocol=protocol.name if protocol else '', baud=found.baud,
-                     axis=self._settings.axis,
-                     **(self._scale(protocol) if protocol else {}))
+        return recording_notes(port=self._given.port, device=found.path,
+                               protocol=protocol.name if protocol else '', baud=found.baud,
+                               axis=self._settings.axis,
+                               **(self._scale_notes(protocol) if protocol else {}))
 
-    def _scale(self, protocol: Protocol) -> dict[str, str]:
+    def _scale_notes(self, protocol: Protocol) -> dict[str, str]:
         """Return the scale of the device; columns in rad/s or deg/s have the unit in the name."""
-        settings, factor = self._settings, protocol.factor(self._settings)
+        settings, factor = self._settings, protocol.unit_scale(self._settings)
         angles = (f', an angle at {protocol.nominal_rate(settings):g} Hz'
                   if protocol.sends_angles(settings) else '')
         sensitivity = ('' if protocol is CSV and settings.sensitivity is None
                        else f'{abs(factor)!r} rad/s a unit of the device{angles}')
         return {'sensitivity': sensitivity, 'inverted': 'yes' if factor < 0.0 else 'no'}
 
-    def _take(self, tick: Callable[[], None]) -> None:
+    def _record_until_stopped(self, tick: Callable[[], None]) -> None:
         for chunk in self._connection.chunks(self._stop):
             protocol = self._connection.protocol
             if protocol and isinstance(self._recorder, McapRecorder):
-                self._recorder.variance = protocol.variance(self._settings)
+                self._recorder.variance = protocol.sample_variance(self._settings)
             for sample, stamp in zip(chunk.samples, chunk.stamps, strict=True):
-                self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + self._since, sample)
+                self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + self._clock_offset, sample)
             tick()
 
-    def _report(self, state: State) -> None:
+    def _report_state(self, state: ConnectionState) -> None:
         if state.name == 'failed':
             self._recorder.flush()  # without samples no piece is written
         message = state.problem or state.name
@@ -308,21 +313,21 @@ class _PortSession(_Session):
         found, self._last_message = self._connection, message
         name = (f'samples of {found.protocol.name} come at {found.baud} bit/s'
                 if found.protocol else '')
-        verb.say(name if state.name == 'reading' else message)
+        verb.print_message(name if state.name == 'reading' else message)
 
-    def _why(self) -> str:
+    def _describe_failure(self) -> str:
         return f' ({self._connection.last_error})' if self._connection.last_error else ''
 
-    def _details(self) -> dict[str, Any]:
+    def _answer_data(self) -> dict[str, Any]:
         found = self._connection
         protocol = found.protocol.name if found.protocol else None
-        return {**super()._details(), 'protocol': protocol, 'baud': found.baud,
-                'openings': found.openings}
+        return {**super()._answer_data(), 'protocol': protocol, 'baud': found.baud,
+                'openings': found.open_count}
 
     def _remarks(self) -> list[str]:
         counts, protocol, clock = (vars(self._connection.counts()), self._connection.protocol,
                                    self._connection.clock)
-        warning = (protocol.wrong_rate(self._settings, clock.period)
+        warning = (protocol.sample_rate_warning(self._settings, clock.period)
                    if protocol and clock and clock.is_settled else '')
         counted = {name.replace('_', ' '): count for name, count in counts.items()
                    if name not in ('samples', 'lost_samples') and count}
@@ -337,9 +342,9 @@ class _TopicSession(_Session):
               'ROS_AUTOMATIC_DISCOVERY_RANGE agree')
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
-        wire = (given.protocol, given.columns, given.sensitivity, given.invert, given.baud,
-                given.sample_rate)
-        if any(wire) or given.increments != 'default':
+        port_options = (given.protocol, given.columns, given.sensitivity, given.invert, given.baud,
+                        given.sample_rate)
+        if any(port_options) or given.increments != 'default':
             raise UsageError('options of a port were given without --port; '
                              'give --port or omit them')
         if not given.out.endswith('.mcap') and (given.all or len(given.reference_topic) > 1):
@@ -351,8 +356,8 @@ class _TopicSession(_Session):
             raise UsageError(f'topics need ROS 2, which is not available ({error}); '
                              'source it, or record from --port') from None
         self._take_messages = take_messages
-        roles = {'gyro': given.topic or _TOPICS['gyro'],
-                 'temperature': given.temperature_topic or _TOPICS['temperature']}
+        roles = {'gyro': given.topic or _DEFAULT_TOPICS['gyro'],
+                 'temperature': given.temperature_topic or _DEFAULT_TOPICS['temperature']}
         if given.reference_topic:
             roles['reference'] = given.reference_topic[0]
         roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
@@ -361,13 +366,14 @@ class _TopicSession(_Session):
             raise UsageError(f'one topic was named twice, of {", ".join(roles.values())}; '
                              f'name one each for {", ".join(roles)}')
         self._topics = [*self._roles, *given.reference_topic[1:]]
-        self._messages, self._samples, self._damaged, self._waiting = 0, 0, 0, True
+        self._messages, self._samples, self._damaged_messages, self._is_waiting = 0, 0, 0, True
         self._received: set[str] = set()
-        self._other_kinds: dict[str, str] = {}
-        self._unknown: dict[str, str] = {}
-        self._stamp, self._intervals = 0, Intervals()
+        self._mismatched_topics: dict[str, str] = {}
+        self._unknown_topics: dict[str, str] = {}
+        self._last_stamp, self._intervals = 0, Intervals()
         # s; a message may be late, and a recording be played faster
-        self._clock = ClockSteps(ahead=10.0, behind=math.inf, back=1.0)
+        self._clock_steps = ClockStepDetector(max_ahead=10.0, max_behind=math.inf,
+                                              max_backward=1.0)
         super().__init__(given, stop)
 
     @property
@@ -376,15 +382,17 @@ class _TopicSession(_Session):
 
     @property
     def lost(self) -> int:
-        return self._intervals.lost
+        return self._intervals.lost_samples
 
-    def _open(self) -> _Recorder:
+    def _open_recorder(self) -> _Recorder:
         """Open a recording, from which a log is written at the end."""
         def notes() -> dict[str, str]:
-            return about(topics='everything' if self._given.all else ', '.join(self._topics))
+            return recording_notes(
+                topics='everything' if self._given.all else ', '.join(self._topics))
         if not self._is_mcap:
-            self._create(self._given.out, notes)  # fails now where the log cannot be written
-        return self._create(self._path, notes)
+            # fails now where the log cannot be written
+            self._create_recorder(self._given.out, notes)
+        return self._create_recorder(self._path, notes)
 
     @property
     def _path(self) -> str:
@@ -393,7 +401,7 @@ class _TopicSession(_Session):
     def run(self) -> None:
         """Record, and write the log; the recording is kept where that fails."""
         super().run()
-        if self._is_mcap or self._full:
+        if self._is_mcap or self._disk_full:
             return
         if self._samples:
             topics = {self._roles[topic]: topic for topic in self._received}
@@ -406,53 +414,56 @@ class _TopicSession(_Session):
         with suppress(FileNotFoundError):
             os.unlink(self._path)
 
-    def _take(self, tick: Callable[[], None]) -> None:
-        with _prints_on_standard_error():
-            self._take_messages(self._topics, self._given.all, self._add,
-                                lambda node: self._watch(node, tick), self._stop)
+    def _record_until_stopped(self, tick: Callable[[], None]) -> None:
+        with _redirect_stdout():
+            self._take_messages(self._topics, self._given.all, self._add_message,
+                                lambda node: self._check_publishers(node, tick), self._stop)
 
-    def _add(self, message: Message, definition: str) -> None:
+    def _add_message(self, message: Message, definition: str) -> None:
         assert isinstance(self._recorder, McapRecorder)
         role = self._roles.get(message.topic)
-        wrong = wrong_kind(role, message.topic, message.kind) if role else ''
+        wrong = topic_type_fault(role, message.topic, message.kind) if role else ''
         if wrong and not self._is_mcap:
             raise LogError(wrong)
         self._messages += 1
         self._recorder.add_message(message, definition)
         if wrong:
-            self._other_kinds[message.topic] = wrong
+            self._mismatched_topics[message.topic] = wrong
         elif role:
             self._received.add(message.topic)
             try:
                 stamp = cdr.parse(message.data, cdr.LAYOUTS[message.kind])[0] or message.received
             except cdr.MessageError:
-                self._damaged += 1
+                self._damaged_messages += 1
                 return
             if role == 'gyro':
                 self._samples += 1
-                was_set = self._clock.watch(message.received / NSEC_PER_SEC, stamp / NSEC_PER_SEC)
-                if self._stamp and not was_set and stamp > self._stamp:
-                    self._intervals.add((stamp - self._stamp) / NSEC_PER_SEC)
-                self._stamp = stamp
+                was_set = self._clock_steps.update(message.received / NSEC_PER_SEC,
+                                                   stamp / NSEC_PER_SEC)
+                if self._last_stamp and not was_set and stamp > self._last_stamp:
+                    self._intervals.add((stamp - self._last_stamp) / NSEC_PER_SEC)
+                self._last_stamp = stamp
 
-    def _watch(self, node: Any, tick: Callable[[], None]) -> None:
+    def _check_publishers(self, node: Any, tick: Callable[[], None]) -> None:
         tick()
-        self._unknown = node.unknown
-        if self._waiting and time.monotonic() - self._begin > _PATIENCE:
-            self._waiting = False
+        self._unknown_topics = node.unknown
+        if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
+            self._is_waiting = False
             if missing := node.missing:
-                verb.say(f'no publisher so far of {", ".join(missing)}; '
-                         f'there are {", ".join(node.known()) or "none"}')
+                verb.print_message(f'no publisher so far of {", ".join(missing)}; '
+                                   f'there are {", ".join(node.known()) or "none"}')
 
-    def _details(self) -> dict[str, Any]:
-        return {**super()._details(), 'messages': self._messages}
+    def _answer_data(self) -> dict[str, Any]:
+        return {**super()._answer_data(), 'messages': self._messages}
 
     def _remarks(self) -> list[str]:
         remarks = [f'{topic}: {reason}; it was not recorded.'
-                   for topic, reason in self._unknown.items()]
-        remarks += [f'{wrong}; it was recorded as it is.' for wrong in self._other_kinds.values()]
-        if self._damaged:
-            remarks.append(f'{self._damaged} messages could not be read.')
-        if self._clock.count:
-            remarks.append(f'The clock of the stamps was set {self._clock.count} times.')
+                   for topic, reason in self._unknown_topics.items()]
+        remarks += [
+            f'{wrong}; it was recorded as it is.' for wrong in self._mismatched_topics.values()
+        ]
+        if self._damaged_messages:
+            remarks.append(f'{self._damaged_messages} messages could not be read.')
+        if self._clock_steps.count:
+            remarks.append(f'The clock of the stamps was set {self._clock_steps.count} times.')
         return remarks

@@ -19,22 +19,22 @@ import textwrap
 from typing import Any
 
 from gyro_calibration.cli import verb
-from gyro_calibration.cli.verb import Answer, under_way
+from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.logs.log import Progress
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, Reproduction
 import numpy as np
 
-HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
+TABLE_HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'reproduce', _reproduce,
-                      'compare published numbers of the sources with those reproduced here',
-                      'hong_park')
+    parser = verb.add_verb(verbs, 'reproduce', _reproduce,
+                           'compare published numbers of the sources with those reproduced here',
+                           'hong_park')
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
                         help=f'one of {", ".join(SOURCES)}; default: all')
-    parser.add_argument('--seed', type=verb.whole, default=0,
+    parser.add_argument('--seed', type=verb.non_negative_integer, default=0,
                         help='seed of the noise; default: 0, as in '
                         'docs/explanation/reproduction.md')
     return parser
@@ -43,45 +43,48 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _reproduce(given: argparse.Namespace) -> Answer:
     """Reproduce each source with a generator of its own, independent of the other sources."""
     names = [given.source] if given.source else list(SOURCES)
-    with under_way(names[0]) as on_progress:
+    with show_progress(names[0]) as on_progress:
         found = {name: SOURCES[name](np.random.default_rng(given.seed),
-                                     progress=_counted(name, on_progress)) for name in names}
-    text = '\n\n'.join(page(reproduction) for reproduction in found.values())
+                                     progress=_make_progress(name, on_progress)) for name in names}
+    text = '\n\n'.join(render_page(reproduction) for reproduction in found.values())
     return Answer([text], {'seed': given.seed, 'sources': {
         name: reproduction.data() for name, reproduction in found.items()}})
 
 
-def _counted(name: str, on_progress: Callable[[float | None, str], None]) -> Progress:
+def _make_progress(name: str, on_progress: Callable[[float | None, str], None]) -> Progress:
     """Return a function that numbers the simulations of a source and reports their runs."""
     number = count(1)
 
-    def runs(items: Iterable[Any]) -> Iterator[Any]:
+    def report_runs(items: Iterable[Any]) -> Iterator[Any]:
         simulation, drawn = next(number), list(items)
         for run, item in enumerate(drawn, 1):
             on_progress(None, f'{name}, simulation {simulation}, run {run} of {len(drawn)}')
             yield item
 
-    return runs
+    return report_runs
 
 
-def page(reproduction: Reproduction) -> str:
+def render_page(reproduction: Reproduction) -> str:
     """Return title, assumptions, table and contradictions in Markdown."""
-    parts = [f'## {reproduction.title}', _items('Assumed:', reproduction.assumed),
-             _table(reproduction.comparisons),
-             _items('What does not hold:',
-                    [contradiction.sentence for contradiction in reproduction.contradictions])]
+    parts = [
+        f'## {reproduction.title}',
+        _bullet_list('Assumed:', reproduction.assumed),
+        _table(reproduction.comparisons),
+        _bullet_list('What does not hold:',
+                     [contradiction.sentence for contradiction in reproduction.contradictions])
+    ]
     return '\n\n'.join(parts)
 
 
-def _items(heading: str, sentences: Iterable[str]) -> str:
+def _bullet_list(heading: str, sentences: Iterable[str]) -> str:
     items = [textwrap.fill(sentence, 130, initial_indent='* ', subsequent_indent='  ',
                            break_on_hyphens=False) for sentence in sentences]
     return '\n'.join([heading, '', *items])
 
 
 def _table(comparisons: Iterable[Comparison]) -> str:
-    rows = [HEADER, *(comparison.cells() for comparison in comparisons)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADER))]
+    rows = [TABLE_HEADER, *(comparison.cells() for comparison in comparisons)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(TABLE_HEADER))]
     lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |'
              for row in rows]
     return '\n'.join([lines[0], '|' + '|'.join('-' * (width + 2) for width in widths) + '|',

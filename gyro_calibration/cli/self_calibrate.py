@@ -20,23 +20,27 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.likelihood import Fit
+from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import (
     check_rest,
+    default_reference_errors,
+    find_rest_after,
     METHODS,
-    record,
-    Reference,
-    rest_after,
+    ReferenceErrors,
     RestCheck,
     self_calibrate,
-    usual_reference,
+    to_model_record,
 )
-from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING
+from gyro_calibration.calibration.whole_turns import calibrate_turns, MARK_DEVIATION
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_run
-from gyro_calibration.cli.verb import Answer, under_way, UsageError
+from gyro_calibration.cli.verb import Answer, show_progress, UsageError
 from gyro_calibration.files import InputError
-from gyro_calibration.heading.log_compensation import compensate_log, none_plausible, plausible
+from gyro_calibration.heading.log_compensation import (
+    compensate_log,
+    no_plausible_row_message,
+    plausible_rows,
+)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.model.gyro_model import (
     GyroModel,
@@ -44,7 +48,7 @@ from gyro_calibration.model.gyro_model import (
     with_self_calibration,
 )
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import Motion, motion_of, read_motion
+from gyro_calibration.model.motion import Motion, motion_from_log, read_motion
 import numpy as np
 
 #: Value of --turns for the number of turns that is nearest to the angle of the gyro.
@@ -52,19 +56,20 @@ _NEAREST = 'nearest'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'self-calibrate', _self_calibrate,
-                      'find scale factor error and bias from about 20 s of known motion',
-                      'run.csv --profile profile.csv --out model.yaml')
-    verb.add_log(parser)
+    parser = verb.add_verb(verbs, 'self-calibrate', _self_calibrate,
+                           'find scale factor error and bias from about 20 s of known motion',
+                           'run.csv --profile profile.csv --out model.yaml')
+    verb.add_log_options(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
                         'rate_dps; default: the reference of the log')
-    parser.add_argument('--turns', type=_turns, metavar='N', help='number of full turns from a '
-                        'mark to the same mark with standstill at both ends, counter-clockwise '
-                        f'positive; {_NEAREST}: the number nearest to the gyro')
-    parser.add_argument('--marking', type=verb.not_negative, metavar='DEG',
+    parser.add_argument(
+        '--turns', type=_parse_turns, metavar='N', help='number of full turns from a '
+        'mark to the same mark with standstill at both ends, counter-clockwise '
+        f'positive; {_NEAREST}: the number nearest to the gyro')
+    parser.add_argument('--marking', type=verb.non_negative_number, metavar='DEG',
                         help='standard deviation of the angle between both standstills on the '
                         'mark, deg; '
-                        f'default: {MARKING / DEGREE:g}')
+                        f'default: {MARK_DEVIATION / DEGREE:g}')
     parser.add_argument('--method', choices=list(METHODS), default='likelihood',
                         help='default: likelihood; the others as published')
     parser.add_argument('--model', metavar='MODEL.yaml', help='model to compensate by first')
@@ -72,16 +77,16 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                              ('drift', 'deg/s', 'the drift'),
                              ('random-walk', 'deg/sqrt(h)', 'the angle random walk')):
         default = '; default: 0.58 for rates of a profile' if name == 'scale-deviation' else ''
-        parser.add_argument(f'--reference-{name}', type=verb.not_negative, metavar='X',
+        parser.add_argument(f'--reference-{name}', type=verb.non_negative_number, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
                             f'or of the driven profile, {unit}{default}')
-    verb.add_picture(parser, 'the run, and its heading error before and after')
+    verb.add_picture_option(parser, 'the run, and its heading error before and after')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with this self-calibration')
     return parser
 
 
-def _turns(text: str) -> int | str:
+def _parse_turns(text: str) -> int | str:
     if text == _NEAREST:
         return text
     try:
@@ -106,22 +111,23 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
                          'omit it, or give --turns')
     model = read_model(given.model) if given.model else GyroModel()
     log = verb.read(given)
-    return (_of_turns(given, model, log) if given.turns is not None
-            else _of_motion(given, model, log))
+    return (_calibrate_by_turns(given, model, log) if given.turns is not None
+            else _calibrate_by_motion(given, model, log))
 
 
-def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, _ = verb.time_of(given, log), verb.output_of(given, log)
+def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
+    time, _ = verb.require_time(given, log), verb.require_output(given, log)
     motion, begin = ((read_motion(given.profile), time[0]) if given.profile
-                     else _reference(given, log))
+                     else _reference_motion(given, log))
     _refuse_implausible(given, model, log)
-    with under_way('fit of scale factor error, bias and delay'):
-        run = calibrated_run(log, model, motion, begin, given.method, _goodness(given, motion))
+    with show_progress('fit of scale factor error, bias and delay'):
+        run = calibrate_run(log, model, motion, begin, given.method,
+                            _reference_errors(given, motion))
     if given.picture:
         run.draw(given.picture)
-    return _answer(given, model, log, run.fit, run.used, given.method,
-                   _figures(run.fit, run.check),
-                   list(_sentences(run.fit, run.check, given.method)))
+    return _store_and_answer(given, model, log, run.fit, run.is_used, given.method,
+                             _fit_data(run.fit, run.rest_check),
+                             list(_fit_lines(run.fit, run.rest_check, given.method)))
 
 
 @dataclass(frozen=True)
@@ -131,16 +137,16 @@ class CalibratedRun:
 
     Attributes
     ----------
-    fit, check : with the rest, and None where there is none
-    used : which rows of the log
+    fit, rest_check : with the rest, and None where there is none
+    is_used : which rows of the log
     time, rate : of these rows, on the clock of the motion, s and rad/s
     motion : that was driven
 
     """
 
-    fit: Fit
-    check: RestCheck | None
-    used: Mask
+    fit: ScaleBiasFit
+    rest_check: RestCheck | None
+    is_used: Mask
     time: Array
     rate: Array
     motion: Motion
@@ -148,101 +154,110 @@ class CalibratedRun:
     def draw(self, path: str | Path | None) -> Any:
         """Draw the run with its errors before and after, and return the figure."""
         fit = self.fit
-        late = 0.0 if math.isnan(fit.time_offset) else fit.time_offset
-        return draw_run(path, self.time - late, self.rate,
+        delay = 0.0 if math.isnan(fit.time_offset) else fit.time_offset
+        return draw_run(path, self.time - delay, self.rate,
                         (self.rate - fit.bias) / (1.0 + fit.scale_factor_error), self.motion)
 
 
-def calibrated_run(log: Log, model: GyroModel, motion: Motion, begin: float, method: str,
-                   reference: Reference) -> CalibratedRun:
+def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, method: str,
+                  reference: ReferenceErrors) -> CalibratedRun:
     """Calibrate by the motion that began at a time of the log, s, and by the rest after it."""
-    time, known = np.asarray(log.time) - begin, plausible(model, log)
+    time, known = np.asarray(log.time) - begin, plausible_rows(model, log)
     run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
     rate = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rate[run], motion, method, noise=model.noise,
                          reference=reference, output=np.asarray(log.output)[run],
-                         prior=model.prior)
-    rest = rest_after(time[known], rate[known], fit, motion)
+                         prior=model.prior_deviations)
+    rest = find_rest_after(time[known], rate[known], fit, motion)
     check = (None if rest is None
              else check_rest(time[known][rest], rate[known][rest], fit, model.noise))
     return CalibratedRun(fit if check is None else check.fit, check, run, time[run], rate[run],
                          motion)
 
 
-def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, output = verb.time_of(given, log), verb.output_of(given, log)
+def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
+    time, output = verb.require_time(given, log), verb.require_output(given, log)
     known, rates = (_refuse_implausible(given, model, log),
                     compensate_log(with_self_calibration(model, None), log))
-    marking = MARKING if given.marking is None else given.marking * DEGREE
+    marking = MARK_DEVIATION if given.marking is None else given.marking * DEGREE
     found = calibrate_turns(time[known], rates[known],
                             None if given.turns == _NEAREST else given.turns, noise=model.noise,
-                            marking=marking, output=output[known])
-    way = 'counter-clockwise' if found.turns > 0 else 'clockwise'
-    before, after = found.rests
-    data = {'turns': found.turns, 'turning_s': found.duration, 'rests_s': list(found.rests),
-            'marking_rad': marking}
-    return _answer(given, model, log, found.fit, known, 'turns', data, [
-        f'{abs(found.turns)} full turns {way} in {found.duration:.1f} s, between standstills '
+                            mark_deviation=marking, output=output[known])
+    direction = 'counter-clockwise' if found.turns > 0 else 'clockwise'
+    before, after = found.rest_durations
+    data = {
+        'turns': found.turns,
+        'turning_s': found.duration,
+        'rests_s': list(found.rest_durations),
+        'marking_rad': marking
+    }
+    return _store_and_answer(given, model, log, found.fit, known, 'turns', data, [
+        f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
+        'standstills '
         f'of {before:.1f} and {after:.1f} s; standard deviation of the mark '
         f'{marking / DEGREE:g} deg.'])
 
 
 def _refuse_implausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
     """Return which rows are used."""
-    found = plausible(model, log)
+    found = plausible_rows(model, log)
     if not found.any() and np.isfinite(np.asarray(log.output)).any():
-        raise DataRefused(f'{given.log}: {none_plausible(model)}')
+        raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
     return found
 
 
-def _goodness(given: argparse.Namespace, motion: Motion) -> Reference:
+def _reference_errors(given: argparse.Namespace, motion: Motion) -> ReferenceErrors:
     """Return the accuracy of the reference by the options, or the usual one of a profile."""
     scale = given.reference_scale_deviation
-    usual = usual_reference(motion) if given.profile else Reference()
-    return Reference(usual.scale_deviation if scale is None else scale / 100.0,
-                     (given.reference_drift or 0.0) * DEGREE,
-                     (given.reference_random_walk or 0.0) * DEGREE / 60.0)
+    usual = default_reference_errors(motion) if given.profile else ReferenceErrors()
+    return ReferenceErrors(usual.scale_deviation if scale is None else scale / 100.0,
+                           (given.reference_drift or 0.0) * DEGREE,
+                           (given.reference_random_walk or 0.0) * DEGREE / 60.0)
 
 
-def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, used: Mask,
-            method: str, data: dict[str, Any], lines: list[str]) -> Answer:
+def _store_and_answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: ScaleBiasFit,
+                      is_used: Mask, method: str, data: dict[str,
+                                                             Any], lines: list[str]) -> Answer:
     """Write the calibration, and return the answer."""
-    calibration = recorded(fit, method, log, used)
+    calibration = make_self_calibration(fit, method, log, is_used)
     if given.out:
-        write_model(given.out, with_self_calibration(verb.with_origin(given, model), calibration))
-    refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
-    remarks = ([f'{refused} rows have an implausible rate or temperature and are not used.']
-               if refused else [])
-    first = f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {used.sum()} samples.'
+        write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
+    implausible_count = int(
+        np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible_rows(model, log)))
+    remarks = ([f'{implausible_count} rows have an implausible rate or temperature and are not '
+                'used.']
+               if implausible_count else [])
+    first = f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {is_used.sum()} samples.'
     return Answer([first, *lines, *remarks],
-                  {**calibration.figures(), 'samples': int(used.sum()),
-                   'refused_samples': refused, **data, 'out': given.out},
+                  {**calibration.to_dict(), 'samples': int(is_used.sum()),
+                   'refused_samples': implausible_count, **data, 'out': given.out},
                   (given.picture, given.out))
 
 
-def recorded(fit: Fit, method: str, log: Log, used: Mask) -> SelfCalibration:
+def make_self_calibration(fit: ScaleBiasFit, method: str, log: Log,
+                          is_used: Mask) -> SelfCalibration:
     """Return a fit as the calibration of now, at the mean temperature of the rows used."""
-    temperature = None if log.temperature is None else float(log.temperature[used].mean())
-    return record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
-                  temperature)
+    temperature = None if log.temperature is None else float(log.temperature[is_used].mean())
+    return to_model_record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
+                           temperature)
 
 
-def _figures(fit: Fit, check: RestCheck | None) -> dict[str, Any]:
+def _fit_data(fit: ScaleBiasFit, check: RestCheck | None) -> dict[str, Any]:
     """Return further results of the fit, in SI; nan where they are not known."""
-    good = fit.goodness
+    goodness = fit.goodness
     return {'time_offset_s': fit.time_offset,
             'time_offset_standard_deviation_s': fit.time_offset_deviation,
             'start_heading_rad': fit.start_heading,
             'start_heading_standard_deviation_rad': fit.start_heading_deviation,
-            'chi_square': good.chi_square if good else math.nan,
-            'degrees_of_freedom': good.freedom if good else math.nan,
-            'probability': good.probability if good else math.nan,
-            'noise_ratio': good.noise_ratio if good else math.nan,
+            'chi_square': goodness.chi_square if goodness else math.nan,
+            'degrees_of_freedom': goodness.dof if goodness else math.nan,
+            'probability': goodness.probability if goodness else math.nan,
+            'noise_ratio': goodness.noise_ratio if goodness else math.nan,
             'rest_rate_rad_s': check.rate if check else math.nan,
             'rest_limit_rad_s': check.limit if check else math.nan}
 
 
-def _sentences(fit: Fit, check: RestCheck | None, method: str) -> Iterator[str]:
+def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str) -> Iterator[str]:
     if method == 'likelihood':
         yield (f'Delay of the gyro behind the profile: {fit.time_offset:.4f} '
                f'+- {fit.time_offset_deviation:.4f} s.')
@@ -257,9 +272,9 @@ def _sentences(fit: Fit, check: RestCheck | None, method: str) -> Iterator[str]:
                f'limit: {check.limit / DEGREE:.4f} deg/s.')
 
 
-def _reference(given: argparse.Namespace, log: Log) -> tuple[Motion, float]:
+def _reference_motion(given: argparse.Namespace, log: Log) -> tuple[Motion, float]:
     try:
-        return motion_of(log)
+        return motion_from_log(log)
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error} with --profile') from None
     except InputError as error:

@@ -22,35 +22,36 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import motion_by_name, NAMED, simulate
+from gyro_calibration.model.motion import motion_by_name, NAMED_MOTIONS, simulate
 import numpy as np
 
 #: Largest number of samples of a simulation, which needs 100 bytes for each.
-MOST = 20_000_000
+MAX_SAMPLES = 20_000_000
 
 
-def add_motion(parser: argparse.ArgumentParser, **how: Any) -> None:
+def add_motion_options(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('--motion', metavar='FILE|NAME',
-                        help=f'a motion profile, or one of {", ".join(NAMED)}', **how)
-    parser.add_argument('--sample-rate', type=verb.positive, default=100.0, metavar='HZ',
+                        help=f'a motion profile, or one of {", ".join(NAMED_MOTIONS)}', **options)
+    parser.add_argument('--sample-rate', type=verb.positive_number, default=100.0, metavar='HZ',
                         help='default: 100')
     parser.add_argument('--temperature', type=verb.degrees_celsius, metavar='DEGC',
                         help='default: the reference temperature of the model')
-    parser.add_argument('--seed', type=verb.whole, help='seed of the noise; default: random')
+    parser.add_argument('--seed', type=verb.non_negative_integer,
+                        help='seed of the noise; default: random')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'simulate', _simulate, 'write the log of a simulated gyro',
-                      '--model model.yaml --motion robot --out log.csv --seed 1')
+    parser = verb.add_verb(verbs, 'simulate', _simulate, 'write the log of a simulated gyro',
+                           '--model model.yaml --motion robot --out log.csv --seed 1')
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
-    add_motion(parser, required=True)
+    add_motion_options(parser, required=True)
     parser.add_argument('--out', required=True, metavar='LOG.csv', help='.csv or .csv.gz')
     return parser
 
 
 def _simulate(given: argparse.Namespace) -> Answer:
-    log, seed = simulated(given)
-    duration = float(verb.time_of(given, log)[-1])
+    log, seed = simulate_log(given)
+    duration = float(verb.require_time(given, log)[-1])
     write_log(given.out, replace(
         log, notes=(f'simulated with {given.model}, motion {given.motion}, seed {seed}',)))
     data = {'out': given.out, 'rows': len(log), 'duration_s': duration, 'seed': seed}
@@ -58,15 +59,15 @@ def _simulate(given: argparse.Namespace) -> Answer:
         [f'{len(log)} samples over {duration:g} s, seed {seed}, written to {given.out}.'], data)
 
 
-def simulated(given: argparse.Namespace) -> tuple[Log, int]:
+def simulate_log(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
-    if given.motion not in NAMED and not os.path.exists(given.motion):
+    if given.motion not in NAMED_MOTIONS and not os.path.exists(given.motion):
         raise UsageError(f'{given.motion}: there is no such motion; '
-                         f'give a file, or one of {", ".join(NAMED)}')
+                         f'give a file, or one of {", ".join(NAMED_MOTIONS)}')
     motion = motion_by_name(given.motion)
-    if motion.duration * given.sample_rate > MOST:
+    if motion.duration * given.sample_rate > MAX_SAMPLES:
         raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
-                         f'{MOST:g} samples; give a lower rate or a shorter motion')
+                         f'{MAX_SAMPLES:g} samples; give a lower rate or a shorter motion')
     if round(motion.duration * given.sample_rate) < 1:
         raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has fewer than '
                          'two samples; give a higher rate or a longer motion')

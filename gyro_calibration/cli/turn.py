@@ -19,24 +19,24 @@ import io
 import math
 from typing import Any, TypeAlias
 
-from gyro_calibration.calibration.dwells import Dwells, dwells, listed, take
-from gyro_calibration.calibration.scatter import not_outlying
-from gyro_calibration.calibration.selection import select_effects, TECHNOLOGIES
+from gyro_calibration.calibration.dwells import Dwells, extract_dwells, format_list, select_dwells
+from gyro_calibration.calibration.scatter import find_inliers
+from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.calibration.turn_error import (
-    predicted_rates,
-    Size,
-    size,
-    SLOWEST,
-    turn_errors,
+    compute_turn_errors,
+    ErrorSummary,
+    MIN_TURN_RATE,
+    predict_left_out_rates,
+    summarize_errors,
     TurnErrors,
 )
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
-from gyro_calibration.cli.verb import Answer, under_way, UsageError
-from gyro_calibration.files import digest, write_atomically
+from gyro_calibration.cli.verb import Answer, show_progress, UsageError
+from gyro_calibration.files import sha256_digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
-from gyro_calibration.logs.ros_bag import files_of
+from gyro_calibration.logs.ros_bag import list_recording_files
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
@@ -47,21 +47,23 @@ Bins: TypeAlias = 'list[tuple[float, float, Mask]]'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add(verbs, 'turn', _turn, 'compute the error of a full turn over rate and '
-                      'temperature, with a static bias only and with a model',
-                      'table.csv --picture turn.png')
-    verb.add_log(parser)
+    parser = verb.add_verb(verbs, 'turn', _turn, 'compute the error of a full turn over rate and '
+                           'temperature, with a static bias only and with a model',
+                           'table.csv --picture turn.png')
+    verb.add_log_options(parser)
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model to evaluate; default: the effects that the data support, '
                         'fitted for each sweep to the other sweeps')
-    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='technology of the gyro; '
-                        'without --model, selects between effects that the data do not '
-                        'distinguish')
-    parser.add_argument('--slowest', type=verb.positive, default=SLOWEST / DEGREE, metavar='DPS',
+    parser.add_argument(
+        '--technology', choices=list(TECHNOLOGY_EFFECTS), help='technology of the gyro; '
+        'without --model, selects between effects that the data do not '
+        'distinguish')
+    parser.add_argument('--slowest', type=verb.positive_number, default=MIN_TURN_RATE / DEGREE,
+                        metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')
     parser.add_argument('--out', metavar='TURN.csv', help='write the table, one row per turn, in '
                         'SI units')
-    verb.add_picture(parser, 'the errors over the rate')
+    verb.add_picture_option(parser, 'the errors over the rate')
     return parser
 
 
@@ -70,46 +72,49 @@ def _turn(given: argparse.Namespace) -> Answer:
         raise UsageError('--technology selects effects, and --model has its own; give one of '
                          'the two')
     log = verb.read(given)
-    verb.output_of(given, log)  # a log with counts only is wrong use, as for other verbs
-    found = dwells(log)
-    with under_way('fit of effects, and errors of turns'):
-        rate, kept, remarks, data = (_fitted(found, given.technology) if given.model is None else
-                                     _as_given(given, read_model(given.model), log, found))
-        errors = turn_errors(take(found, kept), rate[kept], given.slowest * DEGREE)
+    verb.require_output(given, log)  # a log with counts only is wrong use, as for other verbs
+    found = extract_dwells(log)
+    with show_progress('fit of effects, and errors of turns'):
+        rate, is_inlier, remarks, data = (_predict_by_fit(found, given.technology)
+                                          if given.model is None else _predict_by_model(
+                                              given, read_model(given.model), log, found))
+        errors = compute_turn_errors(select_dwells(found, is_inlier), rate[is_inlier],
+                                     given.slowest * DEGREE)
     if given.out:
-        _write(given.out, errors)
+        _write_table(given.out, errors)
     if given.picture:
         draw_turn_errors(given.picture, errors, given.slowest * DEGREE)
     remarks = [*found.remarks, *errors.remarks, *remarks]
-    if places := [place for place, good in zip(found.place, kept) if not good]:
-        remarks.append(f'{len(places)} outlying dwells are left out: {listed(places)}')
+    if places := [place for place, good in zip(found.location, is_inlier) if not good]:
+        remarks.append(f'{len(places)} outlying dwells are left out: {format_list(places)}')
     return Answer(_lines(given, errors, remarks), {**_data(given, errors, remarks), **data},
                   (given.out, given.picture))
 
 
 # rates by the model
 
-def _fitted(found: Dwells, technology: str | None
-            ) -> tuple[Array, Mask, list[str], dict[str, Any]]:
+
+def _predict_by_fit(found: Dwells,
+                    technology: str | None) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     """Return rates by models not fitted to the sweep, the dwells not outlying, and remarks."""
     calibration = select_effects(found, technology).calibration
     names = [effect.name for effect in calibration.effects]
     remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted '
               'for each sweep to the other sweeps, so no turn is in the data of its model')
-    return (predicted_rates(calibration), calibration.scatter.kept, [remark],
+    return (predict_left_out_rates(calibration), calibration.scatter.inliers, [remark],
             {'effects': names, 'left_out': True})
 
 
-def _as_given(given: argparse.Namespace, model: GyroModel, log: Log,
-              found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
+def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
+                      found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     """Return rates by a given model, the dwells not outlying, and remarks."""
     result = compensate(model, found.output, found.temperature)
     names = [term.effect.name for term in model.terms]
     clipped, beyond = (int(np.count_nonzero(each))
                        for each in (result.temperature_clipped, result.beyond_range))
     remarks = [f'the model is {given.model}: {", ".join(names) or "no effects"}'
-               f'{_fitted_to(model, given.log)}']
-    if found.temperature is None and model.looks_at('temperature'):
+               f'{_describe_fit_data(model, given.log)}']
+    if found.temperature is None and model.uses_channel('temperature'):
         remarks.append('the log has no temperature: '
                        'the model was used at its reference temperature')
     if clipped:
@@ -119,17 +124,18 @@ def _as_given(given: argparse.Namespace, model: GyroModel, log: Log,
         remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; '
                        'the correction is extrapolated')
     rate = result.rate
-    if model.looks_around:  # the model depends on the past: the log is compensated row by row
+    if model.needs_history:  # the model depends on the past: the log is compensated row by row
         error = np.asarray(log.output) - compensate_log(model, log)
         rate = found.output - np.array([error[rows].mean() for rows in found.rows])
-    return rate, not_outlying(found), remarks, {
+    return rate, find_inliers(found), remarks, {
         'effects': names, 'left_out': False, 'temperature_clipped': clipped,
         'beyond_range': beyond}
 
 
-def _fitted_to(model: GyroModel, log: str) -> str:
+def _describe_fit_data(model: GyroModel, log: str) -> str:
     """Return whether the model was fitted to the log, by the SHA-256 of its files."""
-    if any(file.is_file() and digest(file) in str(model.origin) for file in files_of(log)):
+    if any(file.is_file() and sha256_digest(file) in str(model.origin)
+           for file in list_recording_files(log)):
         return '; it was fitted to this log, so these are errors of a fit, not of a prediction'
     return '' if 'sha256' in str(model.origin) else (
         '; if it was fitted to this log, these are errors of a fit, not of a prediction')
@@ -145,12 +151,12 @@ def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
     # A step just below the fastest turn would make a nearly empty bin.
     edges = np.concatenate([
         [slowest], steps[(steps > 1.01 * slowest) & (steps < speed.max() / 1.2)], [speed.max()]])
-    number = _numbers(edges, speed)
-    ways = [(-high, -low, (number == place) & (errors.rate < 0.0))
+    number = _bin_numbers(edges, speed)
+    bins = [(-high, -low, (number == place) & (errors.rate < 0.0))
             for place, (low, high) in enumerate(zip(edges, edges[1:]))][::-1]
-    ways += [(low, high, (number == place) & (errors.rate > 0.0))
+    bins += [(low, high, (number == place) & (errors.rate > 0.0))
              for place, (low, high) in enumerate(zip(edges, edges[1:]))]
-    return [each for each in ways if each[2].any()]
+    return [each for each in bins if each[2].any()]
 
 
 def _temperature_bins(errors: TurnErrors) -> Bins:
@@ -161,13 +167,13 @@ def _temperature_bins(errors: TurnErrors) -> Bins:
     widths = [factor * 10.0 ** power for power in range(4) for factor in (1, 2, 5)]
     width = next((width for width in widths if high - low <= 7 * width), widths[-1])
     edges = np.arange(math.floor(low / width), math.floor(high / width) + 2) * width
-    number = _numbers(edges, errors.temperature)
+    number = _bin_numbers(edges, errors.temperature)
     bins = [(low, high, number == place)
             for place, (low, high) in enumerate(zip(edges, edges[1:]))]
     return [each for each in bins if each[2].any()]
 
 
-def _numbers(edges: Array, values: Array) -> Any:
+def _bin_numbers(edges: Array, values: Array) -> Any:
     """Return the number of the bin of each value; the last bin holds its upper edge too."""
     return np.minimum(np.searchsorted(edges, values, side='right') - 1, len(edges) - 2)
 
@@ -175,12 +181,13 @@ def _numbers(edges: Array, values: Array) -> Any:
 # the answer
 
 def _lines(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> Iterator[str]:
-    before, after = size(errors.static), size(errors.modelled)
-    yield (f'Error of a turn of 360 deg: largest {_degrees(before.largest)} with the static bias '
-           f'only, {_degrees(after.largest)} with the model, '
-           f'a factor of {_ratio(before.largest, after.largest)}; '
-           f'rms {_degrees(before.rms)} and {_degrees(after.rms)}, '
-           f'a factor of {_ratio(before.rms, after.rms)}.')
+    before, after = summarize_errors(errors.static), summarize_errors(errors.modelled)
+    yield (f'Error of a turn of 360 deg: largest {_format_error(before.largest)} with the static '
+           'bias '
+           f'only, {_format_error(after.largest)} with the model, '
+           f'a factor of {_format_ratio(before.largest, after.largest)}; '
+           f'rms {_format_error(before.rms)} and {_format_error(after.rms)}, '
+           f'a factor of {_format_ratio(before.rms, after.rms)}.')
     yield (f'{len(errors)} turns, {given.slowest:g} deg/s and faster, '
            f'of {len(np.unique(errors.sweep))} sweeps in {given.log}.')
     for remark in remarks:
@@ -191,11 +198,11 @@ def _lines(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) ->
     yield from _table('temperature [degC]', errors, _temperature_bins(errors))
 
 
-def _degrees(error: float) -> str:
+def _format_error(error: float) -> str:
     return f'{error / DEGREE:.3g} deg ({100.0 * error / math.tau:.2g} %)'
 
 
-def _ratio(before: float, after: float) -> str:
+def _format_ratio(before: float, after: float) -> str:
     return f'{before / after:.2g}' if after > 0.0 else 'infinity'
 
 
@@ -211,41 +218,45 @@ def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
         yield f'{label:20} {np.count_nonzero(mask):5d}' + ''.join(
             f'  {value / DEGREE:7.3f} {100.0 * value / math.tau:7.3f}'
             for each in (errors.static, errors.modelled)
-            for value in (size(each[mask]).rms, size(each[mask]).largest))
+            for value in (summarize_errors(each[mask]).rms, summarize_errors(each[mask]).largest))
 
 
 def _data(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> dict[str, Any]:
-    before, after = size(errors.static), size(errors.modelled)
+    before, after = summarize_errors(errors.static), summarize_errors(errors.modelled)
     ratios = {f'ratio_{name}': getattr(before, name) / getattr(after, name)
               if getattr(after, name) > 0.0 else None for name in ('rms', 'largest')}
     return {'turns': len(errors), 'slowest_rad_s': given.slowest * DEGREE,
-            'static': _figures(before), 'modelled': _figures(after), **ratios,
+            'static': _error_data(before), 'modelled': _error_data(after), **ratios,
             'by_rate': _bin_data('rad_s', errors, _rate_bins(errors, given.slowest * DEGREE)),
             'by_temperature': _bin_data('degc', errors, _temperature_bins(errors)),
             'rate_rad_s': errors.rate.tolist(), 'temperature_degc': None
             if errors.temperature is None else errors.temperature.tolist(),
             'static_rad_per_turn': errors.static.tolist(),
             'modelled_rad_per_turn': errors.modelled.tolist(),
-            'sweep': errors.sweep.tolist(), 'place': list(errors.place), 'remarks': remarks}
+            'sweep': errors.sweep.tolist(), 'place': list(errors.location), 'remarks': remarks}
 
 
-def _figures(of: Size) -> dict[str, float]:
-    return {'rms_rad_per_turn': of.rms, 'largest_rad_per_turn': of.largest}
+def _error_data(errors: ErrorSummary) -> dict[str, float]:
+    return {'rms_rad_per_turn': errors.rms, 'largest_rad_per_turn': errors.largest}
 
 
 def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]:
-    return [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
-             'static': _figures(size(errors.static[mask])),
-             'modelled': _figures(size(errors.modelled[mask]))} for low, high, mask in bins]
+    return [{
+        f'from_{unit}': low,
+        f'to_{unit}': high,
+        'turns': int(np.count_nonzero(mask)),
+        'static': _error_data(summarize_errors(errors.static[mask])),
+        'modelled': _error_data(summarize_errors(errors.modelled[mask]))
+    } for low, high, mask in bins]
 
 
-def _write(path: str, errors: TurnErrors) -> None:
+def _write_table(path: str, errors: TurnErrors) -> None:
     temperature = (np.full(len(errors), np.nan) if errors.temperature is None
                    else errors.temperature)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc',
                      'static_rad_per_turn', 'modelled_rad_per_turn'))
-    writer.writerows(zip(errors.place, *(values.tolist() for values in (
+    writer.writerows(zip(errors.location, *(values.tolist() for values in (
         errors.sweep, errors.rate, temperature, errors.static, errors.modelled))))
     write_atomically(path, text.getvalue().encode())

@@ -28,66 +28,69 @@ import time
 from typing import Any
 
 from gyro_calibration import __version__
-from gyro_calibration.files import digest, InputError, LARGEST, plain
+from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
 from gyro_calibration.logs.columns import AXES
 from gyro_calibration.logs.log import (
     Array,
     DataRefused,
     DEGREE,
     Log,
-    part,
     read_log,
     read_log_blocks,
-    unwrapped,
+    select_rows,
+    unwrap_heading,
 )
-from gyro_calibration.logs.recording import blocks_of, read_recording, Topics
-from gyro_calibration.logs.ros_bag import files_of, is_recording
+from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
+from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel
 from tqdm import tqdm
 
 #: Time before progress is shown, s.
-DELAY = 2.0
+PROGRESS_DELAY = 2.0
 
 
 @contextmanager
-def under_way(words: str) -> Iterator[Callable[[float | None, str], None]]:
+def show_progress(activity: str) -> Iterator[Callable[[float | None, str], None]]:
     """Show the present step, its fraction where it is known, and the elapsed time after 2 s."""
-    begin, state = time.monotonic(), [f'{words} ...']
+    begin, status_text = time.monotonic(), [f'{activity} ...']
 
     def on_progress(share: float | None, words: str) -> None:
-        state[0] = f'{words} ...' if share is None else f'{100.0 * share:3.0f} %  {words} ...'
+        status_text[0] = (f'{words} ...'
+                          if share is None else f'{100.0 * share:3.0f} %  {words} ...')
 
     if not sys.stderr.isatty():
         yield on_progress
         return
-    over = Event()
+    finished = Event()
 
     def show() -> None:
-        wait = DELAY
-        while not over.wait(wait):
-            text = f'{state[0]}  {time.monotonic() - begin:.0f} s'
+        wait = PROGRESS_DELAY
+        while not finished.wait(wait):
+            text = f'{status_text[0]}  {time.monotonic() - begin:.0f} s'
             width = shutil.get_terminal_size().columns - 1
             print(f'\r\033[K{text[:width]}', end='', file=sys.stderr, flush=True)
             wait = 0.5
-        if wait != DELAY:
+        if wait != PROGRESS_DELAY:
             print('\r\033[K', end='', file=sys.stderr, flush=True)
 
-    shown = Thread(target=show, daemon=True)
-    shown.start()
+    thread = Thread(target=show, daemon=True)
+    thread.start()
     try:
         yield on_progress
     finally:
-        over.set()
-        shown.join()
+        finished.set()
+        thread.join()
 
 
 @contextmanager
-def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
+def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
     """Show a bar of the bytes read of a log, and give the function that updates it."""
-    size = sum(os.path.getsize(file) for file in files_of(path) if os.path.isfile(file)) or None
-    with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=DELAY, leave=False,
-              disable=None) as shown:
-        yield lambda place: shown.update(place - shown.n)
+    size = (sum(
+        os.path.getsize(file) for file in list_recording_files(path) if os.path.isfile(file))
+            or None)
+    with tqdm(total=size, desc=to_printable(path), unit='B', unit_scale=True, delay=PROGRESS_DELAY,
+              leave=False, disable=None) as bar:
+        yield lambda place: bar.update(place - bar.n)
 
 
 class UsageError(InputError):
@@ -108,14 +111,14 @@ class Answer:
         return '\n'.join([*self.lines, *(f'Written to {each}.' for each in self.files if each)])
 
 
-def wrapped(text: str, indent: int = 0) -> str:
+def wrap_line(text: str, indent: int = 0) -> str:
     """Return a text wrapped to lines of at most 120 characters."""
     return textwrap.fill(text, 120, subsequent_indent=' ' * indent, break_long_words=False,
                          break_on_hyphens=False)
 
 
-def add(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None],
-        summary: str, example: str) -> argparse.ArgumentParser:
+def add_verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None],
+             summary: str, example: str) -> argparse.ArgumentParser:
     parser = verbs.add_parser(name, help=summary,
                               description=f'{summary[0].upper()}{summary[1:]}.',
                               epilog=f'example: gyro_calibration {name} {example}')
@@ -123,21 +126,22 @@ def add(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer |
     return parser
 
 
-def add_picture(parser: argparse.ArgumentParser, what: str, option: str = '--picture') -> None:
+def add_picture_option(parser: argparse.ArgumentParser, what: str,
+                       option: str = '--picture') -> None:
     parser.add_argument(option, type=_picture_file, metavar='FILE',
                         help=f'draw {what}, .png or .svg')
 
 
-def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
+def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz, or a '
-                        'ROS 2 recording: folder, .mcap or .db3', **how)
-    parser.add_argument('--rate', type=positive, metavar='HZ',
+                        'ROS 2 recording: folder, .mcap or .db3', **options)
+    parser.add_argument('--rate', type=positive_number, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=positive, metavar='DPS',
+    parser.add_argument('--sensitivity', type=positive_number, metavar='DPS',
                         help='deg/s per count, for logs with gyro_counts only')
     parser.add_argument('--invert', action='store_true',
                         help='the gyro reports clockwise turns as positive')
-    parser.add_argument('--columns', dest='names', type=columns, default={},
+    parser.add_argument('--columns', dest='names', type=parse_columns, default={},
                         metavar='QUANTITY=NAME:UNIT,...',
                         help='columns with other names than in the log format, such as '
                         'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; default unit: SI')
@@ -149,15 +153,15 @@ def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
                         help='omit samples before this time, s since the first sample')
     parser.add_argument('--to', dest='end', type=float, default=math.inf, metavar='S',
                         help='omit samples after this time, s since the first sample')
-    add_topics(parser)
+    add_topic_options(parser)
 
 
 #: Values of the options that `read` uses, for a verb without them.
-AS_IT_IS: dict[str, Any] = {'invert': False, 'names': {}, 'axis': 'z', 'unwrap': False,
-                            'begin': 0.0, 'end': math.inf}
+DEFAULT_LOG_OPTIONS: dict[str, Any] = {'invert': False, 'names': {}, 'axis': 'z', 'unwrap': False,
+                                       'begin': 0.0, 'end': math.inf}
 
 
-def add_topics(parser: argparse.ArgumentParser) -> None:
+def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topic', metavar='TOPIC', help='topic of the gyro in a recording, '
                         'sensor_msgs/Imu or another type with a rate; default: the only Imu')
     parser.add_argument('--reference-topic', metavar='TOPIC', help='topic of the reference in a '
@@ -168,7 +172,7 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
                         'in a recording; default: the name nearest to the topic of the gyro')
 
 
-def columns(text: str) -> dict[str, str]:
+def parse_columns(text: str) -> dict[str, str]:
     """Return quantity -> column, or column:unit, of an argument."""
     pairs = [each.partition('=')[::2] for each in text.split(',')]
     if any(not name or not column for name, column in pairs):
@@ -177,11 +181,11 @@ def columns(text: str) -> dict[str, str]:
     return {name.strip(): column.strip() for name, column in pairs}
 
 
-def positive(text: str) -> float:
+def positive_number(text: str) -> float:
     value = float(text)
-    if not 1.0 / LARGEST <= value <= LARGEST:
+    if not 1.0 / MAX_MAGNITUDE <= value <= MAX_MAGNITUDE:
         raise argparse.ArgumentTypeError(f'{text} is out of range; give a number from '
-                                         f'{1.0 / LARGEST:g} to {LARGEST:g}')
+                                         f'{1.0 / MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}')
     return value
 
 
@@ -193,8 +197,8 @@ def degrees_celsius(text: str) -> float:
     return value
 
 
-def not_negative(text: str) -> float:
-    return 0.0 if float(text) == 0.0 else positive(text)
+def non_negative_number(text: str) -> float:
+    return 0.0 if float(text) == 0.0 else positive_number(text)
 
 
 def positive_integer(text: str) -> int:
@@ -204,7 +208,7 @@ def positive_integer(text: str) -> int:
     return value
 
 
-def whole(text: str) -> int:
+def non_negative_integer(text: str) -> int:
     """Return a seed, as a numpy Generator takes it."""
     value = int(text)
     if value < 0:
@@ -225,77 +229,77 @@ def _picture_file(text: str) -> str:
 
 def read(given: argparse.Namespace) -> Log:
     """Read the log of a verb by its options."""
-    with _bytes_of(given.log) as on_progress:
+    with _show_bytes_read(given.log) as on_progress:
         if is_recording(given.log):
             topics = Topics(given.topic, given.reference_topic, given.temperature_topic,
                             given.axis)
-            log = read_recording(given.log, topics, given.rate, on_progress, say)
+            log = read_recording(given.log, topics, given.rate, on_progress, print_message)
         else:
             log = read_log(given.log, sensitivity(given), given.rate, given.names, given.axis,
                            on_progress)
     if given.unwrap and log.reference_heading is not None:
-        time = time_of(given, log)
-        log = replace(log, reference_heading=unwrapped(
-            time, log.reference_heading, time, output_of(given, log))[0])
-    return _turned(given, next(_inside(given, [log])))
+        time = require_time(given, log)
+        log = replace(log, reference_heading=unwrap_heading(
+            time, log.reference_heading, time, require_output(given, log))[0])
+    return _apply_invert(given, next(_cut_to_range(given, [log])))
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
     """Read the logs of a verb that takes several; each has an output."""
     for path in given.log:
-        one = argparse.Namespace(**{**vars(given), 'log': path})
-        log = read(one)
-        output_of(one, log)
+        given_one = argparse.Namespace(**{**vars(given), 'log': path})
+        log = read(given_one)
+        require_output(given_one, log)
         yield log
 
 
-def _inside(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
+def _cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
     """Give the parts of logs between --from and --to; at least one has samples."""
     if given.begin <= 0.0 and given.end == math.inf:
         yield from logs
         return
     begin = found = None
     for log in logs:
-        time = time_of(given, log)
+        time = require_time(given, log)
         begin = time[0] if begin is None else begin
         rows = (time - begin >= given.begin) & (time - begin <= given.end)
         if rows.any():
             found = log
-            yield part(log, rows)
+            yield select_rows(log, rows)
     if found is None:
         raise DataRefused(f'{given.log}: --from {given.begin:g} --to {given.end:g} leaves no '
                           'sample; give a range within the log')
 
 
-def say(text: object) -> None:
+def print_message(text: object) -> None:
     """Print a message on standard error."""
-    print(f'gyro_calibration: {plain(text)}', file=sys.stderr, flush=True)
+    print(f'gyro_calibration: {to_printable(text)}', file=sys.stderr, flush=True)
 
 
-def origin_of(paths: Iterable[str]) -> dict[str, Any]:
+def make_origin(paths: Iterable[str]) -> dict[str, Any]:
     """Return the origin of a model, for its file: logs, date, program."""
-    files = [{'name': plain(file.name),
-              **({'sha256': digest(file)} if os.path.isfile(file) else {})}
-             for path in paths for file in files_of(path)]
+    files = [{'name': to_printable(file.name),
+              **({'sha256': sha256_digest(file)} if os.path.isfile(file) else {})}
+             for path in paths for file in list_recording_files(path)]
     return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
             'program': f'gyro_calibration {__version__}'}
 
 
-def with_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
+def add_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     """Return a model of --model unchanged, or a new one with the log as its origin."""
-    return model if given.model else replace(model, origin=origin_of([given.log]))
+    return model if given.model else replace(model, origin=make_origin([given.log]))
 
 
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     """Read the log of a verb block by block, with a progress bar."""
     if is_recording(given.log) or given.unwrap:
-        yield from blocks_of(read(given))
+        yield from split_blocks(read(given))
         return
-    with _bytes_of(given.log) as on_progress:
+    with _show_bytes_read(given.log) as on_progress:
         blocks = read_log_blocks(given.log, sensitivity(given), given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
-        for log in _inside(given, blocks):
-            yield _turned(given, log)
+        for log in _cut_to_range(given, blocks):
+            yield _apply_invert(given, log)
 
 
 def sensitivity(given: argparse.Namespace) -> float | None:
@@ -303,18 +307,18 @@ def sensitivity(given: argparse.Namespace) -> float | None:
     return None if given.sensitivity is None else given.sensitivity * DEGREE
 
 
-def _turned(given: argparse.Namespace, log: Log) -> Log:
-    return replace(log, output=-output_of(given, log)) if given.invert else log
+def _apply_invert(given: argparse.Namespace, log: Log) -> Log:
+    return replace(log, output=-require_output(given, log)) if given.invert else log
 
 
-def output_of(given: argparse.Namespace, log: Log) -> Array:
+def require_output(given: argparse.Namespace, log: Log) -> Array:
     if log.output is None:
         raise UsageError(f'{given.log}: has gyro_counts only; '
                          'give the deg/s per count with --sensitivity')
     return log.output
 
 
-def time_of(given: argparse.Namespace, log: Log) -> Array:
+def require_time(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
         raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; '
                          'give the sample rate in Hz with --rate')

@@ -26,22 +26,22 @@ import math
 
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.effects import ADDED, CATALOGUE
+from gyro_calibration.model.effects import CATALOGUE, USER_EFFECTS
 import numpy as np
 from scipy.interpolate import BSpline
 
 #: Least step rate of an encoder, 1/s, at which a dead zone is searched for.
-STEPS_A_SECOND = 20.0
+MIN_ENCODER_STEP_RATE = 20.0
 #: Times of a bias step that are tried in all logs together.
-STEPS = 64
+MAX_STEP_TIMES = 64
 #: Least change of a channel in a log, K, V and m/s²; with less it counts as missing.
-LEAST_CHANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
+MIN_CHANNEL_RANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
 
 #: Shortest thermal lag, s; a shorter one equals a sensitivity to the temperature rate.
-FASTEST_LAG = 12.0
+MIN_THERMAL_LAG = 12.0
 
 #: Columns of one log: (replay) -> arrays of shape (n,).
-Columns = Callable[[Replay], Sequence[Array]]
+ColumnFunction = Callable[[Replay], Sequence[Array]]
 
 
 @dataclass(frozen=True)
@@ -54,82 +54,88 @@ class Candidate:
     cause : its name
     shapes : their values, in the order of the effect
     columns : of a log
-    run : number of the log for a single event; None for a cause in all logs
+    log_index : number of the log for a single event; None for a cause in all logs
     amplitude : fixed coefficient of its column if only shapes are fitted; None if it is free
 
     """
 
     cause: str
     shapes: tuple[float, ...]
-    columns: Columns
-    run: int | None = None
+    columns: ColumnFunction
+    log_index: int | None = None
     amplitude: float | None = None
 
 
-def columns_of(candidate: Candidate, replays: Sequence[Replay]) -> Array:
+def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
     """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
     parts = []
     for run, each in enumerate(replays):
         values = candidate.columns(each)
-        absent = candidate.run is not None and candidate.run != run
-        parts.append(np.array([np.zeros(each.points - 1) if absent else each.coefficients(value)
-                               for value in values]))
+        absent = candidate.log_index is not None and candidate.log_index != run
+        parts.append(
+            np.array([
+                np.zeros(each.point_count - 1) if absent else each.transform_samples(value)
+                for value in values
+            ]))
     return np.concatenate(parts, axis=1)
 
 
-def effect(name: str, *shapes: float, run: int | None = None) -> Candidate:
+def effect_candidate(name: str, *shapes: float, log_index: int | None = None) -> Candidate:
     """Return the candidate of an effect of the gyro, or of the reference."""
-    if name in _OF_THE_REFERENCE:
-        columns = _OF_THE_REFERENCE[name][0]
-        return Candidate(name, shapes, lambda each: columns(each, *shapes), run)
+    if name in _REFERENCE_EFFECTS:
+        columns = _REFERENCE_EFFECTS[name][0]
+        return Candidate(name, shapes, lambda each: columns(each, *shapes), log_index)
     known = CATALOGUE[name]
     if (distortion := known.distortion) is not None:
         # change of the rate by a delay, a lag, a clock rate or a limit
         return Candidate(name, shapes, lambda each: (
             distortion(each.channels.rate, each.channels.time, *shapes) - each.channels.rate,),
-            run, 1.0)
+            log_index, 1.0)
     amplitude = known.coefficients[0].default if known.coefficients else None
-    return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), run,
+    return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), log_index,
                      amplitude)
 
 
-def pulse(time: Array, middle: float, width: float) -> Array:
+def gaussian_pulse(time: Array, middle: float, width: float) -> Array:
     """Return the rate of a reference whose heading jumps by 1 rad within about a width."""
     return np.exp(-0.5 * ((time - middle) / width) ** 2) / (width * math.sqrt(2.0 * math.pi))
 
 
 #: Effects of the reference -> columns by log and shapes, and the shapes that a fit finds.
-_OF_THE_REFERENCE: Mapping[str, tuple[Callable[..., Sequence[Array]], list[int]]] = {
+_REFERENCE_EFFECTS: Mapping[str, tuple[Callable[..., Sequence[Array]], list[int]]] = {
     'reference_once_per_rev': (lambda each: (
         -each.channels.rate * np.sin(each.channels.heading),
         -each.channels.rate * np.cos(each.channels.heading)), []),
     'reference_slip': (lambda each, width, *moments: tuple(
-        -pulse(each.channels.time, moment, width) for moment in moments), [0])}
+        -gaussian_pulse(each.channels.time, moment, width) for moment in moments), [0])}
 
 
-def fitted_shapes(candidate: Candidate) -> list[int]:
+def fitted_shape_indices(candidate: Candidate) -> list[int]:
     """Return the indices of the shapes that are fitted, not set by convention."""
     if candidate.cause not in CATALOGUE:
-        return _OF_THE_REFERENCE[candidate.cause][1] if is_named(candidate) else []
+        return _REFERENCE_EFFECTS[candidate.cause][1] if is_named(candidate) else []
     parameters = CATALOGUE[candidate.cause].parameters[:len(candidate.shapes)]
     return [place for place, parameter in enumerate(parameters) if parameter.default is None]
 
 
-def with_shape(candidate: Candidate, place: int, value: float) -> Candidate:
+def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidate:
     """Return a candidate with another shape, within the bounds that a model has for it."""
     if candidate.cause in CATALOGUE:
-        value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[place].bounds))
-    return effect(candidate.cause, *candidate.shapes[:place], value,
-                  *candidate.shapes[place + 1:], run=candidate.run)
+        value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
+    return effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
+                            *candidate.shapes[shape_index + 1:], log_index=candidate.log_index)
 
 
-def constant(replays: Sequence[Replay]) -> frozenset[str]:
+def constant_channels(replays: Sequence[Replay]) -> frozenset[str]:
     """Return the channels that are nearly constant in each log that has them."""
-    known = {name: [getattr(each.channels, name) for each in replays if name in each.has]
-             for name in LEAST_CHANGE}
+    known = {
+        name: [
+            getattr(each.channels, name) for each in replays if name in each.available_channels
+        ] for name in MIN_CHANNEL_RANGE
+    }
     return frozenset(
         name for name, values in known.items()
-        if values and max(float(np.ptp(value)) for value in values) < LEAST_CHANGE[name])
+        if values and max(float(np.ptp(value)) for value in values) < MIN_CHANNEL_RANGE[name])
 
 
 def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
@@ -138,7 +144,7 @@ def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
     top = max(float(np.quantile(np.abs(each.channels.rate), 0.999)) for each in replays) / DEGREE
     if top > 0.0:
         numbers |= {'top': top, 'faster': 3.0 * top}
-    if all('temperature' in each.has for each in replays):
+    if all('temperature' in each.available_channels for each in replays):
         degc = np.concatenate([each.channels.temperature for each in replays])
         # at least 20 K
         middle, half = 0.5 * (degc.max() + degc.min()), max(0.5 * float(np.ptp(degc)), 10.0)
@@ -146,79 +152,84 @@ def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
     return numbers
 
 
-def candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
+def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give all causes that these logs may show, each with its first shapes."""
-    has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
+    has = (frozenset.intersection(*(each.available_channels
+                                    for each in replays)) - constant_channels(replays))
     duration, interval = max(each.duration for each in replays), replays[0].interval
     fastest = max(float(np.abs(each.channels.rate).max()) for each in replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
     middle = reference_temperatures(replays)[2] if 'temperature' in has else 0.0
-    yield effect('rate_ramp')
+    yield effect_candidate('rate_ramp')
     for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
-        yield effect('warm_up', time_constant)
+        yield effect_candidate('warm_up', time_constant)
     for run, each in enumerate(replays):
-        begin, spacing = (float(each.channels.time[each.kept][0]),
-                          spacing_of_steps(each, len(replays)))
-        for number in range(1, _steps(len(replays)) + 1):
-            yield effect('bias_step', begin + number * spacing, run=run)
+        begin, spacing = (float(each.channels.time[each.valid][0]),
+                          step_time_spacing(each, len(replays)))
+        for number in range(1, _step_times_per_log(len(replays)) + 1):
+            yield effect_candidate('bias_step', begin + number * spacing, log_index=run)
     if 'temperature' in has:
-        yield effect('bias_temperature', middle)
+        yield effect_candidate('bias_temperature', middle)
         for reference in reference_temperatures(replays):
-            yield effect('bias_temperature_quadratic', reference)
+            yield effect_candidate('bias_temperature_quadratic', reference)
         for filter_time in (0.3, 1.0, 3.0, 10.0):
-            yield effect('bias_temperature_rate', filter_time)
-        for time_constant in np.geomspace(FASTEST_LAG, min(duration, 3000.0), 8):
-            yield effect('thermal_lag', time_constant)
+            yield effect_candidate('bias_temperature_rate', filter_time)
+        for time_constant in np.geomspace(MIN_THERMAL_LAG, min(duration, 3000.0), 8):
+            yield effect_candidate('thermal_lag', time_constant)
         for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)):
-            yield effect('thermal_hysteresis', filter_time, threshold)
+            yield effect_candidate('thermal_hysteresis', filter_time, threshold)
     if 'specific_force' in has:
-        yield effect('acceleration_sensitivity')
+        yield effect_candidate('acceleration_sensitivity')
         for time_constant in (0.1, 0.3, 1.0):
-            yield effect('vibration_rectification', time_constant)
+            yield effect_candidate('vibration_rectification', time_constant)
     if 'supply' in has:
-        yield effect('supply_sensitivity', 5.0)
-    yield from (effect(name, *shapes) for name, shapes in added_effects(has, moves))
+        yield effect_candidate('supply_sensitivity', 5.0)
+    yield from (effect_candidate(name, *shapes) for name, shapes in user_effects(has, moves))
     if not moves:
         return
     for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity'):
-        yield effect(name)
+        yield effect_candidate(name)
     for angle in (0.5, 1.0, 1.5, 2.0):
-        yield effect('sine_response', angle / fastest)
-    yield effect('heading_sensitivity')
-    yield effect('reference_once_per_rev')
+        yield effect_candidate('sine_response', angle / fastest)
+    yield effect_candidate('heading_sensitivity')
+    yield effect_candidate('reference_once_per_rev')
     if 'temperature' in has:
-        yield effect('scale_factor_temperature', middle)
+        yield effect_candidate('scale_factor_temperature', middle)
     # At a lower step rate the quantization of the encoder passes for a dead zone.
-    slowest = max(1e-5 * fastest, STEPS_A_SECOND * max(each.rounded for each in replays))
+    slowest = max(1e-5 * fastest,
+                  MIN_ENCODER_STEP_RATE * max(each.heading_step for each in replays))
     for zone in np.geomspace(slowest, 0.5 * fastest, 14):
-        yield effect('dead_zone', zone)
+        yield effect_candidate('dead_zone', zone)
     for limit in (0.5, 0.65, 0.8, 0.9, 0.97):
-        yield effect('saturation', limit * fastest)
+        yield effect_candidate('saturation', limit * fastest)
     for offset in (0.2 * interval, 0.02, 0.1, 0.3):
-        yield effect('time_offset', offset)
-        yield effect('time_offset', -offset)
+        yield effect_candidate('time_offset', offset)
+        yield effect_candidate('time_offset', -offset)
     for lag in (0.2 * interval, 0.01, 0.03, 0.1, 0.3):
-        yield effect('bandwidth', lag)
-    yield effect('clock_rate', 1e-6)
+        yield effect_candidate('bandwidth', lag)
+    yield effect_candidate('clock_rate', 1e-6)
 
 
-def added_effects(has: Collection[str], moves: bool) -> Iterator[tuple[str, tuple[float, ...]]]:
+def user_effects(available_channels: Collection[str],
+                 has_motion: bool) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Give the user-defined effects that logs can show, with their first shapes."""
-    for name, own in ADDED.items():
-        turned = own.looks_at & {'rate', 'output', 'heading'}
-        if own.looks_at & LEAST_CHANGE.keys() <= set(has) and (moves or not turned):
-            yield from ((name, shapes) for shapes in product(*(
-                shape.begin_with or (shape.default or 0.0,) for shape in own.shapes)))
+    for name, own in USER_EFFECTS.items():
+        turned = own.inputs & {'rate', 'output', 'heading'}
+        if (own.inputs & MIN_CHANNEL_RANGE.keys() <= set(available_channels)
+                and (has_motion or not turned)):
+            yield from ((name, shapes)
+                        for shapes in product(*(shape.begin_with or (shape.default or 0.0, )
+                                                for shape in own.nonlinear_parameters)))
 
 
-def _steps(logs: int) -> int:
+def _step_times_per_log(log_count: int) -> int:
     """Return how many times of a bias step are tried in each of so many logs."""
-    return max(STEPS // logs, 1)
+    return max(MAX_STEP_TIMES // log_count, 1)
 
 
-def spacing_of_steps(each: Replay, logs: int) -> float:
+def step_time_spacing(replay: Replay, log_count: int) -> float:
     """Return the interval between the times of a bias step that are tried in a log, s."""
-    return each.duration / (_steps(logs) + 1)
+    return replay.duration / (_step_times_per_log(log_count) + 1)
 
 
 def reference_temperatures(replays: Sequence[Replay]) -> list[float]:
@@ -227,66 +238,72 @@ def reference_temperatures(replays: Sequence[Replay]) -> list[float]:
     return [25.0, 20.0, float(known.mean()), float(known[0])]
 
 
-def by_cause(found: Sequence[Candidate]) -> Mapping[str, list[int]]:
+def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]:
     """Return the indices of the candidates of each cause."""
     places: dict[str, list[int]] = {}
-    for place, candidate in enumerate(found):
+    for place, candidate in enumerate(candidates):
         places.setdefault(candidate.cause, []).append(place)
     return places
 
 
 #: Prefix of the name of structure without a name; its variable follows.
-UNNAMED = '~'
+UNNAMED_PREFIX = '~'
 #: Numbers of knots of splines over a variable.
-KNOTS = {'rate': (8, 24), 'temperature': (8, 24)}
-_OTHER_KNOTS = (8,)
+SPLINE_KNOTS = {'rate': (8, 24), 'temperature': (8, 24)}
+_DEFAULT_KNOTS = (8,)
 #: Largest number of times of a bump in a log, and its widths as shares of the duration.
-MOMENTS, BUMPS = 40, (0.007, 0.02, 0.05)
+MAX_BUMP_TIMES, BUMP_WIDTHS = 40, (0.007, 0.02, 0.05)
 #: Numbers of waves over the range of a variable.
-WAVES = {'rate': tuple(np.arange(1.0, 12.5, 0.5)), 'temperature': tuple(np.arange(1.0, 8.5, 0.5))}
-_OTHER_WAVES = (1.0, 1.5, 2.0, 3.0, 4.0)
-HARMONICS = range(2, 11)
+WAVE_COUNTS = {
+    'rate': tuple(np.arange(1.0, 12.5, 0.5)),
+    'temperature': tuple(np.arange(1.0, 8.5, 0.5))
+}
+_DEFAULT_WAVE_COUNTS = (1.0, 1.5, 2.0, 3.0, 4.0)
+HEADING_HARMONICS = range(2, 11)
 
-Of = Callable[[Replay], Array]
+Variable = Callable[[Replay], Array]
 
 
 def is_named(candidate: Candidate) -> bool:
     """Tell whether a candidate is a cause, not structure without a name."""
-    return not candidate.cause.startswith(UNNAMED)
+    return not candidate.cause.startswith(UNNAMED_PREFIX)
 
 
-def along(candidate: Candidate) -> str:
+def unnamed_variable(candidate: Candidate) -> str:
     """Return the variable of a structure without a name."""
-    return candidate.cause[len(UNNAMED):]
+    return candidate.cause[len(UNNAMED_PREFIX):]
 
 
 def generic_terms(replays: Sequence[Replay]) -> list[Candidate]:
     """Return the generic terms that these logs may show."""
-    variables = dict(_variables(replays))
-    found = [each for name, of in variables.items() for each in _of_one(name, of)]
+    variables = dict(_scaled_variables(replays))
+    found = [each for name, of in variables.items() for each in _single_variable_terms(name, of)]
     if 'rate' in variables:
-        found += _of_turning(variables)
+        found += _rotation_terms(variables)
     for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
-            found.append(_term(f'{first} and {second}', _product(one, other)))
+            found.append(_unnamed_term(f'{first} and {second}', _product_columns(one, other)))
     for run, each in enumerate(replays):
-        begin = float(each.channels.time[each.kept][0])
-        for width in BUMPS:
-            count = min(MOMENTS, round(1.0 / width)) // len(replays) + 3
+        begin = float(each.channels.time[each.valid][0])
+        for width in BUMP_WIDTHS:
+            count = min(MAX_BUMP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
-                found.append(_term('time', _bump(moment, width * each.duration), run, moment))
+                found.append(
+                    _unnamed_term('time', _bump_columns(moment, width * each.duration), run,
+                                  moment))
     return found
 
 
-def _term(name: str, columns: Columns, run: int | None = None,
-          *shapes: float) -> Candidate:
-    return Candidate(UNNAMED + name, shapes, columns, run)
+def _unnamed_term(name: str, columns: ColumnFunction, log_index: int | None = None,
+                  *shapes: float) -> Candidate:
+    return Candidate(UNNAMED_PREFIX + name, shapes, columns, log_index)
 
 
-def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Of]]:
+def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable]]:
     """Give the variables that change in these logs, each scaled to -1 to 1."""
-    has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
-    known: dict[str, Of] = {'rate': lambda each: each.channels.rate}
+    has = (frozenset.intersection(*(each.available_channels
+                                    for each in replays)) - constant_channels(replays))
+    known: dict[str, Variable] = {'rate': lambda each: each.channels.rate}
     if 'temperature' in has:
         known['temperature'] = lambda each: each.channels.temperature
     if 'supply' in has:
@@ -297,60 +314,71 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Of]]:
         low = min(float(of(each).min()) for each in replays)
         high = max(float(of(each).max()) for each in replays)
         if high > low:
-            yield name, _scaled(of, low, high)
+            yield name, _scale_to_unit_range(of, low, high)
 
 
-def _scaled(of: Of, low: float, high: float) -> Of:
-    return lambda each: np.clip((2.0 * of(each) - low - high) / (high - low), -1.0, 1.0)
+def _scale_to_unit_range(variable: Variable, low: float, high: float) -> Variable:
+    return lambda each: np.clip((2.0 * variable(each) - low - high) / (high - low), -1.0, 1.0)
 
 
-def _of(of: Of, shape: Callable[..., Sequence[Array]],
-        value: Array | float) -> Columns:
+def _function_columns(variable: Variable, function: Callable[..., Sequence[Array]],
+                      value: Array | float) -> ColumnFunction:
     """Return the columns of a function of a variable and a value."""
-    return lambda each: shape(of(each), value)
+    return lambda each: function(variable(each), value)
 
 
-def _product(one: Of, other: Of) -> Columns:
+def _product_columns(one: Variable, other: Variable) -> ColumnFunction:
     return lambda each: (one(each) * other(each),)
 
 
-def _bump(middle: float, width: float) -> Columns:
+def _bump_columns(middle: float, width: float) -> ColumnFunction:
     return lambda each: (np.exp(-0.5 * ((each.channels.time - middle) / width) ** 2),)
 
 
-def _of_one(name: str, of: Of) -> Iterator[Candidate]:
-    for waves in WAVES.get(name, _OTHER_WAVES):
-        yield _term(name, _of(of, lambda x, waves: (np.sin(np.pi * waves * x),
-                                                    np.cos(np.pi * waves * x)), waves))
+def _single_variable_terms(name: str, variable: Variable) -> Iterator[Candidate]:
+    for waves in WAVE_COUNTS.get(name, _DEFAULT_WAVE_COUNTS):
+        yield _unnamed_term(
+            name,
+            _function_columns(
+                variable, lambda x, waves: (np.sin(np.pi * waves * x), np.cos(np.pi * waves * x)),
+                waves))
     for power in (2, 4, 5) if name == 'rate' else (3, 4) if name == 'temperature' else (2, 3):
         if (name, power) != ('rate', 2):
-            yield _term(name, _of(of, lambda x, power: (x ** power,), power))
+            yield _unnamed_term(
+                name, _function_columns(variable, lambda x, power: (x ** power, ), power))
     for steep in (-8.0, -4.0, 4.0, 8.0):
-        yield _term(name, _of(of, lambda x, steep: (np.exp(steep * x - abs(steep)),), steep))
-    for count in KNOTS.get(name, _OTHER_KNOTS):
+        yield _unnamed_term(
+            name,
+            _function_columns(variable, lambda x, steep: (np.exp(steep * x - abs(steep)), ),
+                              steep))
+    for count in SPLINE_KNOTS.get(name, _DEFAULT_KNOTS):
         knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
         # their sum is constant, as the bias is
-        yield _term(name, _of(of, lambda x, knots: tuple(
+        yield _unnamed_term(name, _function_columns(variable, lambda x, knots: tuple(
             BSpline.design_matrix(x, knots, 3).toarray().T[1:]), knots))
 
 
-def _of_turning(variables: Mapping[str, Of]) -> Iterator[Candidate]:
+def _rotation_terms(variables: Mapping[str, Variable]) -> Iterator[Candidate]:
     """Give powers of the rate, and harmonics of the heading, alone and times a variable."""
     rate = variables['rate']
     for power in (0.25, 0.5, 0.75, 1.5):
-        yield _term('rate', _of(rate, lambda x, power: (np.abs(x) ** power,), power))
-        yield _term('rate', _of(rate, lambda x, power: (np.abs(x) ** power * np.sign(x),), power))
-    for harmonic in HARMONICS:
-        yield _term('heading', _harmonic(harmonic, None))
-    for harmonic in HARMONICS[:3]:
-        yield _term('rate and heading', _harmonic(harmonic, rate))
+        yield _unnamed_term(
+            'rate', _function_columns(rate, lambda x, power: (np.abs(x) ** power, ), power))
+        yield _unnamed_term(
+            'rate',
+            _function_columns(rate, lambda x, power: (np.abs(x) ** power * np.sign(x), ), power))
+    for harmonic in HEADING_HARMONICS:
+        yield _unnamed_term('heading', _harmonic_columns(harmonic, None))
+    for harmonic in HEADING_HARMONICS[:3]:
+        yield _unnamed_term('rate and heading', _harmonic_columns(harmonic, rate))
     for name in ('temperature', 'supply'):
         if name in variables:
-            yield _term(f'{name} and heading', _harmonic(1, variables[name]))
+            yield _unnamed_term(f'{name} and heading', _harmonic_columns(1, variables[name]))
 
 
-def _harmonic(number: int, times: Of | None) -> Columns:
+def _harmonic_columns(number: int, factor_variable: Variable | None) -> ColumnFunction:
     def columns(each: Replay) -> Sequence[Array]:
-        phase, factor = number * each.channels.heading, 1.0 if times is None else times(each)
+        phase, factor = (number * each.channels.heading,
+                         1.0 if factor_variable is None else factor_variable(each))
         return factor * np.sin(phase), factor * np.cos(phase)
     return columns

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from gyro_calibration.diagnosis.findings import Estimate, Finding, RULED_OUT
+from gyro_calibration.diagnosis.findings import Estimate, Finding, RULED_OUT_DEFICIT
 from gyro_calibration.model.effects import CATALOGUE, Effect
 from gyro_calibration.model.gyro_model import GyroModel
 
@@ -41,20 +41,21 @@ class Cause:
     name : as in the catalogue of effects and in files
     sentence : description for people
     units : estimated parameter -> SI unit
-    needs : columns of a log that are required to show it; 'reference' is one of `REFERENCES`
+    required_channels : columns of a log that are required to show it; 'reference' is one of
+        `REFERENCES`
     along : the variable along which it shows
     separate_by : the experiment that distinguishes it from similar causes; '' without one
-    of : what is to be corrected: 'gyro', 'reference', 'record' or 'noise'
+    origin : what is to be corrected: 'gyro', 'reference', 'record' or 'noise'
 
     """
 
     name: str
     sentence: str
     units: Mapping[str, str]
-    needs: frozenset[str]
+    required_channels: frozenset[str]
     along: str
     separate_by: str
-    of: str
+    origin: str
 
     @property
     def unit(self) -> str:
@@ -62,42 +63,44 @@ class Cause:
         return next(iter(self.units.values()))
 
 
-_ACCELERATIONS = ('swing fast with quick reversals: a lag reduces the amplitude of fast motion, '
-                  'a delay does not')
-_CORNERS = ('heat and cool the resting gyro at two temperature rates, with abrupt changes from '
-            'heating to cooling')
-_FULL_SCALE = 'turn at many speeds up to full scale'
-_MARK = 'make whole turns between marks, or use a second reference'
-_HEADINGS = 'turn at several speeds, and stop at eight headings'
+_REVERSALS_EXPERIMENT = ('swing fast with quick reversals: a lag reduces the amplitude of fast '
+                         'motion, '
+                         'a delay does not')
+_THERMAL_CYCLE_EXPERIMENT = ('heat and cool the resting gyro at two temperature rates, with '
+                             'abrupt changes from '
+                             'heating to cooling')
+_FULL_SCALE_EXPERIMENT = 'turn at many speeds up to full scale'
+_CLOSED_TURN_EXPERIMENT = 'make whole turns between marks, or use a second reference'
+_HEADING_STOP_EXPERIMENT = 'turn at several speeds, and stop at eight headings'
 
 #: Effect of the gyro -> the variable along which it shows, and its experiment.
-_OF_THE_GYRO: Mapping[str, tuple[str, str]] = {
+_GYRO_EFFECTS: Mapping[str, tuple[str, str]] = {
     'bias': ('rate', 'turn the axis over within one power-on, with all motors off'),
-    'scale_factor_error': ('rate', _MARK),
+    'scale_factor_error': ('rate', _CLOSED_TURN_EXPERIMENT),
     'scale_factor_asymmetry': ('rate', 'turn both ways at many speeds, slow ones too'),
     'quadratic_nonlinearity': ('rate', 'turn both ways at many speeds, slow ones too, with the '
                                'sensor on the axis of the table'),
-    'cubic_nonlinearity': ('rate', _FULL_SCALE),
-    'sine_response': ('rate', _FULL_SCALE),
+    'cubic_nonlinearity': ('rate', _FULL_SCALE_EXPERIMENT),
+    'sine_response': ('rate', _FULL_SCALE_EXPERIMENT),
     'bias_temperature': ('temperature', 'heat and cool the gyro within one log, and start it both '
                          'cold and warm'),
     'bias_temperature_quadratic': ('temperature', ''),
     'scale_factor_temperature': ('temperature', ''),
-    'bias_temperature_rate': ('temperature_rate', _CORNERS),
-    'thermal_lag': ('temperature_rate', _CORNERS),
+    'bias_temperature_rate': ('temperature_rate', _THERMAL_CYCLE_EXPERIMENT),
+    'thermal_lag': ('temperature_rate', _THERMAL_CYCLE_EXPERIMENT),
     'thermal_hysteresis': ('temperature_rate', 'repeat the same temperature cycle at two '
                            'temperature rates'),
     'warm_up': ('time', 'start the gyro both cold and warm, and let it rest'),
     'rate_ramp': ('time', 'record again, from a power-on at another temperature: only a ramp '
                   'repeats'),
     'bias_step': ('time', 'record again: a step does not repeat'),
-    'heading_sensitivity': ('heading', _HEADINGS),
+    'heading_sensitivity': ('heading', _HEADING_STOP_EXPERIMENT),
     'acceleration_sensitivity': ('specific_force', 'rest in several poses within one power-on'),
     'vibration_rectification': ('vibration', 'rest with the motor on and off'),
     'supply_sensitivity': ('supply', 'step the supply voltage at one temperature'),
     'interference_tone': ('frequency', ''),
-    'bandwidth': ('rate_change', _ACCELERATIONS),
-    'time_offset': ('rate_change', _ACCELERATIONS),
+    'bandwidth': ('rate_change', _REVERSALS_EXPERIMENT),
+    'time_offset': ('rate_change', _REVERSALS_EXPERIMENT),
     'clock_rate': ('time', 'record long, with sharp reversals at both ends'),
     'dead_zone': ('rate', 'sweep slowly through zero'),
     'saturation': ('rate', 'turn faster than the limit: the output stays at its extreme code'),
@@ -105,23 +108,23 @@ _OF_THE_GYRO: Mapping[str, tuple[str, str]] = {
 }
 
 #: Name, sentence, unit, origin, required channels, variable along which it shows, experiment.
-_OTHERS = (
+_OTHER_CAUSES = (
     ('outliers', 'Single samples are outliers, as from a disturbed line or a corrected checksum.',
      '1', 'record', 'time', 'time', ''),
     ('stuck_samples', 'The last value is repeated instead of a new one.', '1', 'record', 'time',
      'time', 'turn without rest: the output of a working gyro then changes in each sample'),
     ('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time', 'time', ''),
     ('reference_once_per_rev', 'The reference errs once in a revolution, as an eccentric encoder '
-     'or a wobbling table does.', '1', 'reference', 'time reference', 'heading', _HEADINGS),
+     'or a wobbling table does.', '1', 'reference', 'time reference', 'heading',
+     _HEADING_STOP_EXPERIMENT),
     ('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference',
-     'time reference', 'rate', _MARK),
+     'time reference', 'rate', _CLOSED_TURN_EXPERIMENT),
     ('reference_slip', 'The reference slipped: it shows a rotation that the gyro did not make.',
      'rad', 'reference', 'time reference', 'rate_change', ''),
     ('reference_quantization', 'The reference heading is quantized, so that its rate between '
      'samples is coarse.', 'rad', 'reference', 'time reference_heading', 'heading', ''),
-    ('unit_error', 'The output has another unit, or the other sign, than its name states.',
-     '1', 'record', 'reference', 'rate',
-     'compare the raw values of the gyro with its data sheet'),
+    ('unit_error', 'The output has another unit, or the other sign, than its name states.', '1',
+     'record', 'reference', 'rate', 'compare the raw values of the gyro with its data sheet'),
     ('angle_random_walk', 'The angle random walk differs from the simulated one.', 'rad/√s',
      'noise', 'time', 'frequency', ''),
     ('bias_instability', 'The bias instability differs from the simulated one.', 'rad/s', 'noise',
@@ -132,39 +135,39 @@ _OTHERS = (
 )
 
 
-def _of_an_effect(name: str, along: str, separate_by: str) -> Cause:
+def _cause_of_effect(name: str, along: str, separate_by: str) -> Cause:
     effect = CATALOGUE[name]
     units = {parameter.name: parameter.unit
              for parameter in effect.parameters if parameter.default is None}
     turned = along in {'rate', 'heading', 'rate_change'} and name != 'bias'
-    needs = {'time', *(effect.looks_at & {'temperature', 'specific_force', 'supply'}),
-             *({'reference'} if turned or 'rate' in effect.looks_at else ())}
+    needs = {'time', *(effect.inputs & {'temperature', 'specific_force', 'supply'}),
+             *({'reference'} if turned or 'rate' in effect.inputs else ())}
     return Cause(name, effect.cause, units, frozenset(needs), along, separate_by, 'gyro')
 
 
 CAUSES: dict[str, Cause] = {
-    **{name: _of_an_effect(name, *shown) for name, shown in _OF_THE_GYRO.items()},
+    **{name: _cause_of_effect(name, *shown) for name, shown in _GYRO_EFFECTS.items()},
     **{name: Cause(name, sentence, {name: unit}, frozenset(needs.split()), along, separate_by, of)
-       for name, sentence, unit, of, needs, along, separate_by in _OTHERS}}
+       for name, sentence, unit, of, needs, along, separate_by in _OTHER_CAUSES}}
 
 
 def add_causes(effects: Iterable[Effect]) -> None:
     """Add user-defined effects of the catalogue to the causes that a diagnosis searches for."""
     for effect in effects:
-        CAUSES[effect.name] = _of_an_effect(effect.name, effect.along, effect.shown_by)
+        CAUSES[effect.name] = _cause_of_effect(effect.name, effect.along, effect.experiment)
 
 
-def finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
-            confounders: Sequence[str] = (), **known: Any) -> Finding:
+def make_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
+                 confounders: Sequence[str] = (), **fields: Any) -> Finding:
     """Return a finding of a cause, with the fields of the cause as defaults."""
     cause = CAUSES[name]
-    usual = {'cause': cause.sentence, 'along': cause.along,
-             'separate_by': cause.separate_by if confounders else ''}
+    defaults = {'cause': cause.sentence, 'along': cause.along,
+                'separate_by': cause.separate_by if confounders else ''}
     return Finding(name, parameters=parameters, p_value=p_value,
-                   ambiguous_with=tuple(confounders), **{**usual, **known})
+                   ambiguous_with=tuple(confounders), **{**defaults, **fields})
 
 
-def as_suspected(found: Finding) -> Finding:
+def mark_suspected(found: Finding) -> Finding:
     """Return a finding as suspected, with the experiment that would establish it as remedy."""
     separate_by = CAUSES[found.effect].separate_by
     return replace(found, status='suspected', remedy=(
@@ -179,13 +182,13 @@ _REMEDIES = {
     'noise': 'use the noise figures of the extended model'}
 
 
-def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
-                  model: GyroModel) -> list[Finding]:
+def add_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
+                 model: GyroModel) -> list[Finding]:
     """Return findings with their shares of the heading error and their remedies."""
     inside = {term.effect.name for term in model.terms}
     return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy or (
-        '' if CAUSES[each.effect].of == 'gyro' and each.effect not in inside
-        else _REMEDIES[CAUSES[each.effect].of])) for each in findings]
+        '' if CAUSES[each.effect].origin == 'gyro' and each.effect not in inside
+        else _REMEDIES[CAUSES[each.effect].origin])) for each in findings]
 
 
 #: Next experiment, with numbers of `observed_range` -> pairs of causes that it distinguishes.
@@ -222,13 +225,13 @@ _EXPERIMENTS: Mapping[str, str] = {
         'bias_temperature supply_sensitivity',
 }
 #: Largest number of logs that is proposed.
-_MOST_LOGS = 10
-_OF_PAIRS = {frozenset(pair.split()): words
-             for words, pairs in _EXPERIMENTS.items() for pair in pairs.split(', ')}
+_MAX_PROPOSED_LOGS = 10
+_EXPERIMENT_BY_PAIR = {frozenset(pair.split()): words
+                       for words, pairs in _EXPERIMENTS.items() for pair in pairs.split(', ')}
 
 
-def experiment(name: str, others: Sequence[tuple[str, float]],
-               numbers: Mapping[str, float]) -> str:
+def next_experiment(name: str, alternatives: Sequence[tuple[str, float]],
+                    observed_range: Mapping[str, float]) -> str:
     """
     Return the next experiment that distinguishes a cause from others, in words.
 
@@ -239,21 +242,22 @@ def experiment(name: str, others: Sequence[tuple[str, float]],
     Parameters
     ----------
     name : of the cause
-    others : names of the alternatives, with their deficits in log-likelihood, which are half the
-        square of the sigmas
-    numbers : of the logs, from `candidates.observed_range`
+    alternatives : names of the alternatives, with their deficits in log-likelihood, which are half
+        the square of the sigmas
+    observed_range : of the logs, from `candidates.observed_range`
 
     """
     found: dict[str, list[str]] = {}
-    for other, lack in others:
-        words = _OF_PAIRS.get(frozenset((name, other)), '')
-        if not words or any(f'{{{key}:' in words for key in {'top', 'low'} - numbers.keys()):
+    for other, lack in alternatives:
+        words = _EXPERIMENT_BY_PAIR.get(frozenset((name, other)), '')
+        if (not words
+                or any(f'{{{key}:' in words for key in {'top', 'low'} - observed_range.keys())):
             words = CAUSES[name].separate_by or CAUSES[other].separate_by
         sigmas = math.sqrt(2.0 * max(lack, 0.0))
         text = f'{other.replace("_", " ")} by {sigmas:.1f} sigma'
-        if RULED_OUT / _MOST_LOGS < lack < RULED_OUT:
-            logs = math.ceil(RULED_OUT / lack)
+        if RULED_OUT_DEFICIT / _MAX_PROPOSED_LOGS < lack < RULED_OUT_DEFICIT:
+            logs = math.ceil(RULED_OUT_DEFICIT / lack)
             text += f', {logs} such logs together by {math.sqrt(logs) * sigmas:.1f}'
-        found.setdefault(words.format(**numbers), []).append(text)
+        found.setdefault(words.format(**observed_range), []).append(text)
     return '; '.join(f'{words} (the data at hand distinguish {", ".join(texts)})'
                      for words, texts in found.items() if words)

@@ -22,11 +22,11 @@ from dataclasses import dataclass
 from html import escape
 import math
 
-from gyro_calibration.diagnosis.words import clean, number, raised
-from gyro_calibration.logs.log import Array, Mask, NORMAL_95
+from gyro_calibration.diagnosis.words import format_number, sanitize_text, superscript
+from gyro_calibration.logs.log import Array, Mask, NORMAL_QUANTILE_975
 import numpy as np
 
-_EMPTY = {'path', 'line', 'circle', 'rect', 'meta', 'br'}
+_VOID_ELEMENTS = {'path', 'line', 'circle', 'rect', 'meta', 'br'}
 
 
 class Markup(str):
@@ -50,23 +50,24 @@ def element(name: str, *children: str | None, **attributes: str | float | None) 
     named = ''.join(f' {key}="{_escaped(value)}"' for key, value in given.items())
     inside = ''.join(child if isinstance(child, Markup) else _escaped(child) for child in children
                      if child is not None)
-    return Markup(f'<{name}{named}/>' if name in _EMPTY else f'<{name}{named}>{inside}</{name}>')
+    return Markup(f'<{name}{named}/>' if name in
+                  _VOID_ELEMENTS else f'<{name}{named}>{inside}</{name}>')
 
 
-def joined(*parts: str) -> Markup:
+def join_markup(*parts: str) -> Markup:
     """Return parts one after the other, texts escaped."""
     return Markup(''.join(part if isinstance(part, Markup) else _escaped(part) for part in parts))
 
 
 def _escaped(text: str) -> str:
-    return escape('\n'.join(clean(line) for line in text.split('\n')))
+    return escape('\n'.join(sanitize_text(line) for line in text.split('\n')))
 
 
 #: Size of the drawing and of the plot in it: small, so that letters are readable on a phone.
 _WIDTH, _HEIGHT = 360.0, 236.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 344.0, 24.0, 196.0
 #: Number of letters that fit side by side below an axis.
-_LETTERS = 30
+_MAX_LABEL_LETTERS = 30
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Line:
     style : measured, simulated, before or after; the page defines colour and stroke for each
     values : shape (n,), nan where missing
     deviation : of the values, drawn as a band or as bars of 95 %; None where it is not known
-    dots : draw dots instead of a line
+    draw_dots : draw dots instead of a line
 
     """
 
@@ -88,7 +89,7 @@ class Line:
     style: str
     values: Array
     deviation: Array | None = None
-    dots: bool = False
+    draw_dots: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,24 +101,24 @@ class Chart:
     ----------
     name : of the chart, unique on the page, for links inside it
     title, description : for people, also for screen readers
-    across, across_unit, at : label, unit and values of the horizontal axis, shape (n,)
-    up, up_unit, lines : label, unit and lines of the vertical axis
-    logarithmic : both axes
-    names : of the horizontal values, if they are numbered from 1 on
+    x_label, x_unit, x : label, unit and values of the horizontal axis, shape (n,)
+    y_label, y_unit, lines : label, unit and lines of the vertical axis
+    is_logarithmic : both axes
+    x_names : of the horizontal values, if they are numbered from 1 on
 
     """
 
     name: str
     title: str
     description: str
-    across: str
-    across_unit: str
-    at: Array
-    up: str
-    up_unit: str
+    x_label: str
+    x_unit: str
+    x: Array
+    y_label: str
+    y_unit: str
     lines: Sequence[Line]
-    logarithmic: bool = False
-    names: Sequence[str] = ()
+    is_logarithmic: bool = False
+    x_names: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -126,25 +127,26 @@ class _Axis:
 
     low: float
     high: float
-    begin: float
-    end: float
-    logarithmic: bool = False
+    low_position: float
+    high_position: float
+    is_logarithmic: bool = False
     unit: str = ''
 
-    def place(self, values: Array) -> Array:
+    def to_positions(self, values: Array) -> Array:
         """Return places in the drawing."""
         with np.errstate(divide='ignore', invalid='ignore'):
-            scaled, low, high = (np.log10(each) if self.logarithmic else each
+            scaled, low, high = (np.log10(each) if self.is_logarithmic else each
                                  for each in (values, self.low, self.high))
-        return np.asarray(self.begin + (scaled - low) / (high - low) * (self.end - self.begin))
+        return np.asarray(self.low_position + (scaled - low) / (high - low)
+                          * (self.high_position - self.low_position))
 
     def ticks(self, count: int) -> list[tuple[float, str]]:
         """Return about so many values with their labels: round, of degrees parts of a turn."""
-        if self.logarithmic:
+        if self.is_logarithmic:
             powers = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
             every = max(1, math.ceil((len(powers) - 2) / count))
             ticks = [(part * 10.0 ** power, f'{part * 10.0 ** power:g}' if -4 < power < 5
-                      else f'{"" if part == 1 else f"{part} × "}10{raised(power)}')
+                      else f'{"" if part == 1 else f"{part} × "}10{superscript(power)}')
                      for power in powers if power % every == 0
                      for part in ((1, 2, 5) if len(powers) < 4 else (1,))]
             return [tick for tick in ticks if self.low <= tick[0] <= self.high]
@@ -160,54 +162,54 @@ class _Axis:
                 for value in values]
 
 
-def draw(chart: Chart) -> Markup:
+def draw_chart(chart: Chart) -> Markup:
     """Return a chart with its legend, its table of values, and a cursor for the values."""
-    shown = [_shown(chart, line) for line in chart.lines]
+    shown = [_drawable_points(chart, line) for line in chart.lines]
     if not any(each.any() for each in shown):
         return element('p', f'{chart.title}: there is nothing to draw.', class_='quiet')
-    names = (_labelled(chart.across, chart.across_unit), _labelled(chart.up, chart.up_unit))
-    across, up = _axes(chart, shown)
-    at, marks, dots = across.place(chart.at), [], []
+    names = (_axis_label(chart.x_label, chart.x_unit), _axis_label(chart.y_label, chart.y_unit))
+    across, up = _make_axes(chart, shown)
+    at, marks, dots = across.to_positions(chart.x), [], []
     for line, known in zip(chart.lines, shown):
-        places = up.place(line.values)
-        marks.append(_line(line, at, places, up, known))
+        places = up.to_positions(line.values)
+        marks.append(_draw_line(line, at, places, up, known))
         # the script moves these to the values pointed at; they are hidden without it
         dots.append(element('circle', r=4.5, class_=line.style,
-                            data_up=_places(np.where(known, places, np.nan))))
-    picture = element(
-        'svg', element('title', chart.title, id=f'{chart.name}-title'),
-        element('desc', chart.description, id=f'{chart.name}-description'),
-        *_grid(chart, names, across, up), *marks,
-        element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots, class_='cursor'),
-        viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img', tabindex='0',
-        aria_labelledby=f'{chart.name}-title {chart.name}-description', data_at=_places(at))
+                            data_up=_format_positions(np.where(known, places, np.nan))))
+    picture = element('svg', element('title', chart.title, id=f'{chart.name}-title'),
+                      element('desc', chart.description, id=f'{chart.name}-description'),
+                      *_grid_elements(chart, names, across, up), *marks,
+                      element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots,
+                              class_='cursor'), viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img',
+                      tabindex='0', aria_labelledby=f'{chart.name}-title {chart.name}-description',
+                      data_at=_format_positions(at))
     return element('figure', element('figcaption', chart.title), picture,
-                   element('ul', *map(_entry, chart.lines), class_='legend'),
+                   element('ul', *map(_legend_entry, chart.lines), class_='legend'),
                    element('p', chart.description, class_='readout', aria_live='polite'),
-                   _table(chart), class_='chart')
+                   _value_table(chart), class_='chart')
 
 
-def _shown(chart: Chart, line: Line) -> Mask:
-    known = np.isfinite(chart.at) & np.isfinite(line.values)
-    return known & (chart.at > 0.0) & (line.values > 0.0) if chart.logarithmic else known
+def _drawable_points(chart: Chart, line: Line) -> Mask:
+    known = np.isfinite(chart.x) & np.isfinite(line.values)
+    return known & (chart.x > 0.0) & (line.values > 0.0) if chart.is_logarithmic else known
 
 
-def _axes(chart: Chart, shown: Sequence[Mask]) -> tuple[_Axis, _Axis]:
+def _make_axes(chart: Chart, shown: Sequence[Mask]) -> tuple[_Axis, _Axis]:
     """Return the axes; linear ones include zero vertically."""
-    at, ends = [], [] if chart.logarithmic else [np.zeros(1)]
+    at, ends = [], [] if chart.is_logarithmic else [np.zeros(1)]
     for line, known in zip(chart.lines, shown):
-        deviation = (0.0 if line.deviation is None or chart.logarithmic
-                     else NORMAL_95 * np.nan_to_num(line.deviation))
-        at.append(chart.at[known])
+        deviation = (0.0 if line.deviation is None or chart.is_logarithmic
+                     else NORMAL_QUANTILE_975 * np.nan_to_num(line.deviation))
+        at.append(chart.x[known])
         ends += [(line.values - deviation)[known], (line.values + deviation)[known]]
-    across = np.array([0.5, len(chart.names) + 0.5]) if chart.names else np.concatenate(at)
-    return (_Axis(*_room(across, chart.logarithmic, 0.0), _LEFT, _RIGHT,
-                  chart.logarithmic, chart.across_unit),
-            _Axis(*_room(np.concatenate(ends), chart.logarithmic, 0.06), _BOTTOM, _TOP,
-                  chart.logarithmic, chart.up_unit))
+    across = np.array([0.5, len(chart.x_names) + 0.5]) if chart.x_names else np.concatenate(at)
+    return (_Axis(*_padded_range(across, chart.is_logarithmic, 0.0), _LEFT, _RIGHT,
+                  chart.is_logarithmic, chart.x_unit),
+            _Axis(*_padded_range(np.concatenate(ends), chart.is_logarithmic, 0.06), _BOTTOM, _TOP,
+                  chart.is_logarithmic, chart.y_unit))
 
 
-def _room(values: Array, logarithmic: bool, margin: float) -> tuple[float, float]:
+def _padded_range(values: Array, logarithmic: bool, margin: float) -> tuple[float, float]:
     """Return the ends of an axis, a little beyond the values."""
     low, high = float(values.min()), float(values.max())
     if logarithmic:
@@ -217,20 +219,20 @@ def _room(values: Array, logarithmic: bool, margin: float) -> tuple[float, float
     return low - margin * (high - low), high + margin * (high - low)
 
 
-def _places(values: Array) -> str:
+def _format_positions(values: Array) -> str:
     return ' '.join(f'{value:.1f}' if math.isfinite(value) else '-' for value in values)
 
 
-def _grid(chart: Chart, names: tuple[str, str], across: _Axis,
-          up: _Axis) -> Iterator[Markup]:
-    apart = math.ceil(sum(map(len, chart.names)) / _LETTERS) or 1
-    named = [(float(place), text) for place, text in enumerate(chart.names, 1)][::apart]
+def _grid_elements(chart: Chart, names: tuple[str, str], across: _Axis,
+                   up: _Axis) -> Iterator[Markup]:
+    apart = math.ceil(sum(map(len, chart.x_names)) / _MAX_LABEL_LETTERS) or 1
+    named = [(float(place), text) for place, text in enumerate(chart.x_names, 1)][::apart]
     for value, label in named or across.ticks(6):
-        x = float(across.place(np.array(value)))
+        x = float(across.to_positions(np.array(value)))
         yield element('line', x1=x, x2=x, y1=_TOP, y2=_BOTTOM, class_='grid')
         yield element('text', label, x=x, y=_BOTTOM + 15.0, text_anchor='middle')
     for value, label in up.ticks(5):
-        y = float(up.place(np.array(value)))
+        y = float(up.to_positions(np.array(value)))
         yield element('line', x1=_LEFT, x2=_RIGHT, y1=y, y2=y,
                       class_='zero' if value == 0.0 else 'grid')
         yield element('text', label, x=_LEFT - 5.0, y=y + 4.0, text_anchor='end')
@@ -239,23 +241,23 @@ def _grid(chart: Chart, names: tuple[str, str], across: _Axis,
     yield element('text', names[1], x=4.0, y=13.0, class_='label')
 
 
-def _labelled(name: str, unit: str) -> str:
+def _axis_label(name: str, unit: str) -> str:
     return f'{name} [{unit}]' if unit else name
 
 
-def _line(line: Line, at: Array, places: Array, up: _Axis, shown: Mask) -> Markup:
+def _draw_line(line: Line, at: Array, places: Array, up: _Axis, shown: Mask) -> Markup:
     """Return a line that breaks where there is no value, or dots, with what they deviate by."""
     x, y = at[shown], places[shown]
     parts = []
     if line.deviation is not None:
-        half = NORMAL_95 * np.nan_to_num(line.deviation)
-        above, below = (up.place(line.values + side)[shown] for side in (half, -half))
+        half = NORMAL_QUANTILE_975 * np.nan_to_num(line.deviation)
+        above, below = (up.to_positions(line.values + side)[shown] for side in (half, -half))
         corners = [*zip(x, above), *zip(x[::-1], below[::-1])]
         parts.append(element('path', d=''.join(
             f'M{each:.1f} {a:.1f}V{b:.1f}' for each, a, b in zip(x, above, below)), class_='bars')
-            if line.dots else element('path', d='M' + 'L'.join(
+            if line.draw_dots else element('path', d='M' + 'L'.join(
                 f'{each:.1f} {value:.1f}' for each, value in corners) + 'Z', class_='band'))
-    if line.dots:
+    if line.draw_dots:
         parts += [element('circle', cx=float(each), cy=float(value), r=2.6)
                   for each, value in zip(x, y)]
     else:
@@ -266,37 +268,37 @@ def _line(line: Line, at: Array, places: Array, up: _Axis, shown: Mask) -> Marku
     return element('g', *parts, class_=line.style)
 
 
-def _entry(line: Line) -> Markup:
-    mark = (element('circle', cx=12.0, cy=6.0, r=3.0) if line.dots
+def _legend_entry(line: Line) -> Markup:
+    mark = (element('circle', cx=12.0, cy=6.0, r=3.0) if line.draw_dots
             else element('path', d='M1 6H23', class_='stroke'))
     spread = [] if line.deviation is None else [
-        element('path', d='M12 0V12', class_='bars') if line.dots
+        element('path', d='M12 0V12', class_='bars') if line.draw_dots
         else element('rect', x=1.0, y=1.0, width=22.0, height=10.0, class_='band')]
     swatch = element('svg', element('g', *spread, mark, class_=line.style),
                      viewBox='0 0 24 12', class_='swatch', aria_hidden='true')
     return element('li', swatch, line.name + ('' if line.deviation is None else ', 95 %'))
 
 
-def _table(chart: Chart) -> Markup:
+def _value_table(chart: Chart) -> Markup:
     def value(line: Line, row: int) -> str:
         """Return a value with the half of its interval."""
         if not math.isfinite(line.values[row]):
             return '–'
-        return number(float(line.values[row])) + (
+        return format_number(float(line.values[row])) + (
             '' if line.deviation is None
-            else f' ± {number(NORMAL_95 * float(line.deviation[row]), 2)}')
+            else f' ± {format_number(NORMAL_QUANTILE_975 * float(line.deviation[row]), 2)}')
 
-    heads = [(chart.across, chart.across_unit), *((each.name, chart.up_unit)
-                                                  for each in chart.lines)]
+    heads = [(chart.x_label, chart.x_unit), *((each.name, chart.y_unit)
+                                              for each in chart.lines)]
     table = element(
-        'table', element('caption', joined(chart.title, ', ', chart.up)),
+        'table', element('caption', join_markup(chart.title, ', ', chart.y_label)),
         element('thead', element('tr', *(element(
-            'th', _labelled(name, unit), scope='col', data_name=name, data_unit=unit)
+            'th', _axis_label(name, unit), scope='col', data_name=name, data_unit=unit)
             for name, unit in heads))),
         element('tbody', *(element(
-            'tr', element('td', chart.names[round(float(at)) - 1] if chart.names
-                          else number(float(at), 4)),
+            'tr', element('td', chart.x_names[round(float(at)) - 1] if chart.x_names
+                          else format_number(float(at), 4)),
             *(element('td', value(line, row)) for line in chart.lines))
-            for row, at in enumerate(chart.at))))
+            for row, at in enumerate(chart.x))))
     return element('details', element('summary', 'Values'),
                    element('div', table, class_='scroll', tabindex='0'))

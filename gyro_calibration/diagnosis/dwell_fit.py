@@ -23,29 +23,29 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, take
+from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.rate_table import (
     Calibration,
     channels_of,
-    columns_of,
     fit_effects,
+    sensitivity_columns,
 )
 from gyro_calibration.calibration.scatter import (
-    parts_of,
-    SMALLEST_TEMPERATURE_SPREAD,
+    cross_validation_parts,
+    MIN_TEMPERATURE_SPREAD,
     Uncertainty,
     Whitener,
 )
 from gyro_calibration.calibration.selection import (
-    decided,
-    DISTINGUISHED,
-    separation,
-    supported_effects,
-    swapped_effects,
-    TECHNOLOGIES,
+    fit_supported_effects,
+    MIN_DISTINGUISHING_SIGMAS,
+    replace_effect,
+    resolve_confounders,
+    separation_sigmas,
+    TECHNOLOGY_EFFECTS,
 )
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.extended_model import origins_before, wider
+from gyro_calibration.diagnosis.extended_model import previous_origins, widen_range
 from gyro_calibration.diagnosis.findings import Unexplained
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.effects import (
@@ -58,7 +58,7 @@ from gyro_calibration.model.effects import (
     SATURATION,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
-    STEADY,
+    STATIC_EFFECTS,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
@@ -67,88 +67,89 @@ from scipy.linalg import block_diag
 from scipy.stats import f as fisher
 
 #: Fitted in any case.
-NUISANCES = (BIAS, SCALE_FACTOR_ERROR)
+NUISANCE_EFFECTS = (BIAS, SCALE_FACTOR_ERROR)
 #: Channels of effects that dwells without time can show.
-_SEEN = {'rate', 'output', 'temperature'}
+_VISIBLE_CHANNELS = {'rate', 'output', 'temperature'}
 #: Shares of the false-alarm rate: for causes other than bias and scale factor, and for a bias and
 #: a scale factor that differ from the model's.
-_CAUSES, _OF_NUISANCES = 0.65, 0.1
+_CAUSE_ALARM_SHARE, _NUISANCE_ALARM_SHARE = 0.65, 0.1
 #: Trial reference temperatures of a parabola without a slope, degC, in addition to the mean and
 #: the first temperature.
-_USUAL = (25.0, 20.0)
+_USUAL_TEMPERATURES = (25.0, 20.0)
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedCauses:
     """
     Causes that dwells support on top of a model.
 
     Attributes
     ----------
     fit : of causes, bias and scale factor to dwells less the effects of the model that are kept
-    change : the same as changes in addition to the whole model, by which causes are tested
+    change_fit : the same as changes in addition to the whole model, by which causes are tested
     causes : the named effects of the fit
     model : that is tested
-    rate : false-alarm rate of the diagnosis
+    false_alarm_rate : false-alarm rate of the diagnosis
 
     """
 
     fit: Calibration
-    change: Calibration
+    change_fit: Calibration
     causes: tuple[Effect, ...]
     model: GyroModel
-    rate: float
+    false_alarm_rate: float
 
-    def changed(self, effect: Effect) -> Effect:
+    def change_effect(self, effect: Effect) -> Effect:
         """Return the change that stands for an effect of the fit: itself, or its confounder."""
-        return _or_confounder(effect, self.change)
+        return _effect_or_confounder(effect, self.change_fit)
 
-    def chance_of(self, effect: Effect) -> float:
+    def p_value(self, effect: Effect) -> float:
         """Return the p-value of a cause, corrected for the number of causes tried."""
-        if effect in NUISANCES:
-            return min(1.0, _chance_of_change(self.fit, self.model, effect) * len(NUISANCES))
-        return min(1.0, _chance(self.change, self.model, self.changed(effect))
-                   * (len(STEADY) - len(NUISANCES)))
+        if effect in NUISANCE_EFFECTS:
+            return min(1.0, _change_p_value(self.fit, self.model, effect) * len(NUISANCE_EFFECTS))
+        return min(1.0, _effect_p_value(self.change_fit, self.model, self.change_effect(effect))
+                   * (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS)))
 
 
 # a model against dwells
 
-def surroundings(model: GyroModel, dwells: Dwells) -> Channels:
+def model_channels(model: GyroModel, dwells: Dwells) -> Channels:
     """Return the channels of a model, at its reference temperature if the table has none."""
     channels = channels_of(dwells)
     return channels if dwells.temperature is not None else replace(
         channels, temperature=np.full(len(dwells), model.reference_temperature))
 
 
-def simulated(model: GyroModel, dwells: Dwells) -> Array:
+def simulate_output(model: GyroModel, dwells: Dwells) -> Array:
     """Return the output that a model has for the dwells, rad/s, shape (n,)."""
-    known = replace(model, terms=tuple(seen(model)))
-    return np.asarray(known.output_in(surroundings(model, dwells))) + np.zeros(len(dwells))
+    known = replace(model, terms=tuple(visible_terms(model)))
+    return (np.asarray(known.output_from_channels(model_channels(model, dwells)))
+            + np.zeros(len(dwells)))
 
 
-def seen(model: GyroModel) -> list[Term]:
+def visible_terms(model: GyroModel) -> list[Term]:
     """Return the effects of a model that dwells can show: of rate, output and temperature."""
     return [term for term in model.terms
-            if term.effect.looks_at <= _SEEN and term.effect.distortion is None]
+            if term.effect.inputs <= _VISIBLE_CHANNELS and term.effect.distortion is None]
 
 
-def without_effects(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) -> Dwells:
+def subtract_effects(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) -> Dwells:
     """Return dwells whose output is without the effects of a model that are not refitted."""
-    channels, names = surroundings(model, dwells), {effect.name for effect in refitted}
+    channels, names = model_channels(model, dwells), {effect.name for effect in refitted}
     return replace(dwells, output=dwells.output - sum(
-        term.error(channels) for term in seen(model) if term.effect.name not in names))
+        term.error(channels) for term in visible_terms(model) if term.effect.name not in names))
 
 
-def technology(model: GyroModel) -> str | None:
+def stated_technology(model: GyroModel) -> str | None:
     """Return the technology of the instrument, if the model states a known one."""
     stated = model.gyro.get('technology')
-    return stated if stated in TECHNOLOGIES else None
+    return stated if stated in TECHNOLOGY_EFFECTS else None
 
 
 # naming
 
-def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
-                without: frozenset[str] = frozenset()) -> Named:
+def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
+                withdrawn: frozenset[str] = frozenset()) -> NamedCauses:
     """
     Find the causes that dwells support on top of a model, or of an ideal gyro.
 
@@ -156,71 +157,79 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
     ----------
     dwells : of a rate table
     model : that is put to the test, if one was given
-    rate : false-alarm rate of the diagnosis
-    without : the names of causes that are withdrawn
+    false_alarm_rate : false-alarm rate of the diagnosis
+    withdrawn : the names of causes that are withdrawn
 
     """
     tested = model or GyroModel()
-    change, _ = supported_effects(without_effects(dwells, tested), technology(tested),
-                                  rate=_CAUSES * rate)
-    change = _without(change, without)
-    change, needless = _counted_well(change, model, level_of(rate))
-    guilty = tuple(each for each in change.effects if each not in (*NUISANCES, *needless)
-                   and _chance(change, tested, each) < level_of(rate))
-    change = _without(change, frozenset(each.name for each in change.effects
-                                        if each not in (*NUISANCES, *needless, *guilty)))
+    change, _ = fit_supported_effects(subtract_effects(dwells, tested), stated_technology(tested),
+                                      false_alarm_rate=_CAUSE_ALARM_SHARE * false_alarm_rate)
+    change = _refit_without(change, withdrawn)
+    change, needless = _choose_temperature_origin(change, model, naming_level(false_alarm_rate))
+    guilty = tuple(each for each in change.effects if each not in (*NUISANCE_EFFECTS, *needless)
+                   and _effect_p_value(change, tested, each) < naming_level(false_alarm_rate))
+    change = _refit_without(
+        change,
+        frozenset(each.name for each in change.effects
+                  if each not in (*NUISANCE_EFFECTS, *needless, *guilty)))
     if model is None:
-        return Named(change, change, guilty, tested, rate)
-    fit = _refitted(dwells, model, change)
-    moved = [each for each in NUISANCES
-             if each in fit.effects and _chance_of_change(fit, model, each) < level_of(rate, True)]
-    return Named(fit, change, (*(_or_confounder(each, fit) for each in guilty), *moved), tested,
-                 rate)
+        return NamedCauses(change, change, guilty, tested, false_alarm_rate)
+    fit = _refit_changed_values(dwells, model, change)
+    changed_nuisances = [
+        each for each in NUISANCE_EFFECTS if each in fit.effects
+        and _change_p_value(fit, model, each) < naming_level(false_alarm_rate, True)
+    ]
+    return NamedCauses(
+        fit, change, (*(_effect_or_confounder(each, fit) for each in guilty), *changed_nuisances),
+        tested, false_alarm_rate)
 
 
-def level_of(rate: float, nuisance: bool = False) -> float:
+def naming_level(false_alarm_rate: float, is_nuisance: bool = False) -> float:
     """Return the level at which one cause is named."""
-    return (_OF_NUISANCES * rate / len(NUISANCES) if nuisance
-            else _CAUSES * rate / (len(STEADY) - len(NUISANCES)))
+    return (_NUISANCE_ALARM_SHARE * false_alarm_rate
+            / len(NUISANCE_EFFECTS) if is_nuisance else _CAUSE_ALARM_SHARE * false_alarm_rate /
+            (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS)))
 
 
-def _without(change: Calibration, names: frozenset[str]) -> Calibration:
+def _refit_without(change: Calibration, names: frozenset[str]) -> Calibration:
     """Refit without some causes."""
     kept = [each for each in change.effects if each.name not in names]
     return (change if len(kept) == len(change.effects)
             else fit_effects(change.dwells, kept, change.scatter))
 
 
-def _refitted(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibration:
+def _refit_changed_values(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibration:
     """Refit the changed effects as a whole, the values of the model and their changes."""
     own = {term.effect.name for term in model.terms}
     effects = tuple(
         other if (other := _confounder(each)) is not None and other.name in own - {each.name}
         else each for each in change.effects)
-    fit, _ = decided(fit_effects(without_effects(dwells, model, effects), effects, change.scatter),
-                     technology(model))
-    return counted_from(fit, model.reference_temperature)
+    fit, _ = resolve_confounders(
+        fit_effects(subtract_effects(dwells, model, effects), effects, change.scatter),
+        stated_technology(model))
+    return with_reference_temperature(fit, model.reference_temperature)
 
 
 def _confounder(effect: Effect) -> Effect | None:
     return {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}.get(effect)
 
 
-def change_of(fit: Calibration, model: GyroModel, effect: Effect) -> float:
+def value_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
     """Return the change of bias or scale factor error from the model, which may have none."""
     found, own = ([term.values[-1] for term in each.terms if term.effect is effect]
                   for each in (fit, model))
     return float(sum(found) - sum(own))
 
 
-def _chance_of_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
+def _change_p_value(fit: Calibration, model: GyroModel, effect: Effect) -> float:
     """Return the p-value of a change of bias or scale factor."""
-    column = columns_of(_used(fit), [term for term in fit.terms if term.effect is effect])[:, 0]
-    return _chance(fit, model, effect, column * change_of(fit, model, effect))
+    column = (sensitivity_columns(_used_dwells(fit),
+                                  [term for term in fit.terms if term.effect is effect])[:, 0])
+    return _effect_p_value(fit, model, effect, column * value_change(fit, model, effect))
 
 
-def _chance(fit: Calibration, model: GyroModel, effect: Effect,
-            added: Array | None = None) -> float:
+def _effect_p_value(fit: Calibration, model: GyroModel, effect: Effect,
+                    added: Array | None = None) -> float:
     """
     Return the p-value of an effect, by the errors of dwells and of the model's values.
 
@@ -231,140 +240,149 @@ def _chance(fit: Calibration, model: GyroModel, effect: Effect,
     added : the effect in each fitted dwell, rad/s; None for the whole effect
 
     """
-    if not fit.freedom:
+    if not fit.dof:
         return 1.0
-    used, others = _used(fit), [term for term in fit.terms if term.effect is not effect]
+    used, others = _used_dwells(fit), [term for term in fit.terms if term.effect is not effect]
     if added is None:
         added = (sum(term.error(channels_of(used)) for term in fit.terms if term.effect is effect)
                  + np.zeros(len(used)))
     if not np.any(added):
         return 1.0
-    columns = np.column_stack([*columns_of(used, others).T, added]) if others else added[:, None]
-    uncertain = Uncertainty.of(used, fit.scatter, columns, fit.residual[fit.scatter.kept])
+    columns = (np.column_stack([*sensitivity_columns(used, others).T, added])
+               if others else added[:, None])
+    uncertain = Uncertainty.from_fit(used, fit.scatter, columns, fit.residual[fit.scatter.inliers])
     # the deviation of the last value by dwells over that by dwells and model
     whitener = Whitener(used, fit.scatter)
     inverse = np.linalg.pinv(whitener.whiten(columns / np.linalg.norm(columns, axis=0)))[-1]
-    by_model = inverse @ whitener.whiten(uncertainty_of(fit, model))
+    by_model = inverse @ whitener.whiten(model_uncertainty(fit, model))
     by_dwells = float(inverse @ inverse)
     of_dwells = float(np.sqrt(by_dwells / (by_dwells + by_model @ by_model)))
-    below = float(uncertain.below(-of_dwells)[-1])
+    below = float(uncertain.probability_below(-of_dwells)[-1])
     return 2.0 * min(below, 1.0 - below)
 
 
-def _used(fit: Calibration) -> Dwells:
-    return take(fit.dwells, fit.scatter.kept)
+def _used_dwells(fit: Calibration) -> Dwells:
+    return select_dwells(fit.dwells, fit.scatter.inliers)
 
 
-def uncertainty_of(fit: Calibration, model: GyroModel) -> Array:
+def model_uncertainty(fit: Calibration, model: GyroModel) -> Array:
     """Return the errors of dwells by 1-sigma errors of model values, rad/s, shape (n, m)."""
-    known = [term for term in seen(model) if term.fitted]
+    known = [term for term in visible_terms(model) if term.fitted_indices]
     if model.covariance is None or not known:
-        return np.zeros((len(_used(fit)), 1))
-    places = _places(model.terms, 0)
+        return np.zeros((len(_used_dwells(fit)), 1))
+    places = _covariance_indices(model.terms, 0)
     chosen = [place for term in known for place in places[term.effect.name]]
     sizes, directions = np.linalg.eigh(model.covariance[np.ix_(chosen, chosen)])
-    channels = surroundings(model, _used(fit))
-    rows = [row + np.zeros(len(_used(fit)))
+    channels = model_channels(model, _used_dwells(fit))
+    rows = [row + np.zeros(len(_used_dwells(fit)))
             for term in known for row in term.sensitivity(channels)]
     return np.column_stack(rows) @ (directions * np.sqrt(np.maximum(sizes, 0.0)))
 
 
-def _or_confounder(effect: Effect, fit: Calibration) -> Effect:
+def _effect_or_confounder(effect: Effect, fit: Calibration) -> Effect:
     """Return the effect, or its confounder if that replaces it in a fit."""
     confounder = _confounder(effect)
     return effect if effect in fit.effects or confounder is None else confounder
 
 
-def _counted_well(fit: Calibration, model: GyroModel | None,
-                  level: float) -> tuple[Calibration, tuple[Effect, ...]]:
+def _choose_temperature_origin(fit: Calibration, model: GyroModel | None,
+                               level: float) -> tuple[Calibration, tuple[Effect, ...]]:
     """Return a fit with a reference temperature that needs no slope, and the unneeded effects."""
     if fit.dwells.temperature is None:
         return fit, ()
-    first = _USUAL if model is None else (model.reference_temperature, *_USUAL)
+    first = (_USUAL_TEMPERATURES if model is None else
+             (model.reference_temperature, *_USUAL_TEMPERATURES))
     if BIAS_TEMPERATURE_QUADRATIC in fit.effects:
         for place in (*first, float(fit.dwells.temperature.mean()),
                       float(fit.dwells.temperature[0])):
-            counted = counted_from(fit, place)
-            if counted.chance_of(BIAS_TEMPERATURE) > level:
-                return ((counted if model is None else counted_from(fit, first[0])),
+            counted = with_reference_temperature(fit, place)
+            if counted.p_value(BIAS_TEMPERATURE) > level:
+                return ((counted if model is None else with_reference_temperature(fit, first[0])),
                         (BIAS_TEMPERATURE,))
-    return (fit if model is None else counted_from(fit, first[0])), ()
+    return (fit if model is None else with_reference_temperature(fit, first[0])), ()
 
 
-def counted_from(fit: Calibration, temperature: float) -> Calibration:
+def with_reference_temperature(fit: Calibration, temperature: float) -> Calibration:
     """Return the same fit with another reference temperature of its effects."""
-    terms = [replace(term, values=(temperature, *term.values[1:])) if term.effect.shapes
-             and term.effect.shapes[0].name == 'reference_temperature' else term
-             for term in fit.terms]
+    terms = [
+        replace(term, values=(temperature, *term.values[1:])) if term.effect.nonlinear_parameters
+        and term.effect.nonlinear_parameters[0].name == 'reference_temperature' else term
+        for term in fit.terms
+    ]
     places = [place for place, term in enumerate(terms)
-              if not any(shape.default is None for shape in term.effect.shapes)]
+              if not any(shape.default is None for shape in term.effect.nonlinear_parameters)]
     channels = channels_of(fit.dwells)
     total = sum(fit.terms[place].error(channels) for place in places) + np.zeros(len(fit.dwells))
-    columns = columns_of(fit.dwells, [terms[place] for place in places])
+    columns = sensitivity_columns(fit.dwells, [terms[place] for place in places])
     lengths = np.linalg.norm(columns, axis=0)
     values = iter((np.linalg.lstsq(columns / lengths, total, rcond=None)[0] / lengths).tolist())
     for place in places:
-        shapes = terms[place].values[:len(terms[place].effect.shapes)]
-        terms[place] = replace(terms[place],
-                               values=(*shapes, *(next(values) for _ in terms[place].fitted)))
+        shapes = terms[place].values[:len(terms[place].effect.nonlinear_parameters)]
+        terms[place] = replace(
+            terms[place], values=(*shapes, *(next(values) for _ in terms[place].fitted_indices)))
     return replace(fit, terms=tuple(terms))
 
 
 # models
 
-def model_before(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroModel:
+
+def simulation_under_test(dwells: Dwells, model: GyroModel | None,
+                          named: NamedCauses) -> GyroModel:
     """Return the simulation under test: the given model, or the best bias and scale factor."""
-    effects = [each for each in NUISANCES if each in named.change.effects]
+    effects = [each for each in NUISANCE_EFFECTS if each in named.change_fit.effects]
     if model is not None or not effects:
         return model or GyroModel()
     scatter = named.fit.scatter
     # if it is that of these dwells
-    same = len(scatter.kept) == len(dwells)
+    same = len(scatter.inliers) == len(dwells)
     return fit_effects(dwells, effects, scatter if same else None).model
 
 
-def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> GyroModel:
+def assemble_model(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> GyroModel:
     """Return a model with the values of a fit in place of its own, or in addition to them."""
     if model is None:
         return fit.model
     new = {term.effect.name: term for term in fit.terms}
     # the confounder of an effect of the model may stand in its place
-    stays = [term for term in model.terms
-             if (other := _confounder(term.effect)) not in fit.effects
-             or term.effect in fit.effects or any(each.effect is other for each in model.terms)]
-    own = [term.effect.name for term in stays]
-    terms = (*(new.get(term.effect.name, term) for term in stays),
+    kept_terms = [
+        term for term in model.terms if (other := _confounder(term.effect)) not in fit.effects
+        or term.effect in fit.effects or any(each.effect is other for each in model.terms)
+    ]
+    own = [term.effect.name for term in kept_terms]
+    terms = (*(new.get(term.effect.name, term) for term in kept_terms),
              *(term for name, term in new.items() if name not in own))
     temperatures = [] if dwells.temperature is None else [dwells.temperature]
     # A self-calibration belongs to the old bias and scale factor of the model.
-    return replace(model, terms=terms, covariance=_covariance(model, fit, terms),
-                   rate_range=wider(model.rate_range, [dwells.output], True),
-                   temperature_range=wider(model.temperature_range, temperatures, True),
-                   origin=origins_before(model), self_calibration=None)
+    return replace(model, terms=terms, covariance=_combined_covariance(model, fit, terms),
+                   rate_range=widen_range(model.rate_range, [dwells.output], True),
+                   temperature_range=widen_range(model.temperature_range, temperatures, True),
+                   origin=previous_origins(model), self_calibration=None)
 
 
-def _covariance(model: GyroModel, fit: Calibration, terms: Sequence[Term]) -> Array | None:
+def _combined_covariance(model: GyroModel, fit: Calibration,
+                         terms: Sequence[Term]) -> Array | None:
     """Return the covariance of all fitted values: of model and of dwells, as if independent."""
     found = fit.model.covariance
-    stays = [term for term in terms if term.effect not in fit.effects and term.fitted]
-    if found is None or (stays and model.covariance is None):
+    kept_terms = [term for term in terms if term.effect not in fit.effects and term.fitted_indices]
+    if found is None or (kept_terms and model.covariance is None):
         return None
     known = np.zeros((0, 0)) if model.covariance is None else model.covariance
     both, places = block_diag(known, found), []
-    of_model, of_fit = _places(model.terms, 0), _places(fit.terms, len(known))
+    of_model, of_fit = (_covariance_indices(model.terms,
+                                            0), _covariance_indices(fit.terms, len(known)))
     for term in terms:
         places += of_fit.get(term.effect.name, []) or of_model[term.effect.name]
     return both[np.ix_(places, places)]
 
 
-def _places(terms: Sequence[Term], first: int) -> dict[str, list[int]]:
+def _covariance_indices(terms: Sequence[Term], first: int) -> dict[str, list[int]]:
     """Return the indices of the fitted values of each term in a covariance."""
-    ends = np.cumsum([first, *(len(term.fitted) for term in terms)]).tolist()
+    ends = np.cumsum([first, *(len(term.fitted_indices) for term in terms)]).tolist()
     return {term.effect.name: list(range(begin, end))
             for term, begin, end in zip(terms, ends, ends[1:])}
 
 
-def tried(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
+def try_fit(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
     """Fit other effects to the dwells of a fit; None if they cannot be separated."""
     try:
         return fit_effects(fit.dwells, effects, fit.scatter)
@@ -373,27 +391,27 @@ def tried(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
 
 
 #: Largest number of columns of a curve.
-_MOST_COLUMNS = 9
+_MAX_CURVE_COLUMNS = 9
 #: Least number of dwells for each column.
-_DWELLS_A_COLUMN = 4
+_MIN_DWELLS_PER_COLUMN = 4
 #: Least part of the columns of a curve that is independent of the model.
-_NEW = 1e-3
+_MIN_INDEPENDENT_SHARE = 1e-3
 RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = (
     'rate', 'temperature', 'rate_times_temperature', 'order_of_dwells', 'sweep')
 SINGLE_RATES = 'single_rates'
 #: Least number of sweeps that repeat a rate for a column of that rate.
-_REPEATED = 4
+_MIN_REPEATING_SWEEPS = 4
 
 
-def what_is_left(fit: Calibration, level: float,
-                 by_model: Array) -> tuple[tuple[Unexplained, ...], Mapping[str, float]]:
+def find_structure(fit: Calibration, false_alarm_rate: float,
+                   by_model: Array) -> tuple[tuple[Unexplained, ...], Mapping[str, float]]:
     """
     Search for structure in the residual of a fit.
 
     Parameters
     ----------
     fit : of dwells
-    level : false-alarm rate
+    false_alarm_rate : false-alarm rate
     by_model : errors of dwells by errors of the model's values, rad/s, shape (n, m), which are not
         structure
 
@@ -403,16 +421,18 @@ def what_is_left(fit: Calibration, level: float,
     whitened squared residuals by each
 
     """
-    used = take(fit.dwells, fit.scatter.kept)
-    probes = {name: columns for name, columns in _probes(used).items() if columns.shape[1]}
-    known, error = columns_of(used, fit.terms), fit.residual[fit.scatter.kept]
-    found, gains, tried = [], {}, len(probes)
+    used = select_dwells(fit.dwells, fit.scatter.inliers)
+    probes = ({
+        name: columns for name, columns in _structure_curves(used).items() if columns.shape[1]
+    })
+    known, error = sensitivity_columns(used, fit.terms), fit.residual[fit.scatter.inliers]
+    found, gains, curve_count = [], {}, len(probes)
     while probes:
-        tested = [_tested(name, fit, known, columns, error, by_model)
+        tested = [_test_curve(name, fit, known, columns, error, by_model)
                   for name, columns in probes.items()]
         best, gain = min(tested, key=lambda each: (each[0].p_value, -each[1]))
-        chance = min(1.0, tried * best.p_value)
-        if chance >= level:
+        chance = min(1.0, curve_count * best.p_value)
+        if chance >= false_alarm_rate:
             break
         found.append(replace(best, p_value=chance))
         gains[best.along] = gain
@@ -420,126 +440,136 @@ def what_is_left(fit: Calibration, level: float,
     return tuple(found), gains
 
 
-def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
-            by_model: Array) -> tuple[Unexplained, float]:
+def _test_curve(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
+                by_model: Array) -> tuple[Unexplained, float]:
     """Return share, p-value and reduction of the misfit of a curve given the known columns."""
-    used = take(fit.dwells, fit.scatter.kept)
+    used = select_dwells(fit.dwells, fit.scatter.inliers)
     whitener = Whitener(used, fit.scatter)
     white = whitener.whiten(known)
     left, sizes, _ = np.linalg.svd(white / np.linalg.norm(white, axis=0), full_matrices=False)
-    base = left[:, sizes > 1e-6 * sizes[0]]
+    known_basis = left[:, sizes > 1e-6 * sizes[0]]
     white = whitener.whiten(error)
-    white = white - base @ (base.T @ white)
+    white = white - known_basis @ (known_basis.T @ white)
     # orthonormal columns for what is new in the curve
     curve = whitener.whiten(columns)
     curve = curve / np.maximum(np.linalg.norm(curve, axis=0), 1e-300)
-    left, sizes, _ = np.linalg.svd(curve - base @ (base.T @ curve), full_matrices=False)
-    new = left[:, sizes > _NEW]
-    count, freedom = new.shape[1], len(used) - base.shape[1] - new.shape[1]
+    left, sizes, _ = np.linalg.svd(curve - known_basis @ (known_basis.T @ curve),
+                                   full_matrices=False)
+    new_basis = left[:, sizes > _MIN_INDEPENDENT_SHARE]
+    count, freedom = new_basis.shape[1], len(used) - known_basis.shape[1] - new_basis.shape[1]
     if not count or freedom < 3:
         return Unexplained(name, 0.0, 1.0), 0.0
-    gain, total = float(np.sum((new.T @ white) ** 2)), float(white @ white)
+    gain, total = float(np.sum((new_basis.T @ white) ** 2)), float(white @ white)
     share = 1.0 - (total - gain) / freedom / (total / (freedom + count))
     # Columns in their own unit, for the covariance of the dwells may be another one.
-    plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (base, new)]
+    plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (known_basis, new_basis)]
     # an F test over what the scatter may be, given the errors of the model
-    uncertain = Uncertainty.of(used, fit.scatter, np.column_stack(plain), error)
-    by_model = new.T @ whitener.whiten(by_model)
+    uncertain = Uncertainty.from_fit(used, fit.scatter, np.column_stack(plain), error)
+    by_model = new_basis.T @ whitener.whiten(by_model)
     values = uncertain.offsets[:, -count:]
     covariances = uncertain.covariances[:, -count:, -count:] + by_model @ by_model.T
     squares = np.einsum('ki,ki->k', values,
                         np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
-    chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.freedom))
+    chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.dof))
     return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
 
 
 # the curves
 
-def _probes(dwells: Dwells) -> Mapping[str, Array]:
+def _structure_curves(dwells: Dwells) -> Mapping[str, Array]:
     """Return the columns of each curve, shape (n, m)."""
-    sweeps = len(np.unique(parts_of(dwells)))
+    sweeps = len(np.unique(cross_validation_parts(dwells)))
     # A variable that differs between sweeps alone has as many independent values as sweeps.
-    slow = min(_MOST_COLUMNS, sweeps // 3)
-    probes = {RATE: _spline(dwells.rate, min(_MOST_COLUMNS, len(dwells) // _DWELLS_A_COLUMN)),
-              SINGLE_RATES: _by_rate(dwells),
-              ORDER: _spline(np.arange(len(dwells)).astype(float), slow),
-              SWEEP: _by_sweep(dwells)}
+    slow = min(_MAX_CURVE_COLUMNS, sweeps // 3)
+    probes = {
+        RATE: _spline_columns(dwells.rate,
+                              min(_MAX_CURVE_COLUMNS,
+                                  len(dwells) // _MIN_DWELLS_PER_COLUMN)),
+        SINGLE_RATES: _rate_columns(dwells),
+        ORDER: _spline_columns(np.arange(len(dwells)).astype(float), slow),
+        SWEEP: _sweep_columns(dwells)
+    }
     if (dwells.temperature is not None
-            and np.ptp(dwells.temperature) >= SMALLEST_TEMPERATURE_SPREAD):
-        probes[TEMPERATURE] = _spline(dwells.temperature, slow)
-        rate, temperature = _scaled(dwells.rate), _scaled(dwells.temperature)
+            and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD):
+        probes[TEMPERATURE] = _spline_columns(dwells.temperature, slow)
+        rate, temperature = (_scale_to_unit_range(dwells.rate),
+                             _scale_to_unit_range(dwells.temperature))
         probes[PRODUCT] = np.column_stack([rate ** i * temperature ** j
                                            for i in (1, 2, 3) for j in range(1, min(slow, 2) + 1)]
                                           or [np.zeros((len(dwells), 0))])
     return probes
 
 
-def _scaled(values: Array) -> Array:
+def _scale_to_unit_range(values: Array) -> Array:
     """Return values from -1 to 1."""
     low, high = float(values.min()), float(values.max())
     return (2.0 * values - low - high) / max(high - low, 1e-300)
 
 
-def _spline(values: Array, most: int) -> Array:
+def _spline_columns(values: Array, max_columns: int) -> Array:
     """Return a cubic spline over values, or fewer powers where they are few, shape (n, m)."""
-    count = min(most, len(np.unique(np.round(_scaled(values), 3))) - 1)
+    count = min(max_columns, len(np.unique(np.round(_scale_to_unit_range(values), 3))) - 1)
     if count < 4:
-        return _scaled(values)[:, None] ** np.arange(1, max(count, 0) + 1)
+        return _scale_to_unit_range(values)[:, None] ** np.arange(1, max(count, 0) + 1)
     inner = np.quantile(values, np.linspace(0.0, 1.0, count - 1))
     knots = np.concatenate([[inner[0]] * 3, np.unique(inner), [inner[-1]] * 3])
     return BSpline.design_matrix(values, knots, 3).toarray()
 
 
-def _by_rate(dwells: Dwells) -> Array:
+def _rate_columns(dwells: Dwells) -> Array:
     """Return a column for each rate that several sweeps repeat, shape (n, rates)."""
-    _, number = np.unique(np.round(_scaled(dwells.rate), 4), return_inverse=True)
+    _, number = np.unique(np.round(_scale_to_unit_range(dwells.rate), 4), return_inverse=True)
     columns = (number[:, None] == np.arange(number.max() + 1)).astype(float)
-    parts = parts_of(dwells)
-    repeated = np.array([len(np.unique(parts[column > 0.0])) >= _REPEATED for column in columns.T])
-    return (columns[:, repeated] if np.count_nonzero(repeated) * _DWELLS_A_COLUMN <= len(dwells)
-            else columns[:, :0])
+    parts = cross_validation_parts(dwells)
+    repeated = np.array(
+        [len(np.unique(parts[column > 0.0])) >= _MIN_REPEATING_SWEEPS for column in columns.T])
+    return (columns[:, repeated] if np.count_nonzero(repeated)
+            * _MIN_DWELLS_PER_COLUMN <= len(dwells) else columns[:, :0])
 
 
-def _by_sweep(dwells: Dwells) -> Array:
+def _sweep_columns(dwells: Dwells) -> Array:
     """Return a parabola over rate per sweep, which no bias or scale makes, shape (n, sweeps)."""
-    parts = parts_of(dwells)
+    parts = cross_validation_parts(dwells)
     if len(dwells) < 8 * (parts.max() + 1):
         return np.zeros((len(dwells), 0))
-    return (parts[:, None] == np.arange(parts.max() + 1)) * (_scaled(dwells.rate) ** 2)[:, None]
+    return ((parts[:, None] == np.arange(parts.max() + 1)) *
+            (_scale_to_unit_range(dwells.rate) ** 2)[:, None])
 
 
 #: Confounders of bias and scale factor that dwells in one pose on one table never rule out.
-_ALWAYS = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
+_ALWAYS_CONFOUNDED = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
 #: Sigmas by which proposed dwells are to separate two fits, one more than required.
-_AIM = DISTINGUISHED + 1.0
+_TARGET_SIGMAS = MIN_DISTINGUISHING_SIGMAS + 1.0
 
 
-def alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
+def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
     """Return the alternatives of an effect, and the experiment that would distinguish them."""
-    if effect in _ALWAYS:
-        return [_ALWAYS[effect]], CAUSES[effect.name].separate_by
-    steady = [(sigmas, other) for other in _others(fit, effect)
-              if (sigmas := math.sqrt(max(other.misfit - fit.misfit, 0.0))) < DISTINGUISHED]
+    if effect in _ALWAYS_CONFOUNDED:
+        return [_ALWAYS_CONFOUNDED[effect]], CAUSES[effect.name].separate_by
+    steady = [
+        (sigmas, other) for other in _swapped_fits(fit, effect)
+        if (sigmas := math.sqrt(max(other.misfit - fit.misfit, 0.0))) < MIN_DISTINGUISHING_SIGMAS
+    ]
     found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
-    found += [(sigmas, name) for name, columns in _beyond(fit, effect)
-              if (sigmas := _sigmas(fit, effect, columns)) < DISTINGUISHED]
-    experiments = [_experiment(fit, steady[0][1])] if steady else []
+    found += [(sigmas, name) for name, columns in _unsteady_causes(fit, effect)
+              if (sigmas := _advantage_sigmas(fit, effect, columns)) < MIN_DISTINGUISHING_SIGMAS]
+    experiments = [_distinguishing_sweep(fit, steady[0][1])] if steady else []
     experiments += [CAUSES[effect.name].separate_by] if len(found) > len(steady) else []
     return [name for _, name in sorted(found)], '; '.join(experiments)
 
 
-def _others(fit: Calibration, effect: Effect) -> Iterator[Calibration]:
+def _swapped_fits(fit: Calibration, effect: Effect) -> Iterator[Calibration]:
     """Give fits with another steady effect in place of one."""
     if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects:
         return  # the quadratic effect needs its slope
-    for other in STEADY.values():
+    for other in STATIC_EFFECTS.values():
         swapped = (None if other in fit.effects
-                   else tried(fit, swapped_effects(fit.effects, effect, other)))
+                   else try_fit(fit, replace_effect(fit.effects, effect, other)))
         if swapped is not None:
             yield swapped
 
 
-def _beyond(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]]]:
+def _unsteady_causes(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]]]:
     """Give causes other than effects of rate or temperature, with columns tried one by one."""
     rate, order = fit.dwells.rate, np.arange(len(fit.dwells)) / len(fit.dwells)
     if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
@@ -553,18 +583,19 @@ def _beyond(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]
                              for limit in limits.tolist()]
 
 
-def _sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
+def _advantage_sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
     """Return by how many sigma an effect is better than the best column with a free factor."""
-    used = take(fit.dwells, fit.scatter.kept)
+    used = select_dwells(fit.dwells, fit.scatter.inliers)
     term = next(each for each in fit.terms if each.effect is effect)
     whitener = Whitener(used, fit.scatter)
     # the residual with what the effect explains
     error = whitener.whiten((fit.residual
-                             + term.error(channels_of(fit.dwells)))[fit.scatter.kept])
-    known = whitener.whiten(columns_of(used, [each for each in fit.terms if each is not term]))
+                             + term.error(channels_of(fit.dwells)))[fit.scatter.inliers])
+    known = whitener.whiten(
+        sensitivity_columns(used, [each for each in fit.terms if each is not term]))
     misfits = []
     for column in columns:
-        both = np.column_stack([known, whitener.whiten(column[fit.scatter.kept])])
+        both = np.column_stack([known, whitener.whiten(column[fit.scatter.inliers])])
         lengths = np.linalg.norm(both, axis=0)
         both = both / np.where(lengths > 0.0, lengths, 1.0)
         left = error - both @ np.linalg.lstsq(both, error, rcond=None)[0]
@@ -574,7 +605,7 @@ def _sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
 
 # experiments
 
-def _sweeps(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
+def _proposed_sweeps(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
     """Give sweeps that may be added, the easiest first: in words, rates, and temperature."""
     fastest = float(np.abs(fit.dwells.rate).max())
     middle = fit.model.reference_temperature
@@ -592,13 +623,13 @@ def _sweeps(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
                 yield f'a sweep of 18 dwells at {temperature:.0f} degC', rates, temperature
 
 
-def _experiment(fit: Calibration, other: Calibration) -> str:
+def _distinguishing_sweep(fit: Calibration, other: Calibration) -> str:
     """Return the easiest sweep that would separate two fits, or the best one, in words."""
     tried_sweeps = []
-    for words, rates, temperature in _sweeps(fit):
-        tried_sweeps.append((separation(fit, other, rates, temperature), words))
-        if tried_sweeps[-1][0] >= _AIM:
+    for words, rates, temperature in _proposed_sweeps(fit):
+        tried_sweeps.append((separation_sigmas(fit, other, rates, temperature), words))
+        if tried_sweeps[-1][0] >= _TARGET_SIGMAS:
             break
     sigmas, words = max(tried_sweeps)
     return (f'add {words}: that separates them by {sigmas:.1f} sigma'
-            + ('' if sigmas >= _AIM else ', and repeat it'))
+            + ('' if sigmas >= _TARGET_SIGMAS else ', and repeat it'))

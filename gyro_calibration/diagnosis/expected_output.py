@@ -23,35 +23,35 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.logs.log import Array, Log
-from gyro_calibration.logs.quality import robust_deviation, white_noise
+from gyro_calibration.logs.quality import robust_deviation, white_noise_deviation
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
 from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
-_CONFUSED: Mapping[str, float] = {
+_COMMON_FACTORS: Mapping[str, float] = {
     'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi,
     '-pi/180': -math.pi / 180.0, '-180/pi': -180.0 / math.pi,
     '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
 #: Powers of two instead of powers of ten, and vice versa.
-_BINARY: Mapping[str, float] = {
+_BINARY_FACTORS: Mapping[str, float] = {
     **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)},
     '1000/1024': 1000.0 / 1024.0,
     '1048576/1000000': 1.048576, '1000000/1048576': 1.0 / 1.048576}
-FACTORS: Mapping[str, float] = {**_CONFUSED, **_BINARY}
+UNIT_FACTORS: Mapping[str, float] = {**_COMMON_FACTORS, **_BINARY_FACTORS}
 #: Largest ratio of the factor of a gyro to 1 in the right unit, or to the factor of another unit.
-_OF_A_GYRO = 1.1
+_MAX_GYRO_RATIO = 1.1
 #: Largest relative difference between a factor and that of a unit.
-_CLOSE = 0.005
+_MAX_FACTOR_ERROR = 0.005
 #: Largest standard deviation of a factor as a share of its distance to 1, and of a delay as a
 #: share of the sample interval.
-_KNOWN = 0.1
+_MAX_DEVIATION = 0.1
 #: The same for a factor near 1, where a coincidence is more frequent.
-_WELL_KNOWN = 0.02
+_MAX_DEVIATION_NEAR_ONE = 0.02
 
 
-def unit_of_scale(factor: float, deviation: float) -> str | None:
+def identify_unit_factor(factor: float, deviation: float) -> str | None:
     """
     Return the confusion of units, such as 'pi/180', that explains a factor, or None.
 
@@ -65,31 +65,36 @@ def unit_of_scale(factor: float, deviation: float) -> str | None:
     deviation : its standard deviation
 
     """
-    close = []
-    for name, value in FACTORS.items():
+    matches = []
+    for name, value in UNIT_FACTORS.items():
         # far from 1 a confusion is the only explanation
-        least, known = (_CLOSE, _KNOWN) if is_far(value) else (1e-4, _WELL_KNOWN)
+        least, known = ((_MAX_FACTOR_ERROR, _MAX_DEVIATION) if is_implausible_factor(value) else
+                        (1e-4, _MAX_DEVIATION_NEAR_ONE))
         if (abs(factor - value) < max(2.0 * deviation, least * abs(value))
-                and abs(factor / value - 1.0) < _CLOSE
+                and abs(factor / value - 1.0) < _MAX_FACTOR_ERROR
                 and deviation < known * min(abs(value - 1.0), abs(value))):
-            close.append(name)
-    if close:
-        return min(close, key=lambda name: abs(factor - FACTORS[name]))
-    far = [name for name, value in _CONFUSED.items() if _ratio(factor, value) < _OF_A_GYRO]
-    return far[0] if far and deviation < _KNOWN * abs(factor) else None
+            matches.append(name)
+    if matches:
+        return min(matches, key=lambda name: abs(factor - UNIT_FACTORS[name]))
+    distant_matches = [
+        name for name, value in _COMMON_FACTORS.items()
+        if _factor_ratio(factor, value) < _MAX_GYRO_RATIO
+    ]
+    return (distant_matches[0]
+            if distant_matches and deviation < _MAX_DEVIATION * abs(factor) else None)
 
 
-def is_far(factor: float) -> bool:
+def is_implausible_factor(factor: float) -> bool:
     """Tell whether a factor is not plausible for a gyro with the right unit."""
-    return _ratio(factor, 1.0) > 1.4
+    return _factor_ratio(factor, 1.0) > 1.4
 
 
-def _ratio(factor: float, value: float) -> float:
+def _factor_ratio(factor: float, value: float) -> float:
     """Return the ratio of two factors, above 1; infinite if their signs differ."""
     return math.inf if factor * value <= 0.0 else max(factor / value, value / factor)
 
 
-def unit_of_offset(estimate: float, deviation: float, interval: float) -> str | None:
+def identify_sample_offset(estimate: float, deviation: float, interval: float) -> str | None:
     """
     Return 'one sample' or 'half a sample' if a time offset is either within 2 sigma; or None.
 
@@ -99,7 +104,7 @@ def unit_of_offset(estimate: float, deviation: float, interval: float) -> str | 
     interval : of the samples, s
 
     """
-    if deviation > _KNOWN * interval:
+    if deviation > _MAX_DEVIATION * interval:
         return None
     for name, part in (('one sample', 1.0), ('half a sample', 0.5)):
         if abs(abs(estimate) - part * interval) < max(2.0 * deviation, 1e-3 * interval):
@@ -109,17 +114,17 @@ def unit_of_offset(estimate: float, deviation: float, interval: float) -> str | 
 
 #: Length of the parabolas by which a heading is differentiated, s; shorter ones would show its
 #: quantization.
-_SMOOTHING = 0.15
+_SMOOTHING_DURATION = 0.15
 #: Lengths of the blocks in which output and reference are compared, s; the shorter one is used if
 #: the motion averages out in the longer one.
-_BLOCKS = (0.5, 0.1)
+_BLOCK_DURATIONS = (0.5, 0.1)
 #: Share of the range of the output at each end that is left out of the first fit of a line, and
 #: number of robust fits.
-_ENDS, _FITS = 0.05, 4
+_END_SHARE, _FIT_ITERATIONS = 0.05, 4
 
 
 @dataclass(frozen=True)
-class Line:
+class LineFit:
     """Output = factor * rate + offset; standard deviation of the factor by scatter of parts."""
 
     factor: float
@@ -128,7 +133,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Compared:
+class OutputComparison:
     """
     Output and expectation, in rad/s, shape (n,).
 
@@ -136,7 +141,7 @@ class Compared:
     ----------
     output : without nan; gaps are interpolated
     expected : from the reference, nan in its gaps; None without a reference
-    white : standard deviation of the white noise of a sample
+    noise_deviation : standard deviation of the white noise of a sample
     scatter : robust standard deviation of output less expected output; infinite without a
         reference
 
@@ -144,22 +149,25 @@ class Compared:
 
     output: Array
     expected: Array | None
-    white: float
+    noise_deviation: float
     scatter: float = math.inf
 
 
-def compare(output: Array, rate: Array | None, line: Line | None) -> Compared:
+def compare_output(output: Array, rate: Array | None, line: LineFit | None) -> OutputComparison:
     """Compare an output with the line over the reference rate."""
-    whole = bridged(output)
+    whole = bridge_gaps(output)
     if rate is None or line is None:
-        return Compared(whole, None, white_noise(output))
+        return OutputComparison(whole, None, white_noise_deviation(output))
     expected = line.factor * rate + line.offset
-    off = output - expected
-    scatter = 1.4826 * float(np.nanmedian(np.abs(off))) if np.isfinite(off).any() else math.inf
-    return Compared(whole, expected, min(white_noise(output), white_noise(off)), scatter)
+    difference = output - expected
+    scatter = (1.4826 * float(np.nanmedian(np.abs(difference)))
+               if np.isfinite(difference).any() else math.inf)
+    return OutputComparison(whole, expected,
+                            min(white_noise_deviation(output), white_noise_deviation(difference)),
+                            scatter)
 
 
-def bridged(values: Array) -> Array:
+def bridge_gaps(values: Array) -> Array:
     """Return values with nan interpolated linearly."""
     known = np.isfinite(values)
     if known.all():
@@ -168,16 +176,16 @@ def bridged(values: Array) -> Array:
     return np.interp(places, places[known], values[known])
 
 
-def integral_of(time: Array, rate: Array) -> Array:
+def integrate_trapezoidal(time: Array, rate: Array) -> Array:
     """Return the integral of a rate, from 0 on, shape (n,)."""
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
 
 
-def angle_of(time: Array, rate: Array) -> Array:
+def integrate_with_curvature(time: Array, rate: Array) -> Array:
     """Return the integral of a rate, corrected for its curvature between samples, shape (n,)."""
     slope = np.gradient(rate, time)
     step = float(np.median(np.diff(time)))
-    return integral_of(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
+    return integrate_trapezoidal(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
 
 
 def reference_rate(log: Log) -> Array | None:
@@ -188,15 +196,16 @@ def reference_rate(log: Log) -> Array | None:
             or np.isfinite(log.reference_heading).sum() < 2):
         return None
     known = np.isfinite(log.reference_heading)
-    length = min(max(5, 2 * round(0.5 * _SMOOTHING / float(np.median(np.diff(log.time)))) + 1),
-                 (len(known) - 1) // 2 * 2 + 1)
+    length = min(
+        max(5, 2 * round(0.5 * _SMOOTHING_DURATION / float(np.median(np.diff(log.time)))) + 1),
+        (len(known) - 1) // 2 * 2 + 1)
     if length < 3:
         return None
-    smooth = savgol_filter(bridged(log.reference_heading), length, 2)
+    smooth = savgol_filter(bridge_gaps(log.reference_heading), length, 2)
     return np.where(known, np.gradient(smooth, log.time), np.nan)
 
 
-def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
+def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:
     """Return the line of the output over the rate by block means, or None without motion."""
     known = np.isfinite(rate) & np.isfinite(output)
     if np.count_nonzero(known) < 8 or not np.ptp(rate[known]) > 0.0:
@@ -204,16 +213,16 @@ def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
     rate, output = rate[known], output[known]
     if time is not None:
         whole, stamps = (rate, output), time[known]
-        for length in _BLOCKS:
+        for length in _BLOCK_DURATIONS:
             number = np.floor((stamps - stamps[0]) / length)
             block = np.cumsum(np.diff(number, prepend=number[0]) > 0.0)
             rate, output = (np.bincount(block, each) / np.bincount(block) for each in whole)
             if np.std(rate) > 0.8 * np.std(whole[0]):
                 break
-    return _line(rate, output) if len(rate) >= 8 else None
+    return _fit_robust_line(rate, output) if len(rate) >= 8 else None
 
 
-def scale_of(model: GyroModel, rate: Array) -> float:
+def model_scale_factor(model: GyroModel, rate: Array) -> float:
     """Return the slope of a model's output between the 90 % quantiles of the speed, both ways."""
     speeds = np.abs(rate[np.isfinite(rate)])
     speed = float(np.quantile(speeds, 0.9)) if speeds.size else 0.0
@@ -224,24 +233,27 @@ def scale_of(model: GyroModel, rate: Array) -> float:
     return (forth - back) / (2.0 * speed)
 
 
-def _line(rate: Array, output: Array) -> Line | None:
+def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
     low, high = output.min(), output.max()
     # without the ends, which may be clipped, unless most samples are there
-    good = (output > low + _ENDS * (high - low)) & (output < high - _ENDS * (high - low))
-    if np.count_nonzero(good) < 8 or not np.ptp(rate[good]) > 0.3 * np.ptp(rate):
-        good = np.ones(len(rate), dtype=bool)
-    for _ in range(_FITS):
-        if np.count_nonzero(good) < 8 or not np.ptp(rate[good]) > 0.0:
+    inliers = ((output > low + _END_SHARE * (high - low)) & (output < high - _END_SHARE *
+                                                             (high - low)))
+    if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.3 * np.ptp(rate):
+        inliers = np.ones(len(rate), dtype=bool)
+    for _ in range(_FIT_ITERATIONS):
+        if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.0:
             return None
         columns = np.column_stack([rate, np.ones(len(rate))])
-        solution = np.linalg.lstsq(columns[good], output[good], rcond=None)[0]
-        off = output - columns @ solution
-        good = np.abs(off) <= 5.0 * robust_deviation(off) + 1e-15
+        solution = np.linalg.lstsq(columns[inliers], output[inliers], rcond=None)[0]
+        residual = output - columns @ solution
+        inliers = np.abs(residual) <= 5.0 * robust_deviation(residual) + 1e-15
     # the standard deviation by the scatter of up to 20 parts, as the noise is coloured
-    columns, off = columns[good], off[good]
-    pieces = np.minimum(np.arange(len(off)) * min(20, len(off) // 2) // len(off), 19)
-    scores = np.array([np.bincount(pieces, column * off) for column in columns.T])
+    columns, residual = columns[inliers], residual[inliers]
+    pieces = np.minimum(
+        np.arange(len(residual)) * min(20,
+                                       len(residual) // 2) // len(residual), 19)
+    scores = np.array([np.bincount(pieces, column * residual) for column in columns.T])
     inverse = np.linalg.pinv(columns.T @ columns)
     student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)
     deviation = student * math.sqrt((inverse @ scores @ scores.T @ inverse)[0, 0])
-    return Line(float(solution[0]), float(solution[1]), float(deviation))
+    return LineFit(float(solution[0]), float(solution[1]), float(deviation))

@@ -15,11 +15,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from gyro_calibration.calibration.self_calibration import Limits
+from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.diagnosis.data_quality import DataQuality
 from gyro_calibration.diagnosis.findings import Finding
-from gyro_calibration.diagnosis.regression import FittedValues, happens_once, Named, seen
-from gyro_calibration.diagnosis.residuals import NAMES
+from gyro_calibration.diagnosis.regression import (
+    FittedValues,
+    is_single_event,
+    SelectedCause,
+    with_distorted_rate,
+)
+from gyro_calibration.diagnosis.residuals import NOISE_NAMES
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import (
     BIAS,
@@ -29,27 +34,27 @@ from gyro_calibration.model.effects import (
     Effect,
     SCALE_FACTOR_ERROR,
 )
-from gyro_calibration.model.gyro_model import GyroModel, same_effects, Term
+from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: Limits of a plausible scale factor error and its standard deviation.
-LIMITS = Limits()
+SCALE_FACTOR_LIMITS = RunLimits()
 #: Effects with a reference value -> the effect that compensates a change of that value.
-_MADE_UP_BY: Mapping[str, Effect] = {
+_COMPENSATING_EFFECTS: Mapping[str, Effect] = {
     'bias_temperature': BIAS, 'supply_sensitivity': BIAS,
     'scale_factor_temperature': SCALE_FACTOR_ERROR, 'bias_temperature_quadratic': BIAS_TEMPERATURE}
 
 
-def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequence[DataQuality],
-                  findings: Sequence[Finding], noise: Noise, bias_deviation: float) -> GyroModel:
+def extend_model(model: GyroModel | None, fit: FittedValues, quality: Sequence[DataQuality],
+                 findings: Sequence[Finding], noise: Noise, bias_deviation: float) -> GyroModel:
     """
     Return the extended model; the given one if no finding concerns the gyro.
 
     Parameters
     ----------
     model : of the simulation, `calibrated`; None for an ideal gyro
-    found : the causes and their values, none of them `left_out`
+    fit : the causes and their values, none of them `left_out`
     quality : of each log
     findings : all; of the noise of a given model, only the figures with a finding are replaced
     noise : of the residual
@@ -59,75 +64,83 @@ def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequenc
     given, names = (model or GyroModel(),
                     {name for each in findings for name in (each.effect, *each.ambiguous_with)})
     fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
-              or any(each.candidate.cause in CATALOGUE and found.explaining(place)
-                     for place, each in enumerate(found.named)))
-    new = extended(given, found, bias_deviation) if fitted else given
+              or any(each.candidate.cause in CATALOGUE and fit.is_included(place)
+                     for place, each in enumerate(fit.causes)))
+    new = add_causes(given, fit, bias_deviation) if fitted else given
     # limit and quantization of the output, if they are findings, from the first log; exact
-    exact: dict[str, Term] = {}
+    output_terms: dict[str, Term] = {}
     for clean in quality:
-        sizes = {'saturation': clean.limit, 'quantization': clean.step}
+        sizes = {'saturation': clean.limit, 'quantization': clean.output_step}
         for name in (each.effect for each in clean.findings if sizes.get(each.effect)):
-            exact.setdefault(name, Term(CATALOGUE[name], (float(sizes[name] or 0.0),)))
-    terms = [term for term in exact.values() if _is_within(term)]
+            output_terms.setdefault(name, Term(CATALOGUE[name], (float(sizes[name] or 0.0),)))
+    terms = [term for term in output_terms.values() if _is_within_bounds(term)]
     if terms:
-        spread = np.zeros((len(terms), len(terms)))
-        new = replace(new, terms=_all(new.terms, terms),
-                      covariance=_covariance(new, terms, spread))
+        term_covariance = np.zeros((len(terms), len(terms)))
+        new = replace(new, terms=_merge_terms(new.terms, terms),
+                      covariance=_extended_covariance(new, terms, term_covariance))
     figures = replace(given.noise, **{each.effect: getattr(noise, each.effect)
-                                      for each in findings if each.effect in NAMES})
-    if model is not None and same_effects(new, model) and figures == model.noise:
+                                      for each in findings if each.effect in NOISE_NAMES})
+    if model is not None and have_same_effects(new, model) and figures == model.noise:
         return model
     figures = figures if given.noise.angle_random_walk else noise
     bounds = {name: ends for name, ends in given.noise_bounds.items()
               if getattr(figures, name) == getattr(given.noise, name)}
-    return noted(replace(new, noise=figures, noise_bounds=bounds), given, quality, findings)
+    return add_origin_notes(replace(new, noise=figures, noise_bounds=bounds), given, quality,
+                            findings)
 
 
-def extended(model: GyroModel, found: FittedValues, bias_deviation: float) -> GyroModel:
+def add_causes(model: GyroModel, fit: FittedValues, bias_deviation: float) -> GyroModel:
     """Return a model with all named effects of the gyro, and with corrected bias and scale."""
-    new, spread = _values(found, bias_deviation)
-    moves = _moves(found) and not implausible_scale(found)
-    return with_terms(model, new, spread, [each.channels.output[each.kept] + each.added[each.kept]
-                                           for each in found.replays if moves],
-                      [each.channels.temperature[each.kept]
-                       for each in found.replays if 'temperature' in each.has])
+    new, term_covariance = _terms_with_covariance(fit, bias_deviation)
+    moves = _has_motion(fit) and not is_scale_implausible(fit)
+    return add_terms(model, new, term_covariance, [
+        each.channels.output[each.valid] + each.simulated_error[each.valid]
+        for each in fit.replays if moves
+    ], [
+        each.channels.temperature[each.valid]
+        for each in fit.replays if 'temperature' in each.available_channels
+    ])
 
 
-def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Sequence[Array],
-               temperatures: Sequence[Array]) -> GyroModel:
-    """Return a model with more terms of covariance `spread`, and ranges that include the logs."""
-    was = bool(model.terms)
-    return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
-                   rate_range=wider(model.rate_range, outputs, was),
-                   temperature_range=wider(model.temperature_range, temperatures, was))
+def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
+              outputs: Sequence[Array], temperatures: Sequence[Array]) -> GyroModel:
+    """Return a model with more terms and their covariance, and ranges that include the logs."""
+    has_ranges = bool(model.terms)
+    return replace(
+        model, terms=_merge_terms(model.terms, new), covariance=_extended_covariance(
+            model, new, term_covariance), rate_range=widen_range(model.rate_range, outputs,
+                                                                 has_ranges),
+        temperature_range=widen_range(model.temperature_range, temperatures, has_ranges))
 
 
-def noted(new: GyroModel, given: GyroModel, quality: Sequence[DataQuality],
-          findings: Sequence[Finding] = ()) -> GyroModel:
+def add_origin_notes(new: GyroModel, base_model: GyroModel, quality: Sequence[DataQuality],
+                     findings: Sequence[Finding] = ()) -> GyroModel:
     """Return a new model with its ambiguities, output factors and predecessor in its origin."""
-    used = {term.effect.name for term in new.terms if term not in given.terms}
-    notes = notes_of([each for each in findings if each.effect in used],
-                     [clean.factor for clean in quality])
-    return replace(new, origin={**notes, **origins_before(given)})
+    used = {term.effect.name for term in new.terms if term not in base_model.terms}
+    notes = origin_notes([each for each in findings if each.effect in used],
+                         [clean.unit_factor for clean in quality])
+    return replace(new, origin={**notes, **previous_origins(base_model)})
 
 
-def notes_of(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str, object]:
+def origin_notes(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str, object]:
     """Return the notes on ambiguous findings and on factors of the output for a model file."""
     sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
             for each in findings if each.ambiguous_with]
-    mended = list(factors) if any(factor != 1.0 for factor in factors) else []
-    return {name: note for name, note in (('ambiguous', sets), ('output_multiplied_by', mended))
-            if note}
+    output_factors = list(factors) if any(factor != 1.0 for factor in factors) else []
+    return {
+        name: note
+        for name, note in (('ambiguous', sets), ('output_multiplied_by', output_factors)) if note
+    }
 
 
-def origins_before(model: GyroModel) -> dict[str, object]:
+def previous_origins(model: GyroModel) -> dict[str, object]:
     """Return the origins of a model as a list, because its file has a limited nesting depth."""
     earlier = model.origin.get('before', [])
     own = {name: value for name, value in model.origin.items() if name != 'before'}
     return {'before': [own, *(earlier if isinstance(earlier, list) else [earlier])]} if own else {}
 
 
-def calibrated(model: GyroModel) -> GyroModel:
+def merge_self_calibration(model: GyroModel) -> GyroModel:
     """Return a model with its self-calibration merged into its terms, to first order."""
     known = model.self_calibration
     if known is None:
@@ -136,23 +149,23 @@ def calibrated(model: GyroModel) -> GyroModel:
     new = [Term(SCALE_FACTOR_ERROR, (slope * known.scale_factor_error,)),
            Term(BIAS, (slope * known.bias,))]
     covariance = (None if known.covariance is None
-                  else _covariance(model, new, slope ** 2 * np.array(known.covariance)))
-    return replace(model, terms=_all(model.terms, new), covariance=covariance,
+                  else _extended_covariance(model, new, slope ** 2 * np.array(known.covariance)))
+    return replace(model, terms=_merge_terms(model.terms, new), covariance=covariance,
                    self_calibration=None)
 
 
-def left_out(model: GyroModel, found: FittedValues) -> tuple[Named, ...]:
+def unmergeable_causes(model: GyroModel, fit: FittedValues) -> tuple[SelectedCause, ...]:
     """Return the lasting causes of the gyro that cannot be merged with terms of its model."""
-    terms, out = model.terms, []
-    for place, known in enumerate(found.named):
-        if known.candidate.cause in CATALOGUE and not happens_once(known):
-            more = _with(terms, _term(found, place))
-            out += [known] if more is None else []
+    terms, unmergeable = model.terms, []
+    for place, known in enumerate(fit.causes):
+        if known.candidate.cause in CATALOGUE and not is_single_event(known):
+            more = _merge_term(terms, _term_of_cause(fit, place))
+            unmergeable += [known] if more is None else []
             terms = more or terms
-    return tuple(out)
+    return tuple(unmergeable)
 
 
-def implausible_scale(found: FittedValues) -> bool:
+def is_scale_implausible(fit: FittedValues) -> bool:
     """
     Tell whether the fitted scale factor error is implausible.
 
@@ -160,97 +173,107 @@ def implausible_scale(found: FittedValues) -> bool:
     measure, which gives a scale factor error of up to -100 %.
 
     """
-    scale = found.scale_factor_error
-    return _moves(found) and (scale.value < -LIMITS.scale_factor_error
-                              or scale.deviation > LIMITS.scale_standard_deviation)
+    scale = fit.scale_factor_error
+    return _has_motion(fit) and (scale.value < -SCALE_FACTOR_LIMITS.max_scale_factor_error
+                                 or scale.deviation > SCALE_FACTOR_LIMITS.max_scale_deviation)
 
 
-def _moves(found: FittedValues) -> bool:
-    return found.place(-1, 0) is not None
+def _has_motion(fit: FittedValues) -> bool:
+    return fit.estimate_index(-1, 0) is not None
 
 
 # values
 
-def _values(found: FittedValues, bias_deviation: float) -> tuple[list[Term], Array]:
+def _terms_with_covariance(fit: FittedValues, bias_deviation: float) -> tuple[list[Term], Array]:
     """Return the fitted terms, and the covariance of all their values, 0 for exact ones."""
-    implausible = implausible_scale(found)
-    scale = 0.0 if implausible else found.scale_factor_error.value
+    implausible = is_scale_implausible(fit)
+    scale = 0.0 if implausible else fit.scale_factor_error.value
     # the mean bias of the logs given that scale factor error
-    rates = [seen(each, found.named).channels.rate[each.kept].mean() for each in found.replays]
-    bias = np.mean(found.biases) + (found.scale_factor_error.value - scale) * np.mean(rates)
+    rates = [
+        with_distorted_rate(each, fit.causes).channels.rate[each.valid].mean()
+        for each in fit.replays
+    ]
+    bias = np.mean(fit.biases) + (fit.scale_factor_error.value - scale) * np.mean(rates)
     terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
-    ranks: list[int | None] = [None, None if implausible else found.place(-1, 0)]
-    for place, known in enumerate(found.named):
-        if known.candidate.cause in CATALOGUE and found.explaining(place):
-            terms.append(_term(found, place))
+    ranks: list[int | None] = [None, None if implausible else fit.estimate_index(-1, 0)]
+    for place, known in enumerate(fit.causes):
+        if known.candidate.cause in CATALOGUE and fit.is_included(place):
+            terms.append(_term_of_cause(fit, place))
             shapes = len(known.candidate.shapes)
-            ranks += [found.place(place, -1 - number if number < shapes else number - shapes)
-                      for number in range(len(terms[-1].values))]
+            ranks += [
+                fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
+                for number in range(len(terms[-1].values))
+            ]
     fitted = {number: rank for number, rank in enumerate(ranks) if rank is not None}
-    spread = np.zeros((len(ranks), len(ranks)))
-    spread[np.ix_(list(fitted), list(fitted))] = found.covariance[
+    term_covariance = np.zeros((len(ranks), len(ranks)))
+    term_covariance[np.ix_(list(fitted), list(fitted))] = fit.covariance[
         np.ix_(list(fitted.values()), list(fitted.values()))]
-    spread[0, 0] = bias_deviation ** 2
-    return terms, spread
+    term_covariance[0, 0] = bias_deviation ** 2
+    return terms, term_covariance
 
 
-def _term(found: FittedValues, place: int) -> Term:
+def _term_of_cause(fit: FittedValues, cause_index: int) -> Term:
     """Return a cause of the gyro as a term."""
-    candidate = found.named[place].candidate
+    candidate = fit.causes[cause_index].candidate
     effect = CATALOGUE[candidate.cause]
-    coefficients = ([one.value for one in found.coefficients(place)]
+    coefficients = ([one.value for one in fit.coefficients(cause_index)]
                     or [candidate.amplitude or 0.0][:len(effect.coefficients)])
     return Term(effect, (*candidate.shapes, *coefficients))
 
 
 # terms among others
 
-def _all(terms: tuple[Term, ...], new: Sequence[Term]) -> tuple[Term, ...]:
+def _merge_terms(terms: tuple[Term, ...], new: Sequence[Term]) -> tuple[Term, ...]:
     for each in new:
-        terms = _with(terms, each) or terms
+        terms = _merge_term(terms, each) or terms
     return terms
 
 
-def _with(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
+def _merge_term(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
     """Return terms with one more, merged with that of its effect; None if not possible."""
     old = next((term for term in terms if term.effect.name == new.effect.name), None)
     if old is None:
         return (*terms, new)
-    alike, *others = _counted_like(old, new)
-    one = _one(old, alike)
-    return None if one is None else _all(
+    aligned, *others = _align_reference(old, new)
+    one = _combine_terms(old, aligned)
+    return None if one is None else _merge_terms(
         tuple(one if term is old else term for term in terms), others)
 
 
-def _counted_like(old: Term, new: Term) -> list[Term]:
+def _align_reference(old: Term, new: Term) -> list[Term]:
     """Return a term with the reference value of another, and the terms that compensate this."""
-    if new.effect.name not in _MADE_UP_BY or new.values[0] == old.values[0]:
+    if new.effect.name not in _COMPENSATING_EFFECTS or new.values[0] == old.values[0]:
         return [new]
     begin, value = old.values[0], new.values[1]
-    way, other, alike = (begin - new.values[0], _MADE_UP_BY[new.effect.name],
-                         Term(new.effect, (begin, value)))
+    offset, compensating_effect, aligned = (begin - new.values[0],
+                                            _COMPENSATING_EFFECTS[new.effect.name],
+                                            Term(new.effect, (begin, value)))
     if new.effect is BIAS_TEMPERATURE_QUADRATIC:
-        return [alike, Term(other, (begin, 2.0 * way * value)), Term(BIAS, (way ** 2 * value,))]
-    return [alike, Term(other, (way * value,))]
+        return [
+            aligned,
+            Term(compensating_effect, (begin, 2.0 * offset * value)),
+            Term(BIAS, (offset ** 2 * value, ))
+        ]
+    return [aligned, Term(compensating_effect, (offset * value,))]
 
 
-def _one(old: Term, new: Term) -> Term | None:
+def _combine_terms(old: Term, new: Term) -> Term | None:
     """Return the term that is equivalent to two terms of one effect; None without one."""
-    effect, shapes = new.effect, len(new.effect.shapes)
+    effect, shapes = new.effect, len(new.effect.nonlinear_parameters)
     if effect.stage == 'output':
         # Logs are compared without limits and quantization of the model.
         return new
     # Delays add up, and so do clock rate errors, to first order.
-    first = 0 if effect.moved is not None else shapes
+    first = 0 if effect.correct_stamps is not None else shapes
     if new.values[:first] != old.values[:first] or (first and not effect.coefficients) or any(
             each.default is not None for each in effect.coefficients):
         return None
-    one = Term(effect, (*new.values[:first],
-                        *(a + b for a, b in zip(old.values[first:], new.values[first:]))))
-    return one if _is_within(one) else None
+    combined = Term(effect, (*new.values[:first],
+                             *(a + b for a, b in zip(old.values[first:], new.values[first:]))))
+    return combined if _is_within_bounds(combined) else None
 
 
-def _is_within(term: Term) -> bool:
+def _is_within_bounds(term: Term) -> bool:
     """Tell whether the values of a term are within the bounds of its effect."""
     return all(parameter.bounds[0] <= value <= parameter.bounds[1]
                for parameter, value in zip(term.effect.parameters, term.values))
@@ -258,7 +281,9 @@ def _is_within(term: Term) -> bool:
 
 # covariance
 
-def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array | None:
+
+def _extended_covariance(model: GyroModel, new: Sequence[Term],
+                         term_covariance: Array) -> Array | None:
     """
     Return the covariance of all fitted values of a model with new terms; None if unknown before.
 
@@ -266,27 +291,29 @@ def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array |
     ----------
     model : whose values come first; new ones are independent of them
     new : the added terms
-    spread : covariance of all their values
+    term_covariance : covariance of all their values
 
     """
     if model.terms and model.covariance is None:
         return None
-    values, moved = _fitted(_all(model.terms, new)), np.sqrt(np.diag(spread))
-    changes = np.zeros((len(values), len(spread)))
-    for place in np.flatnonzero(moved).tolist():
-        changes[:, place] = (_fitted(_all(
-            model.terms, list(_moved(new, place, moved[place])))) - values) / moved[place]
-    whole = changes @ spread @ changes.T
+    values, deviations = (_fitted_values(_merge_terms(model.terms,
+                                                      new)), np.sqrt(np.diag(term_covariance)))
+    changes = np.zeros((len(values), len(term_covariance)))
+    for place in np.flatnonzero(deviations).tolist():
+        changes[:, place] = (_fitted_values(
+            _merge_terms(model.terms, list(_perturb_value(new, place, deviations[place]))))
+                             - values) / deviations[place]
+    covariance = changes @ term_covariance @ changes.T
     if model.covariance is not None:
-        whole[:len(model.covariance), :len(model.covariance)] += model.covariance
-    return whole
+        covariance[:len(model.covariance), :len(model.covariance)] += model.covariance
+    return covariance
 
 
-def _fitted(terms: Sequence[Term]) -> Array:
-    return np.array([term.values[place] for term in terms for place in term.fitted])
+def _fitted_values(terms: Sequence[Term]) -> Array:
+    return np.array([term.values[place] for term in terms for place in term.fitted_indices])
 
 
-def _moved(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
+def _perturb_value(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
     """Give terms of which one value, by its index among all values, is changed."""
     for term in terms:
         here = 0 <= place < len(term.values)
@@ -295,9 +322,10 @@ def _moved(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
         place -= len(term.values)
 
 
-def wider(known: tuple[float, float], parts: Sequence[Array], was: bool) -> tuple[float, float]:
+def widen_range(known: tuple[float, float], parts: Sequence[Array],
+                is_existing: bool) -> tuple[float, float]:
     """Return a range that includes the logs; only theirs if the model had none before."""
     if not parts:
         return known
     low, high = min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)
-    return (min(known[0], low), max(known[1], high)) if was else (low, high)
+    return (min(known[0], low), max(known[1], high)) if is_existing else (low, high)

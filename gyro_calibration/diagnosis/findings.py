@@ -17,18 +17,18 @@ from dataclasses import dataclass, field
 import math
 from typing import Any
 
-from gyro_calibration.logs.log import Array, NORMAL_95
+from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 
 SCHEMA = 'gyro_calibration/diagnosis/2'
 #: Least probability that is stated; the assumptions on the noise do not justify smaller ones.
-LEAST_PROBABILITY = 1e-4
+MIN_PROBABILITY = 1e-4
 #: Ratio of the level at which a lasting cause is suspected to that at which it is established.
-SUSPECTED = 5.0
+SUSPECTED_RATE_FACTOR = 5.0
 #: Least deficit in log-likelihood, relative to the best cause, of a cause that is ruled out (2.5
 #: sigma).
-RULED_OUT = 3.2
+RULED_OUT_DEFICIT = 3.2
 
 
 @dataclass(frozen=True)
@@ -40,29 +40,29 @@ class Estimate:
     unit: str
 
     @classmethod
-    def about(cls, value: float, half: float, unit: str) -> Estimate:
+    def from_half_width(cls, value: float, half_width: float, unit: str) -> Estimate:
         """Return a value with an interval of a half-width on each side."""
-        return cls(value, (value - half, value + half), unit)
+        return cls(value, (value - half_width, value + half_width), unit)
 
     @property
     def deviation(self) -> float:
-        """Return the standard deviation: the half-width of the interval over `NORMAL_95`."""
-        return (self.interval[1] - self.interval[0]) / (2.0 * NORMAL_95)
+        """Return the standard deviation, from the half-width of the interval."""
+        return (self.interval[1] - self.interval[0]) / (2.0 * NORMAL_QUANTILE_975)
 
     @property
-    def holds_zero(self) -> bool:
+    def contains_zero(self) -> bool:
         """Return whether the interval includes zero."""
         return self.interval[0] <= 0.0 <= self.interval[1]
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
         return {'estimate': self.estimate, 'ci95': list(self.interval), 'unit': self.unit}
 
 
-def probabilities(lacks: Mapping[str, float]) -> dict[str, float]:
+def probabilities(deficits: Mapping[str, float]) -> dict[str, float]:
     """Return the probabilities of causes by their deficits in log-likelihood, largest first."""
-    weights = {name: math.exp(-min(max(lack, 0.0), 700.0)) for name, lack in lacks.items()}
-    return {name: max(weight / sum(weights.values()), LEAST_PROBABILITY)
+    weights = {name: math.exp(-min(max(lack, 0.0), 700.0)) for name, lack in deficits.items()}
+    return {name: max(weight / sum(weights.values()), MIN_PROBABILITY)
             for name, weight in sorted(weights.items(), key=lambda each: -each[1])}
 
 
@@ -75,7 +75,7 @@ class Gate:
     ----------
     name : wrapped_heading, motion, tilt, sense, unit, time_unit or model
     passed : None if the log does not show it
-    said : the measured numbers, in words
+    evidence : the measured numbers, in words
     remedy : what to do if it failed
     factor : ratio of the output to the reference and its 95 % interval, if it failed by that
 
@@ -83,13 +83,18 @@ class Gate:
 
     name: str
     passed: bool | None
-    said: str
+    evidence: str
     remedy: str = ''
     factor: tuple[float, tuple[float, float]] | None = None
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
-        return {'name': self.name, 'passed': self.passed, 'said': self.said, 'remedy': self.remedy}
+        return {
+            'name': self.name,
+            'passed': self.passed,
+            'said': self.evidence,
+            'remedy': self.remedy
+        }
 
 
 @dataclass(frozen=True)
@@ -134,11 +139,11 @@ class Finding:
     where: tuple[float, float] | None = None
     remedy: str = ''
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
         return {'effect': self.effect, 'cause': self.cause,
-                'parameters': {name: value.figures() for name, value in self.parameters.items()},
-                'p_value': max(self.p_value, LEAST_PROBABILITY),
+                'parameters': {name: value.to_dict() for name, value in self.parameters.items()},
+                'p_value': max(self.p_value, MIN_PROBABILITY),
                 'minimum_detectable': self.minimum_detectable,
                 'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by,
                 'evidence': self.evidence, 'status': self.status,
@@ -155,10 +160,10 @@ class Unexplained:
     share_of_variance: float
     p_value: float
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
         return {'along': self.along, 'share_of_variance': self.share_of_variance,
-                'p_value': max(self.p_value, LEAST_PROBABILITY)}
+                'p_value': max(self.p_value, MIN_PROBABILITY)}
 
 
 @dataclass(frozen=True)
@@ -178,11 +183,11 @@ class Change:
     interval: tuple[float, float] | None
 
     @property
-    def worse(self) -> bool:
+    def is_worse(self) -> bool:
         """Tell whether the error increased significantly."""
         return self.interval is not None and self.interval[1] < 0.0
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
         return {'before': self.before, 'after': self.after,
                 'ci95': None if self.interval is None else list(self.interval)}
@@ -212,15 +217,15 @@ class Gain:
     models: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def worse(self) -> bool:
+    def is_worse(self) -> bool:
         """Tell whether the extended model has significantly larger errors."""
-        return any(change is not None and change.worse for change in (self.rate, self.heading))
+        return any(change is not None and change.is_worse for change in (self.rate, self.heading))
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
         heading = (None if self.heading is None
-                   else {'window_s': self.window, **self.heading.figures()})
-        return {'held_out': self.held_out, 'rate_rms': self.rate.figures(),
+                   else {'window_s': self.window, **self.heading.to_dict()})
+        return {'held_out': self.held_out, 'rate_rms': self.rate.to_dict(),
                 'heading_rms': heading, **self.models}
 
 
@@ -299,18 +304,18 @@ class Reference:
     Attributes
     ----------
     kind : rate_command, encoder, motion_capture, course, odometry, gyro or rest
-    known : how the kind was found, in words
+    evidence : how the kind was found, in words
     noise : name -> size of the errors of the reference, SI; empty if it is taken as exact
 
     """
 
     kind: str
-    known: str
+    evidence: str
     noise: Mapping[str, float] = field(default_factory=dict)
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
-        return {'kind': self.kind, 'known': self.known, 'noise': dict(self.noise)}
+        return {'kind': self.kind, 'known': self.evidence, 'noise': dict(self.noise)}
 
 
 @dataclass(frozen=True)
@@ -370,21 +375,27 @@ class Diagnosis:
         return ('extended' if any(each.status == 'established' for each in self.findings)
                 else 'adequate')
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
-        return {'schema': SCHEMA, 'verdict': self.verdict,
-                'false_alarm_rate': self.false_alarm_rate,
-                'findings': [finding.figures() for finding in self.findings],
-                'unexplained': [each.figures() for each in self.unexplained],
-                'noise': _noise(self.noise), 'simulated_noise': _noise(self.simulated),
-                'gain': None if self.gain is None else self.gain.figures(),
-                'cannot_show': dict(self.cannot_show), 'remarks': list(self.remarks),
-                'logs': list(self.logs), 'gates': [gate.figures() for gate in self.gates],
-                'heading_shares': dict(self.heading_shares),
-                'reference': None if self.reference is None else self.reference.figures()}
+        return {
+            'schema': SCHEMA,
+            'verdict': self.verdict,
+            'false_alarm_rate': self.false_alarm_rate,
+            'findings': [finding.to_dict() for finding in self.findings],
+            'unexplained': [each.to_dict() for each in self.unexplained],
+            'noise': _noise_to_dict(self.noise),
+            'simulated_noise': _noise_to_dict(self.simulated),
+            'gain': None if self.gain is None else self.gain.to_dict(),
+            'cannot_show': dict(self.cannot_show),
+            'remarks': list(self.remarks),
+            'logs': list(self.logs),
+            'gates': [gate.to_dict() for gate in self.gates],
+            'heading_shares': dict(self.heading_shares),
+            'reference': None if self.reference is None else self.reference.to_dict()
+        }
 
 
-def _noise(noise: Noise) -> dict[str, float]:
+def _noise_to_dict(noise: Noise) -> dict[str, float]:
     return {'angle_random_walk': noise.angle_random_walk,
             'bias_instability': noise.bias_instability,
             'rate_random_walk': noise.rate_random_walk}

@@ -30,18 +30,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 #: Indices of coefficients.
-Places = NDArray[np.intp]
+Indices = NDArray[np.intp]
 
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
-LEAST_LEFT = 1e-7
+MIN_INDEPENDENT_SHARE = 1e-7
 
 
 #: Indices of the columns of one candidate.
-Group = Sequence[int]
+ColumnGroup = Sequence[int]
 
 
 @dataclass(frozen=True)
-class Noises:
+class NoiseHypotheses:
     """
     The noises that are tried, relative to the first noise: g noises, b bands.
 
@@ -55,23 +55,24 @@ class Noises:
     weights: Array
     log_determinant: Array
 
-    def take(self, kept: Places) -> Noises:
+    def take(self, indices: Indices) -> NoiseHypotheses:
         """Return some of them."""
-        return Noises(self.weights[kept], self.log_determinant[kept])
+        return NoiseHypotheses(self.weights[indices], self.log_determinant[indices])
 
 
-def drawn(noises: Noises, count: Array, probability: Array, draws: int,
-          generator: np.random.Generator) -> Array:
+def draw_residuals(noises: NoiseHypotheses, count: Array, probability: Array, draws: int,
+                   generator: np.random.Generator) -> Array:
     """
     Draw residuals of noise alone, each by a noise chosen with its probability, shape (draws, m).
 
     In single precision, which is sufficient here and twice as fast.
 
     """
-    which = generator.choice(len(probability), draws, p=probability)
+    chosen_noises = generator.choice(len(probability), draws, p=probability)
     deviation = np.repeat((1.0 / np.sqrt(noises.weights)).astype(np.float32), count.astype(int),
                           axis=1)
-    return generator.standard_normal((draws, deviation.shape[1]), np.float32) * deviation[which]
+    return (generator.standard_normal(
+        (draws, deviation.shape[1]), np.float32) * deviation[chosen_noises])
 
 
 @dataclass(frozen=True)
@@ -81,29 +82,30 @@ class Marginalized:
 
     Attributes
     ----------
-    own : information of the nuisances, shape (g, q, q)
-    towards : coefficients of the projection of each column on the nuisances, shape (g, q, p)
-    left : for each candidate the information of its columns given the nuisances, shape (g, k, k)
-    log_determinant : of `own` and of the noise, shape (g,)
+    nuisance_information : information of the nuisances, shape (g, q, q)
+    projections : coefficients of the projection of each column on the nuisances, shape (g, q, p)
+    conditional_information : for each candidate the information of its columns given the
+        nuisances, shape (g, k, k)
+    log_determinant : of `nuisance_information` and of the noise, shape (g,)
     unidentifiable : whether a candidate is a combination of the nuisances
-    freedom : number of coefficients less nuisances
+    degrees_of_freedom : number of coefficients less nuisances
 
     """
 
-    own: Array
-    towards: Array
-    left: tuple[Array, ...]
+    nuisance_information: Array
+    projections: Array
+    conditional_information: tuple[Array, ...]
     log_determinant: Array
     unidentifiable: tuple[bool, ...]
-    freedom: float
+    degrees_of_freedom: float
 
 
-def _parts(starts: Places, size: int) -> list[slice]:
+def _band_slices(starts: Indices, size: int) -> list[slice]:
     return [slice(begin, end) for begin, end in zip(starts, [*starts[1:], size])]
 
 
-def marginalized(nuisances: Array, columns: Array, groups: Sequence[Group], starts: Places,
-                 noises: Noises) -> Marginalized:
+def marginalize_nuisances(nuisances: Array, columns: Array, groups: Sequence[ColumnGroup],
+                          starts: Indices, noises: NoiseHypotheses) -> Marginalized:
     """
     Marginalize all candidates over the nuisances.
 
@@ -116,7 +118,7 @@ def marginalized(nuisances: Array, columns: Array, groups: Sequence[Group], star
     noises : that are tried
 
     """
-    parts = _parts(starts, nuisances.shape[1])
+    parts = _band_slices(starts, nuisances.shape[1])
 
     def products(one: Array, other: Array) -> Array:
         """Return the products of rows under each noise, shape (g, rows, rows of the other)."""
@@ -133,7 +135,8 @@ def marginalized(nuisances: Array, columns: Array, groups: Sequence[Group], star
                  else products(columns[group], columns[group]))
         part = whole - np.swapaxes(crossing[:, :, group], 1, 2) @ towards[:, :, group]
         left.append(part)
-        unidentifiable.append(bool((_diagonal(part) <= LEAST_LEFT * _diagonal(whole)).any()))
+        unidentifiable.append(
+            bool((_diagonal(part) <= MIN_INDEPENDENT_SHARE * _diagonal(whole)).any()))
     return Marginalized(own, towards, tuple(left),
                         noises.log_determinant + np.linalg.slogdet(own)[1], tuple(unidentifiable),
                         float(nuisances.shape[1] - len(nuisances)))
@@ -150,71 +153,84 @@ class NoiseLikelihood:
 
     Attributes
     ----------
-    likelihood : restricted log likelihood without any candidate, shape (d, g)
-    squares : sum of whitened squares of the residual, shape (d, g)
-    towards : scores of the nuisances, N'z, shape (d, g, q)
-    pull : scores of the candidates, X'z given the nuisances, shape (d, g, p)
+    log_likelihood : restricted log likelihood without any candidate, shape (d, g)
+    residual_squares : sum of whitened squares of the residual, shape (d, g)
+    nuisance_scores : scores of the nuisances, N'z, shape (d, g, q)
+    candidate_scores : scores of the candidates, X'z given the nuisances, shape (d, g, p)
 
     """
 
-    likelihood: Array
-    squares: Array
-    towards: Array
-    pull: Array
+    log_likelihood: Array
+    residual_squares: Array
+    nuisance_scores: Array
+    candidate_scores: Array
 
     @property
     def probability(self) -> Array:
         """Return the probability of each noise, shape (d, g)."""
-        top = np.exp(self.likelihood - self.likelihood.max(axis=1, keepdims=True))
+        top = np.exp(self.log_likelihood - self.log_likelihood.max(axis=1, keepdims=True))
         return top / top.sum(axis=1, keepdims=True)
 
 
-def noise_likelihood(residuals: Array, nuisances: Array, columns: Array, starts: Places,
-                     noises: Noises, by: Marginalized) -> NoiseLikelihood:
+def noise_likelihood(residuals: Array, nuisances: Array, columns: Array, starts: Indices,
+                     noises: NoiseHypotheses, marginalization: Marginalized) -> NoiseLikelihood:
     """Return the likelihood of residuals, (d, m), whitened by the first noise."""
-    parts = _parts(starts, nuisances.shape[1])
+    parts = _band_slices(starts, nuisances.shape[1])
     towards, crossed = (noises.weights @ np.stack(
         [residuals[:, part] @ each[:, part].T for part in parts], axis=1)
         for each in (nuisances, columns))
-    value = np.linalg.solve(by.own, towards[..., None])[..., 0]
+    value = np.linalg.solve(marginalization.nuisance_information, towards[..., None])[..., 0]
     squares = (np.add.reduceat(residuals ** 2, starts, axis=1) @ noises.weights.T
                - (value * towards).sum(axis=-1))
-    likelihood = -0.5 * (by.freedom * np.log(squares) + by.log_determinant)
-    pull = crossed - (towards[:, :, None, :] @ by.towards)[:, :, 0]
+    likelihood = (
+        -0.5 *
+        (marginalization.degrees_of_freedom * np.log(squares) + marginalization.log_determinant))
+    pull = crossed - (towards[:, :, None, :] @ marginalization.projections)[:, :, 0]
     return NoiseLikelihood(likelihood, squares, towards, pull)
 
 
-def evidence(by_noise: NoiseLikelihood, by: Marginalized, groups: Sequence[Group]) -> Array:
+def column_evidence(by_noise: NoiseLikelihood, marginalization: Marginalized,
+                    groups: Sequence[ColumnGroup]) -> Array:
     """Return the evidence of candidates, shape (d, groups), -inf if unidentifiable."""
     if not groups:
-        return np.empty((len(by_noise.squares), 0))
-    return np.column_stack([_evidence(by_noise, by, place, list(group))
+        return np.empty((len(by_noise.residual_squares), 0))
+    return np.column_stack([_candidate_evidence(by_noise, marginalization, place, list(group))
                             for place, group in enumerate(groups)])
 
 
-def _evidence(by_noise: NoiseLikelihood, by: Marginalized, place: int, group: list[int]) -> Array:
-    if by.unidentifiable[place]:
-        return np.full(len(by_noise.squares), -np.inf)
-    own, pull = by.left[place], by_noise.pull[:, :, group]
-    own = own + 1e-10 * np.eye(len(group)) * _diagonal(own)[:, None]
+def _candidate_evidence(by_noise: NoiseLikelihood, marginalization: Marginalized,
+                        candidate_index: int, group: list[int]) -> Array:
+    if marginalization.unidentifiable[candidate_index]:
+        return np.full(len(by_noise.residual_squares), -np.inf)
+    information, scores = (marginalization.conditional_information[candidate_index],
+                           by_noise.candidate_scores[:, :, group])
+    information = information + 1e-10 * np.eye(len(group)) * _diagonal(information)[:, None]
     if len(group) == 1:
-        return _summary(by_noise, pull[..., 0] ** 2 / own[:, 0, 0], np.log(own[:, 0, 0]),
-                        by.freedom, 1)
-    gained = ((pull[:, :, None, :] @ np.linalg.inv(own))[:, :, 0] * pull).sum(axis=-1)
-    return _summary(by_noise, gained, np.linalg.slogdet(own)[1], by.freedom, len(group))
+        return _average_over_noises(by_noise, scores[..., 0] ** 2 / information[:, 0, 0],
+                                    np.log(information[:, 0, 0]),
+                                    marginalization.degrees_of_freedom, 1)
+    gained = ((scores[:, :, None, :] @ np.linalg.inv(information))[:, :, 0] * scores).sum(axis=-1)
+    return _average_over_noises(by_noise, gained,
+                                np.linalg.slogdet(information)[1],
+                                marginalization.degrees_of_freedom, len(group))
 
 
-def _summary(by_noise: NoiseLikelihood, gained: Array, logarithm: Array, freedom: float,
-             size: int) -> Array:
+def _average_over_noises(by_noise: NoiseLikelihood, explained_squares: Array,
+                         log_determinant: Array, degrees_of_freedom: float,
+                         column_count: int) -> Array:
     """Return the evidence averaged over the noises (see the module)."""
-    ratio = np.log1p(-np.minimum(gained / by_noise.squares, 1.0 - 1e-9))
-    change = 0.5 * (size * np.log(by_noise.squares) - (freedom - size) * ratio - logarithm)
-    best = by_noise.likelihood.argmax(axis=1)
-    scale = 0.5 * (logarithm[best] - size * np.log(by_noise.squares[np.arange(len(best)), best]))
-    return log_sum(by_noise.likelihood + change) + scale - log_sum(by_noise.likelihood)
+    ratio = np.log1p(-np.minimum(explained_squares / by_noise.residual_squares, 1.0 - 1e-9))
+    change = (0.5 * (column_count * np.log(by_noise.residual_squares) -
+                     (degrees_of_freedom - column_count) * ratio - log_determinant))
+    best = by_noise.log_likelihood.argmax(axis=1)
+    scale = (0.5 *
+             (log_determinant[best]
+              - column_count * np.log(by_noise.residual_squares[np.arange(len(best)), best])))
+    return (log_sum_exp(by_noise.log_likelihood + change) + scale
+            - log_sum_exp(by_noise.log_likelihood))
 
 
-def log_sum(logarithms: Array) -> Array:
+def log_sum_exp(logarithms: Array) -> Array:
     """Return the logarithm of the sum of exponentials along the last axis."""
     top = logarithms.max(axis=-1)
     with np.errstate(invalid='ignore'):

@@ -26,47 +26,47 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.diagnosis.candidates import added_effects, LEAST_CHANGE
-from gyro_calibration.diagnosis.causes import as_suspected, CAUSES, finding, with_remedies
+from gyro_calibration.diagnosis.candidates import MIN_CHANNEL_RANGE, user_effects
+from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, mark_suspected
 from gyro_calibration.diagnosis.cross_validation import (
-    gain_of,
+    gain_from_squares,
     heading_curve,
-    over_windows,
-    shares,
-    WINDOW,
-    WITHIN,
+    heading_error_shares,
+    HEADING_WINDOW,
+    MAX_WINDOW_SHARE,
+    window_changes,
 )
-from gyro_calibration.diagnosis.data_quality import inspect
-from gyro_calibration.diagnosis.extended_model import origins_before, with_terms
+from gyro_calibration.diagnosis.data_quality import inspect_record
+from gyro_calibration.diagnosis.extended_model import add_terms, previous_origins
 from gyro_calibration.diagnosis.findings import (
     Curve,
     Diagnosis,
     Estimate,
     Finding,
     Gain,
-    LEAST_PROBABILITY,
+    MIN_PROBABILITY,
     probabilities,
     Reference,
-    SUSPECTED,
+    SUSPECTED_RATE_FACTOR,
     Trace,
 )
-from gyro_calibration.diagnosis.search import SURELY, sureness
+from gyro_calibration.diagnosis.search import MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.diagnosis.spans import (
-    all_columns,
-    Column,
-    FEWEST_STRETCHES,
+    BASE_VALUES,
+    CauseTerm,
+    design_matrix,
     fit_spans,
-    HEADING,
-    PLAIN,
-    shared_noise,
+    HEADING_TREATMENT,
+    lay_out_spans,
+    MIN_STRETCHES,
     SpanFit,
-    spans_of,
-    Whitened,
-    whitened,
+    wander_noise,
+    whiten_regression,
+    WhitenedRegression,
 )
-from gyro_calibration.diagnosis.steps import CHECKS, OnPart, OnProgress, Steps
+from gyro_calibration.diagnosis.steps import CHECKS_STEP, OnPart, OnProgress, ProgressSteps
 from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_95
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
@@ -76,46 +76,59 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 #: Least and largest number of parts of a log that are held out in turn, and least length, s.
-_FEWEST_PARTS, _MOST_PARTS, _PART = 2, 6, 80.0
+_MIN_PARTS, _MAX_PARTS, _MIN_PART_DURATION = 2, 6, 80.0
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
 #: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
-_SHARES = {CHECKS: 4, 'data quality': 3, 'bias and scale factor error': 26,
-           'search for causes': 45, 'cross-validation': 4, 'findings': 18}
+_STEP_SHARES = {CHECKS_STEP: 4, 'data quality': 3, 'bias and scale factor error': 26,
+                'search for causes': 45, 'cross-validation': 4, 'findings': 18}
 #: Standard deviations of a value that is found in 95 % of logs, and of a lag that is ruled out.
-SEEN, _RULED_OUT = 4.8, 3.0
+DETECTION_SIGMAS, _LAG_EXCLUSION_SIGMAS = 4.8, 3.0
 #: Longest lag of a gyro, s.
-_OF_A_LAG = 0.1
+_MAX_GYRO_LAG = 0.1
 #: Bins of a curve.
-_BINS = 20
+_CURVE_BINS = 20
 #: Shares of the false-alarm rate: for the search for causes, for a delay, and, with a model, for
 #: bias and scale factor error. A delay between two clocks is usual and has a separate level.
-_OF_SEARCH, _OF_VALUE = 0.6, {'bias': 0.05, 'scale_factor_error': 0.05, 'time_offset': 0.1}
-_SPOKEN = {'rate_command': 'a reference rate with noise', 'course': 'a course over ground',
-           'encoder': 'an encoder', 'odometry': 'odometry', 'motion_capture': 'motion capture',
-           'gyro': 'another gyro'}
-_METHOD = ('The heading by {} was compared with the integral of the output over spans of a second '
-           'or more, under noise of gyro and reference that was found together with the causes. A '
-           'cause is established if its evidence holds beyond the scatter between stretches, and '
-           'if choice and fit on some stretches predict the others; else it is suspected. Only '
-           'established causes are in the model. Intervals are of 95 %.')
+_SEARCH_ALARM_SHARE, _VALUE_ALARM_SHARES = (0.6, {
+    'bias': 0.05,
+    'scale_factor_error': 0.05,
+    'time_offset': 0.1
+})
+_REFERENCE_PHRASES = {
+    'rate_command': 'a reference rate with noise',
+    'course': 'a course over ground',
+    'encoder': 'an encoder',
+    'odometry': 'odometry',
+    'motion_capture': 'motion capture',
+    'gyro': 'another gyro'
+}
+_METHOD_TEXT = ('The heading by {} was compared with the integral of the output over spans of a '
+                'second '
+                'or more, under noise of gyro and reference that was found together with the '
+                'causes. A '
+                'cause is established if its evidence holds beyond the scatter between stretches, '
+                'and '
+                'if choice and fit on some stretches predict the others; else it is suspected. '
+                'Only '
+                'established causes are in the model. Intervals are of 95 %.')
 #: Causes that are not candidates, because they are tested in each log.
-_ALWAYS_SEEN = {*PLAIN, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_error',
-                'quantization', 'saturation'}
+_ALWAYS_TESTED = {*BASE_VALUES, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_error',
+                  'quantization', 'saturation'}
 #: Largest number of causes that are added, and of parts of a log for cross-fitting.
-MOST, FOLDS = 4, 5
+MAX_CAUSES, FOLD_COUNT = 4, 5
 #: Largest effect along the rate that is established, as a share of the rate: two standard
 #: deviations of the prior of a scale factor error. Larger ones result from several similar columns
 #: that nearly cancel each other.
-_LARGEST = 2.0 * HEADING.prior[0]
+_MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
 #: Variables whose causes are similar to errors of an encoder that repeat with its position.
-_OF_MOTION = frozenset({'rate', 'rate_change', 'heading'})
+_MOTION_VARIABLES = frozenset({'rate', 'rate_change', 'heading'})
 #: Largest likelihood ratio between the best cause and an equivalent one.
-_LIKELY = 25.0
+_MAX_LIKELIHOOD_RATIO = 25.0
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
-                                rate: float, on_progress: OnProgress) -> Diagnosis:
+                                false_alarm_rate: float, on_progress: OnProgress) -> Diagnosis:
     """
     Diagnose a log with a reference whose errors are larger than those of the gyro.
 
@@ -124,184 +137,193 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     log : with output, time and a reference
     reference : its kind
     model : of the simulation; None is an ideal gyro
-    rate : of false alarms
+    false_alarm_rate : of false alarms
     on_progress : is called with the share of the work done and the name of the step that begins
 
     """
-    steps = Steps(on_progress, _SHARES)
+    steps = ProgressSteps(on_progress, _STEP_SHARES)
     steps.begin('data quality')
     if reference.kind != 'rate_command' and log.reference_heading is not None:
         log = replace(log, reference_rate=None)
     else:
         log = replace(log, reference_heading=None)
-    record = inspect(replace(log, reference_heading=None, reference_rate=None))
+    record = inspect_record(replace(log, reference_heading=None, reference_rate=None))
     assert log.output is not None
-    mended = replace(log, output=np.where(record.trusted, log.output, np.nan))
-    prior = None if model is None else model.prior
+    cleaned_log = replace(log, output=np.where(record.usable, log.output, np.nan))
+    prior = None if model is None else model.prior_deviations
     steps.begin('bias and scale factor error')
-    plain = fit_spans(spans_of(mended if model is None else replace(
-        mended, output=compensate_log(model, mended)), reference.kind, prior))
+    plain = fit_spans(lay_out_spans(cleaned_log if model is None else replace(
+        cleaned_log, output=compensate_log(model, cleaned_log)), reference.kind, prior))
     steps.begin('search for causes')
-    extended, found = search(plain, _OF_SEARCH * rate, steps.within)
+    extended, found = search_causes(plain, _SEARCH_ALARM_SHARE * false_alarm_rate,
+                                    steps.begin_part)
     steps.begin('cross-validation')
-    gain = _gain(plain, extended)
-    inside = extended
+    gain = _cross_validated_gain(plain, extended)
+    model_fit = extended
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
         # causes that do not improve the prediction are not added to the model
-        inside = plain
-        if not plain.spans.fine:
-            found = [replace(each, established=False) for each in found]
+        model_fit = plain
+        if not plain.spans.is_fine:
+            found = [replace(each, is_established=False) for each in found]
             extended = plain
-        gain = _gain(plain, plain)
+        gain = _cross_validated_gain(plain, plain)
     steps.begin('findings')
-    parts, time = _contributions(extended), extended.spans.time
-    noise = {name: extended.size(name) for name in ('reference', 'motion')}
-    rates = extended.spans.rates()
-    of_heading = shares([(parts, time)], 2.0 * (
+    parts, time = _heading_contributions(extended), extended.spans.time
+    noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
+    rates = extended.spans.point_rates()
+    of_heading = heading_error_shares([(parts, time)], 2.0 * (
         noise['reference'] ** 2 + noise['motion'] ** 2 * float(np.mean(rates ** 2))))
-    findings = [*_of_values(extended, model, rate, reference), *record.findings,
-                *(each for cause in found for each in [_finding(cause, extended)]
-                  if not each.parameters[each.effect].holds_zero)]
+    findings = [*_value_findings(extended, model, false_alarm_rate, reference), *record.findings,
+                *(each for cause in found for each in [_cause_finding(cause, extended)]
+                  if not each.parameters[each.effect].contains_zero)]
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     of_record = {each.effect for each in record.findings}
-    changed = any(each.status == 'established' and CAUSES[each.effect].of == 'gyro'
+    changed = any(each.status == 'established' and CAUSES[each.effect].origin == 'gyro'
                   and each.effect not in {'time_offset', *of_record} for each in findings)
     # between two clocks a delay is no property of the gyro
-    late = next((each for each in findings if each.effect == 'time_offset'
-                 and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
-    base = _model(GyroModel(), plain, log) if model is None else model
-    after = (_extended(model, inside, log, late)
-             if changed or late or model is None or prior is not None else model)
-    curve, trace = _pictures(extended, parts)
-    return Diagnosis(
-        tuple(with_remedies(findings, of_heading, after)), (), _noise(extended),
-        Noise() if model is None else model.noise,
-        None if not changed and model is not None else gain, base, after, _cannot_show(plain),
-        [curve], heading_curve(parts, time), None,
-        (*record.remarks, *_remarks(reference, extended, prior is not None)), rate, trace=trace,
-        method=_METHOD.format(_SPOKEN[reference.kind]), reference=replace(reference, noise=noise),
-        heading_shares=of_heading)
+    clock_delay = next((each for each in findings if each.effect == 'time_offset'
+                        and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
+    before = _model_with_fit(GyroModel(), plain, log) if model is None else model
+    after = (_extend_model(model, model_fit, log, clock_delay)
+             if changed or clock_delay or model is None or prior is not None else model)
+    curve, trace = _rate_curve_and_trace(extended, parts)
+    return Diagnosis(tuple(add_remedies(findings, of_heading, after)), (), _gyro_noise(extended),
+                     Noise() if model is None else model.noise,
+                     None if not changed and model is not None else gain, before, after,
+                     _untestable_causes(plain), [curve], heading_curve(parts, time), None,
+                     (*record.remarks, *_remarks(reference, extended, prior is not None)),
+                     false_alarm_rate, trace=trace, method=_METHOD_TEXT.format(
+                         _REFERENCE_PHRASES[reference.kind]), reference=replace(
+                             reference, noise=noise), heading_shares=of_heading)
 
 
 # values
 
-def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
-               reference: Reference) -> Iterator[Finding]:
+def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: float,
+                    reference: Reference) -> Iterator[Finding]:
     """Give delay, and with a model bias and scale factor error, if they are established."""
-    lag = next((each for each in done.causes if each.cause == 'bandwidth'), None)
+    lag = next((each for each in fit.causes if each.cause == 'bandwidth'), None)
     own_clock = reference.kind not in _SAME_CLOCK
-    for place, name in enumerate(PLAIN):
+    for place, name in enumerate(BASE_VALUES):
         if name != 'time_offset' and model is None:
             continue
-        value, deviation = float(done.values[place]), math.sqrt(done.covariance[place, place])
+        value, deviation = float(fit.values[place]), math.sqrt(fit.covariance[place, place])
         if name == 'bias' and model is not None:
             # the mean bias of a log differs from that of the model by bias wander
-            duration = float(done.spans.time[-1] - done.spans.time[0])
+            duration = float(fit.spans.time[-1] - fit.spans.time[0])
             deviation = math.sqrt(deviation ** 2 + max(
                 2.0 / math.pi * each.bias_instability ** 2
                 + each.rate_random_walk ** 2 * duration / 3.0
-                for each in (_noise(done), model.noise)))
+                for each in (_gyro_noise(fit), model.noise)))
         if name == 'time_offset' and lag is not None:
             # to first order a lag is a delay
-            place_of_lag = done.places(lag).start
-            constant = _lag(float(done.values[place_of_lag]), done.half(place_of_lag))
+            place_of_lag = fit.value_slice(lag).start
+            constant = _lag_estimate(float(fit.values[place_of_lag]), fit.half_width(place_of_lag))
             value -= constant.estimate
             deviation = math.hypot(deviation, constant.deviation)
-        effective = float(done.stretches_of[place])
-        freedom = float(done.freedom[place])
+        effective = float(fit.effective_stretches[place])
+        freedom = float(fit.freedom[place])
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
-        share = 1.0 if name == 'time_offset' and own_clock else _OF_VALUE[name]
-        if chance >= share * rate or effective < FEWEST_STRETCHES:
+        share = 1.0 if name == 'time_offset' and own_clock else _VALUE_ALARM_SHARES[name]
+        if chance >= share * false_alarm_rate or effective < MIN_STRETCHES:
             continue
         half = min(float(student.ppf(0.975, freedom)) * deviation,
-                   NORMAL_95 * done.spans.treatment.prior[place])
+                   NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place])
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         if name == 'time_offset':
-            of_reference = not 0.0 < value < _OF_A_LAG
-            if not (of_reference or lag) and _may_lag(done, value):
+            of_reference = not 0.0 < value < _MAX_GYRO_LAG
+            if not (of_reference or lag) and _is_lag_possible(fit, value):
                 confounders = ['bandwidth']
             if own_clock:
                 known = {'remedy': 'synchronize the clocks of gyro and reference; the model does '
                          'not contain it'}
                 if of_reference:
                     known['cause'] = 'The gyro has a time offset from its reference.'
-        yield finding(name, {name: Estimate.about(value, half, CAUSES[name].unit)},
-                      max(chance, LEAST_PROBABILITY), confounders,
-                      minimum_detectable=SEEN * deviation,
-                      evidence=f'evidence from {effective:.0f} stretches', **known)
+        yield make_finding(name, {name: Estimate.from_half_width(value, half, CAUSES[name].unit)},
+                           max(chance, MIN_PROBABILITY), confounders,
+                           minimum_detectable=DETECTION_SIGMAS * deviation,
+                           evidence=f'evidence from {effective:.0f} stretches', **known)
 
 
-def _may_lag(done: SpanFit, delay: float) -> bool:
+def _is_lag_possible(fit: SpanFit, delay: float) -> bool:
     """Tell whether a lag explains the log as well as the delay does."""
-    if not done.spans.fine:
+    if not fit.spans.is_fine:
         return True
-    data = whitened(done, (*done.causes, Column('bandwidth')))
-    place = len(done.values)
-    inverse = np.linalg.pinv(data.plain.T @ data.plain)
-    square = float((inverse @ data.plain.T @ data.observed)[place])
-    return abs(square - 0.5 * delay ** 2) < _RULED_OUT * math.sqrt(inverse[place, place])
+    data = whiten_regression(fit, (*fit.causes, CauseTerm('bandwidth')))
+    place = len(fit.values)
+    inverse = np.linalg.pinv(data.design.T @ data.design)
+    square = float((inverse @ data.design.T @ data.observed)[place])
+    return (abs(square - 0.5 * delay ** 2)
+            < _LAG_EXCLUSION_SIGMAS * math.sqrt(inverse[place, place]))
 
 
-def _finding(each: Confirmed, extended: SpanFit) -> Finding:
+def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
-    done = (extended if each.established
-            else fit_spans(extended.spans, [*extended.causes, each.column]))
-    name, known, places = each.column.cause, CAUSES[each.column.cause], done.places(each.column)
-    values = done.values[places]
-    half = np.array([done.half(place) for place in range(places.start, places.stop)])
+    fit = (extended if found_cause.is_established
+           else fit_spans(extended.spans, [*extended.causes, found_cause.cause_term]))
+    name, known, places = (found_cause.cause_term.cause, CAUSES[found_cause.cause_term.cause],
+                           fit.value_slice(found_cause.cause_term))
+    values = fit.values[places]
+    half = np.array([fit.half_width(place) for place in range(places.start, places.stop)])
     effect = CATALOGUE.get(name)
     unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
             else known.unit)
     if name == 'bandwidth':
-        parameters = {name: _lag(float(values[0]), float(half[0]))}
+        parameters = {name: _lag_estimate(float(values[0]), float(half[0]))}
     else:
         size = float(values[0]) if len(values) == 1 else float(np.hypot(*values))
         within = half[0] if len(values) == 1 else float(np.hypot(*(values * half))) / size
-        parameters = {name: Estimate.about(size, float(within), unit)}
-    for parameter, value in zip(() if effect is None else effect.shapes, each.column.shapes):
+        parameters = {name: Estimate.from_half_width(size, float(within), unit)}
+    for parameter, value in zip(() if effect is None else effect.nonlinear_parameters,
+                                found_cause.cause_term.shapes):
         if parameter.default is None and parameter.name not in parameters:
-            parameters[parameter.name] = Estimate.about(value, 0.0, parameter.unit)
-    shown = finding(
-        name, parameters, each.p_value, [other for other in each.probability if other != name],
-        minimum_detectable=(SEEN * float(half[0]) / NORMAL_95
+            parameters[parameter.name] = Estimate.from_half_width(value, 0.0, parameter.unit)
+    shown = make_finding(
+        name, parameters, found_cause.p_value,
+        [other for other in found_cause.probability if other != name],
+        minimum_detectable=(DETECTION_SIGMAS * float(half[0]) / NORMAL_QUANTILE_975
                             if len(values) == 1 and name != 'bandwidth' else None),
-        evidence=f'it adds {each.predicted:.1f} to the log-likelihood of held-out stretches, and '
-        f'is selected in {100.0 * each.chosen:.0f} % of the folds',
-        probability=each.probability,
-        where=(each.column.shapes[0], float(done.spans.time[-1])) if each.column.once else None)
-    return shown if each.established else as_suspected(shown)
+        evidence=f'it adds {found_cause.prediction_gain:.1f} to the log-likelihood of held-out '
+        'stretches, and '
+        f'is selected in {100.0 * found_cause.selection_share:.0f} % of the folds',
+        probability=found_cause.probability,
+        where=(found_cause.cause_term.shapes[0],
+               float(fit.spans.time[-1])) if found_cause.cause_term.is_single_event else None)
+    return shown if found_cause.is_established else mark_suspected(shown)
 
 
-def _lag(square: float, half: float) -> Estimate:
+def _lag_estimate(half_square: float, half_width: float) -> Estimate:
     """Return a time constant from half of its square."""
     low, size, high = (math.sqrt(2.0 * max(each, 0.0))
-                       for each in (square - half, square, square + half))
+                       for each in (half_square - half_width, half_square,
+                                    half_square + half_width))
     return Estimate(size, (low, high), 's')
 
 
-def _extended(model: GyroModel | None, inside: SpanFit, log: Log,
-              late: Finding | None) -> GyroModel:
+def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
+                  delay_finding: Finding | None) -> GyroModel:
     """Return the extended model of a fit, with a delay of the gyro."""
-    after = _model(model or GyroModel(), inside, log)
-    if model is not None and model.prior is not None:
+    after = _model_with_fit(model or GyroModel(), fit, log)
+    if model is not None and model.prior_deviations is not None:
         # the values of this unit replace those of its type
-        after = replace(after, tolerance=Tolerance(), origin=origins_before(model))
-    if late is None:
+        after = replace(after, tolerance=Tolerance(), origin=previous_origins(model))
+    if delay_finding is None:
         return after
-    size = late.parameters['time_offset']
-    return with_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))],
-                      np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
+    size = delay_finding.parameters['time_offset']
+    return add_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))],
+                     np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
 
 
-def _model(given: GyroModel, done: SpanFit, log: Log) -> GyroModel:
+def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
     """Return a model with scale factor error, bias, and the causes of the gyro that are fitted."""
-    own = 1.0 + sum(term.values[0] for term in given.terms if term.effect is SCALE_FACTOR_ERROR)
-    scale, bias = (own * float(value) for value in done.values[:2])
+    own = (1.0 + sum(term.values[0]
+                     for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR))
+    scale, bias = (own * float(value) for value in fit.values[:2])
     terms = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))]
     places: list[int | None] = [1, 0]
-    for cause in done.causes:
-        own_places = done.places(cause)
-        values = done.values[own_places].tolist()
+    for cause in fit.causes:
+        own_places = fit.value_slice(cause)
+        values = fit.values[own_places].tolist()
         if cause.cause == 'bandwidth':
             terms.append(Term(CATALOGUE['bandwidth'],
                               (math.sqrt(2.0 * max(values[0], 1e-10)),)))
@@ -309,54 +331,56 @@ def _model(given: GyroModel, done: SpanFit, log: Log) -> GyroModel:
         elif cause.cause in CATALOGUE:
             terms.append(Term(CATALOGUE[cause.cause], (*cause.shapes, *values)))
             places += [*(None for _ in cause.shapes), *range(own_places.start, own_places.stop)]
-    spread = np.zeros((len(places), len(places)))
+    covariance = np.zeros((len(places), len(places)))
     fits = [row for row, place in enumerate(places) if place is not None]
     chosen = [place for place in places if place is not None]
-    spread[np.ix_(fits, fits)] = done.covariance[np.ix_(chosen, chosen)]
+    covariance[np.ix_(fits, fits)] = fit.covariance[np.ix_(chosen, chosen)]
     assert log.output is not None
     output = log.output[np.isfinite(log.output)]
-    new = with_terms(given, terms, spread, [output],
-                     [] if log.temperature is None else [log.temperature])
-    return new if given.noise.angle_random_walk else replace(new, noise=_noise(done))
+    new = add_terms(base_model, terms, covariance, [output],
+                    [] if log.temperature is None else [log.temperature])
+    return new if base_model.noise.angle_random_walk else replace(new, noise=_gyro_noise(fit))
 
 
-def _noise(done: SpanFit) -> Noise:
+def _gyro_noise(fit: SpanFit) -> Noise:
     """Return the noise of the gyro; bias wander that the log does not show is 0."""
     # at the edge of the grid nothing bounds it from below
-    return Noise(done.size('angle_random_walk'), **{
-        part.name: done.size(part.name)
-        if done.fit.sizes[part.name][1] > 1.01 * part.range[0] else 0.0
-        for part in shared_noise(done.spans)})
+    return Noise(fit.noise_size('angle_random_walk'), **{
+        part.name: fit.noise_size(part.name)
+        if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
+        for part in wander_noise(fit.spans)})
 
 
 # gain
 
-def _contributions(done: SpanFit) -> dict[str, Array]:
+def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
     """Return contributions of causes to the change of heading over spans, and residual, rad."""
-    values = done.values.copy()
-    values[2] -= done.spans.delay
-    columns = all_columns(done.spans, done.causes) * values
-    found = {name: columns[:, place] for place, name in enumerate(PLAIN) if name != 'time_offset'}
-    for cause in done.causes:
-        found[cause.cause] = columns[:, done.places(cause)].sum(axis=1)
-    found['left'] = done.spans.observed - columns.sum(axis=1)
-    return {name: part[:len(done.spans.time) - 1] for name, part in found.items()}
+    values = fit.values.copy()
+    values[2] -= fit.spans.delay
+    columns = design_matrix(fit.spans, fit.causes) * values
+    found = ({
+        name: columns[:, place] for place, name in enumerate(BASE_VALUES) if name != 'time_offset'
+    })
+    for cause in fit.causes:
+        found[cause.cause] = columns[:, fit.value_slice(cause)].sum(axis=1)
+    found['left'] = fit.spans.observed - columns.sum(axis=1)
+    return {name: part[:len(fit.spans.time) - 1] for name, part in found.items()}
 
 
-def _gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
+def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     """Hold out each part of a log in turn, fit the others, and predict heading and rate there."""
     time, spans = plain.spans.time, plain.spans
     duration, count = float(time[-1] - time[0]), len(time) - 1
-    parts = int(np.clip(duration / _PART, _FEWEST_PARTS, _MOST_PARTS))
+    parts = int(np.clip(duration / _MIN_PART_DURATION, _MIN_PARTS, _MAX_PARTS))
     number = np.minimum(((time[1:] - time[0]) * parts / duration).astype(int), parts - 1)
-    window = min(WINDOW, WITHIN * duration / parts)
+    window = min(HEADING_WINDOW, MAX_WINDOW_SHARE * duration / parts)
     # under the noise of the plain fit, given the prior of the wandering bias
-    noisy = whitened(plain, ())
+    noisy = whiten_regression(plain, ())
     prior = len(noisy.observed) - len(spans.observed)
-    models = {'given': (spans.plain()[:, 2:], noisy.plain[:, 2:]),
-              'plain': (all_columns(spans, ()), noisy.plain),
-              'extended': (all_columns(extended.spans, extended.causes),
-                           whitened(extended, extended.causes, plain).plain)}
+    models = {'given': (spans.base_columns()[:, 2:], noisy.design[:, 2:]),
+              'plain': (design_matrix(spans, ()), noisy.design),
+              'extended': (design_matrix(extended.spans, extended.causes),
+                           whiten_regression(extended, extended.causes, plain).design)}
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
     counts: list[tuple[int, int]] = []
     for part in range(parts):
@@ -370,24 +394,25 @@ def _gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
             values = np.linalg.lstsq(white[rows], noisy.observed[rows], rcond=None)[0]
             left = (spans.observed - columns @ values[:columns.shape[1]])[:count][held]
             stamps = time[held[0]:held[-1] + 2]
-            turned = over_windows(left, stamps, window)
+            turned = window_changes(left, stamps, window)
             squares[name].append((float(np.sum((left / np.diff(stamps)) ** 2)),
                                   float(np.sum(turned ** 2))))
         counts.append((len(left), len(turned)))
-    return gain_of(f'each of {parts} parts of the log in turn, the others being fitted', squares,
-                   counts, 'given', window) if np.all(counts) else None
+    return gain_from_squares(f'each of {parts} parts of the log in turn, the others being '
+                             'fitted', squares,
+                             counts, 'given', window) if np.all(counts) else None
 
 
 # for people
 
-def _cannot_show(plain: SpanFit) -> dict[str, str]:
+def _untestable_causes(plain: SpanFit) -> dict[str, str]:
     """Return the reason for each cause that was not searched for."""
-    seen = {each.cause for each in candidates(plain)} | _ALWAYS_SEEN
+    seen = {each.cause for each in propose_terms(plain)} | _ALWAYS_TESTED
     missing = {channel for channel in ('temperature', 'specific_force', 'supply')
                if getattr(plain.spans.log, channel) is None}
     shown = {}
     for name, cause in CAUSES.items():
-        lacks = sorted(missing & cause.needs)
+        lacks = sorted(missing & cause.required_channels)
         if name not in seen:
             shown[name] = (f'the logs have no {" and no ".join(lacks)}'.replace('_', ' ') if lacks
                            else 'fewer than three stretches turn, which do not distinguish it '
@@ -397,14 +422,15 @@ def _cannot_show(plain: SpanFit) -> dict[str, str]:
     return shown
 
 
-def _remarks(reference: Reference, done: SpanFit, of_fleet: bool) -> Iterator[str]:
-    if of_fleet:
+def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Iterator[str]:
+    if is_fleet_model:
         yield ('The model of the fleet is used as the prior of bias and scale factor error.')
-    errors = (f'{done.size("reference") / DEGREE:.2g} deg from point to point, and '
-              f'{1000.0 * done.size("motion"):.2g} ms times the rate'
-              if done.spans.treatment.of_heading
-              else f'white noise of {done.spans.noisier:.2g} times that of the gyro')
-    yield (f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); if '
+    errors = (f'{done.noise_size("reference") / DEGREE:.2g} deg from point to point, and '
+              f'{1000.0 * done.noise_size("motion"):.2g} ms times the rate'
+              if done.spans.treatment.errs_as_heading
+              else f'white noise of {done.spans.reference_noise_ratio:.2g} times that of the gyro')
+    yield (f'The reference is taken as {_REFERENCE_PHRASES[reference.kind]} '
+           f'({reference.evidence}); if '
            f'it is another kind, state it with --reference-kind. Its errors: {errors}.')
     if done.scale_held:
         yield ('Fewer than three stretches with rotation determine the scale factor error, and it '
@@ -412,14 +438,16 @@ def _remarks(reference: Reference, done: SpanFit, of_fleet: bool) -> Iterator[st
                'in both directions.')
 
 
-def _pictures(done: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
+def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
     """Return the residual along the rate, and the measured and simulated rate over time."""
-    steps, time = np.diff(done.spans.time), done.spans.time
-    assert done.spans.log.output is not None
-    measured = done.spans.integrals(done.spans.log.output)[:len(steps)] / steps
+    steps, time = np.diff(fit.spans.time), fit.spans.time
+    assert fit.spans.log.output is not None
+    measured = fit.spans.span_integrals(fit.spans.log.output)[:len(steps)] / steps
     before, after = (-each / steps
                      for each in (sum(parts.values(), 0.0 * parts['left']), parts['left']))
-    order = np.array_split(np.argsort(measured, kind='stable'), min(_BINS, len(steps) // 4 + 1))
+    order = np.array_split(np.argsort(measured, kind='stable'),
+                           min(_CURVE_BINS,
+                               len(steps) // 4 + 1))
     at, given, left = (np.array([float(each[part].mean()) for part in order])
                        for each in (measured, before, after))
     deviation = np.array([float(after[part].std()) / math.sqrt(len(part)) for part in order])
@@ -430,30 +458,30 @@ def _pictures(done: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
 # the search
 
 @dataclass(frozen=True)
-class Confirmed:
+class FoundCause:
     """
     A cause that the search found.
 
     Attributes
     ----------
-    column : the cause
+    cause_term : the cause
     p_value : of the best of all candidates in noise, cluster-robust
-    predicted : gain in log-likelihood on held-out stretches
-    chosen : share of the folds in which the same cause was selected
-    established : whether it is confirmed
+    prediction_gain : gain in log-likelihood on held-out stretches
+    selection_share : share of the folds in which the same cause was selected
+    is_established : whether it is confirmed
     probability : of the cause and of its alternatives, by name
 
     """
 
-    column: Column
+    cause_term: CauseTerm
     p_value: float
-    predicted: float
-    chosen: float
-    established: bool
+    prediction_gain: float
+    selection_share: float
+    is_established: bool
     probability: dict[str, float]
 
 
-def candidates(done: SpanFit) -> Iterator[Column]:
+def propose_terms(fit: SpanFit) -> Iterator[CauseTerm]:
     """
     Give the causes that headings over spans can show, for the channels that the log has.
 
@@ -461,178 +489,193 @@ def candidates(done: SpanFit) -> Iterator[Column]:
     so that none of these is a candidate.
 
     """
-    return (each for each in _columns(done)
-            if not (done.scale_held and _follows_the_rate(each.cause)))
+    return (each for each in _columns(fit)
+            if not (fit.scale_held and _follows_the_rate(each.cause)))
 
 
 def _follows_the_rate(cause: str) -> bool:
     """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
     effect = CATALOGUE.get(cause)
     return (cause == 'reference_once_per_rev' if effect is None
-            else 'rate' in effect.looks_at)
+            else 'rate' in effect.inputs)
 
 
-def _columns(done: SpanFit) -> Iterator[Column]:
+def _columns(done: SpanFit) -> Iterator[CauseTerm]:
     """Give the columns of all causes for the channels that the log has."""
-    log, fine, time = done.spans.log, done.spans.fine, done.spans.time
+    log, fine, time = done.spans.log, done.spans.is_fine, done.spans.time
     duration = float(time[-1] - time[0])
     for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
                  'rate_ramp', 'heading_sensitivity', 'reference_once_per_rev'):
-        yield Column(name)
+        yield CauseTerm(name)
     if fine:
-        yield Column('bandwidth', positive=True)
+        yield CauseTerm('bandwidth', is_positive=True)
     for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist():
-        yield Column('warm_up', (constant,))
+        yield CauseTerm('warm_up', (constant,))
     for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist():
-        yield Column('bias_step', (moment,), once=True)
+        yield CauseTerm('bias_step', (moment,), is_single_event=True)
         if not fine:
-            yield Column('reference_slip', (moment,), once=True)
+            yield CauseTerm('reference_slip', (moment,), is_single_event=True)
     if log.temperature is not None and np.ptp(log.temperature) > 0.2:
         middle = float(log.temperature.mean())
         for name in ('bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature'):
-            yield Column(name, (middle,))
+            yield CauseTerm(name, (middle,))
         for filter_time in (3.0, 10.0):
-            yield Column('bias_temperature_rate', (filter_time,))
+            yield CauseTerm('bias_temperature_rate', (filter_time,))
         if fine:
             for constant in np.geomspace(5.0, min(duration, 3000.0), 6).tolist():
-                yield Column('thermal_lag', (constant,))
+                yield CauseTerm('thermal_lag', (constant,))
             for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4)):
-                yield Column('thermal_hysteresis', (filter_time, threshold))
+                yield CauseTerm('thermal_hysteresis', (filter_time, threshold))
     if log.specific_force is not None and np.ptp(log.specific_force) > 0.0:
-        yield Column('acceleration_sensitivity')
-        yield Column('vibration_rectification', (1.0,))
+        yield CauseTerm('acceleration_sensitivity')
+        yield CauseTerm('vibration_rectification', (1.0,))
     if log.supply is not None and np.ptp(log.supply) > 0.0:
-        yield Column('supply_sensitivity', (5.0,))
-    has = [name for name in LEAST_CHANGE if getattr(log, name) is not None]
-    for name, shapes in added_effects(has, moves=True):
-        yield Column(name, shapes)
+        yield CauseTerm('supply_sensitivity', (5.0,))
+    has = [name for name in MIN_CHANNEL_RANGE if getattr(log, name) is not None]
+    for name, shapes in user_effects(has, has_motion=True):
+        yield CauseTerm(name, shapes)
 
 
-def search(done: SpanFit, level: float, on_part: OnPart) -> tuple[SpanFit, list[Confirmed]]:
+def search_causes(fit: SpanFit, false_alarm_rate: float,
+                  on_part: OnPart) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
-    found: list[Confirmed] = []
-    offered = list(candidates(done))
+    found: list[FoundCause] = []
+    candidate_terms = list(propose_terms(fit))
     # noise given one column of each cause, so that it does not absorb their contributions
-    columns = {each.cause: each for each in offered if not each.once}
-    rich = fit_spans(done.spans, list(columns.values()))
-    while len(found) < MOST:
-        taken = [each.column for each in found]
-        names = {each.cause for each in taken}
+    columns = {each.cause: each for each in candidate_terms if not each.is_single_event}
+    rich_fit = fit_spans(fit.spans, list(columns.values()))
+    while len(found) < MAX_CAUSES:
+        found_terms = [each.cause_term for each in found]
+        names = {each.cause for each in found_terms}
         on_part(f'search for causes after {len(found)} found' if found else 'search for causes')
-        best = _best(done, rich, [each for each in offered if each.cause not in names], taken,
-                     level)
+        best = _find_best_cause(fit, rich_fit,
+                                [each for each in candidate_terms if each.cause not in names],
+                                found_terms, false_alarm_rate)
         if best is None:
             break
         found.append(best)
-    found = [each for each in found if each.predicted > 0.0]
-    extended = done
-    while inside := [each.column for each in found if each.established]:
-        extended = fit_spans(done.spans, inside)
-        worst = max(inside, key=lambda each: _contradiction(extended, each))
-        if _contradiction(extended, worst) < 1.0:
+    found = [each for each in found if each.prediction_gain > 0.0]
+    extended = fit
+    while established_terms := [each.cause_term for each in found if each.is_established]:
+        extended = fit_spans(fit.spans, established_terms)
+        worst = max(established_terms, key=lambda each: _implausibility(extended, each))
+        if _implausibility(extended, worst) < 1.0:
             return extended, found
-        found = [replace(each, established=each.established and each.column != worst)
+        found = [replace(each, is_established=each.is_established and each.cause_term != worst)
                  for each in found]
-    return done, found
+    return fit, found
 
 
-def _contradiction(done: SpanFit, cause: Column) -> float:
+def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
     """Return the ratio of an effect to the largest plausible one; inf if it may be 0."""
-    places = done.places(cause)
-    values = done.values[places]
-    if len(values) == 1 and abs(values[0]) < done.half(places.start):
+    places = fit.value_slice(cause)
+    values = fit.values[places]
+    if len(values) == 1 and abs(values[0]) < fit.half_width(places.start):
         return math.inf
     if CAUSES[cause.cause].along != 'rate' or cause.cause not in CATALOGUE:
         return 0.0
-    columns = CATALOGUE[cause.cause].columns(done.spans.channels, *cause.shapes)
+    columns = CATALOGUE[cause.cause].columns(fit.spans.channels, *cause.shapes)
     added = np.abs(np.tensordot(values, np.array(columns), 1)).max()
-    return float(added / np.abs(done.spans.channels.rate).max()) / _LARGEST
+    return float(added / np.abs(fit.spans.channels.rate).max()) / _MAX_RELATIVE_EFFECT
 
 
-def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequence[Column],
-          level: float) -> Confirmed | None:
+def _find_best_cause(fit: SpanFit, rich_fit: SpanFit, open_terms: Sequence[CauseTerm],
+                     found_terms: Sequence[CauseTerm],
+                     false_alarm_rate: float) -> FoundCause | None:
     """Return the best of the remaining causes, given those found; None if insignificant."""
     # what a scale factor error that is kept at 0 would explain is no evidence of a cause
-    data = whitened(replace(done, prior=np.array(done.spans.treatment.prior)), given, rich,
-                    most=True)
-    widths = [done.spans.columns(each) for each in open_ones]
-    columns = data.columns(np.column_stack(widths))
+    data = whiten_regression(replace(fit, prior=np.array(fit.spans.treatment.prior)), found_terms,
+                             rich_fit, use_max_random_walk=True)
+    widths = [fit.spans.cause_columns(each) for each in open_terms]
+    columns = data.whiten_columns(np.column_stack(widths))
     edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])
     places = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:])]
-    chances = _evidences(data, columns, places, open_ones, np.ones(len(data.observed), dtype=bool))
+    chances = _term_evidences(data, columns, places, open_terms,
+                              np.ones(len(data.observed), dtype=bool))
     # single events are never established, and are not counted in the number of the others
-    lasting = sum(not each.once for each in open_ones)
-    tried = [chance * (len(open_ones) if each.once else lasting)
-             for each, (chance, _, _) in zip(open_ones, chances)]
-    strongest = int(np.argmin(tried))
-    once = open_ones[strongest].once
-    if min(tried[strongest], 1.0) > (level if once else SUSPECTED * level):
+    lasting = sum(not each.is_single_event for each in open_terms)
+    corrected_chances = [chance * (len(open_terms) if each.is_single_event else lasting)
+                         for each, (chance, _, _) in zip(open_terms, chances)]
+    strongest = int(np.argmin(corrected_chances))
+    once = open_terms[strongest].is_single_event
+    if min(corrected_chances[strongest],
+           1.0) > (false_alarm_rate if once else SUSPECTED_RATE_FACTOR * false_alarm_rate):
         return None
     best_of: dict[str, int] = {}
-    for other, each in enumerate(open_ones):
+    for other, each in enumerate(open_terms):
         if each.cause not in best_of or chances[other][1] > chances[best_of[each.cause]][1]:
             best_of[each.cause] = other
     gain = chances[strongest][1]
-    alike = {name: other for name, other in best_of.items()
-             if chances[other][1] > gain - math.log(_LIKELY) or other == strongest}
+    equivalent_causes = {
+        name: other for name, other in best_of.items()
+        if chances[other][1] > gain - math.log(_MAX_LIKELIHOOD_RATIO) or other == strongest
+    }
     # the simplest of the equivalent causes: with the fewest values and fitted shapes
-    place = min(alike.values(), key=lambda other: (widths[other].shape[1] + sum(
-        each.default is None for each in getattr(CATALOGUE.get(open_ones[other].cause), 'shapes',
-                                                 ())), tried[other]))
-    column, p_value, stretches = open_ones[place], min(tried[place], 1.0), chances[place][2]
-    found = _cross_fitted(data, columns, places, open_ones, alike)
+
+    def count_values(other: int) -> int:
+        effect = CATALOGUE.get(open_terms[other].cause)
+        return widths[other].shape[1] + sum(each.default is None for each in getattr(
+            effect, 'nonlinear_parameters', ()))
+
+    place = min(equivalent_causes.values(),
+                key=lambda other: (count_values(other), corrected_chances[other]))
+    column, p_value = open_terms[place], min(corrected_chances[place], 1.0)
+    stretches = chances[place][2]
+    found = _cross_fit(data, columns, places, open_terms, equivalent_causes)
     # errors of a course are correlated over time, so that distant stretches must be predicted too
-    surely, predicted, chosen = max(found) if done.spans.fine else min(found)
+    prediction_sigma, predicted, chosen = max(found) if fit.spans.is_fine else min(found)
     probability = {name: chance for name, chance in probabilities(
         {name: gain - chances[other][1] for name, other in best_of.items()}).items()
-        if name in alike}
-    established = (p_value < level and surely > SURELY and chosen == 1.0 and not column.once
-                   and stretches >= FEWEST_STRETCHES)
-    return Confirmed(column, max(p_value, LEAST_PROBABILITY), predicted, chosen, established,
-                     probability)
+        if name in equivalent_causes}
+    established = (p_value < false_alarm_rate and prediction_sigma > MIN_PREDICTION_SIGMAS
+                   and chosen == 1.0 and not column.is_single_event and stretches >= MIN_STRETCHES)
+    return FoundCause(column, max(p_value, MIN_PROBABILITY), predicted, chosen, established,
+                      probability)
 
 
-def _evidences(data: Whitened, columns: Array, places: Sequence[slice],
-               open_ones: Sequence[Column], rows: Mask) -> list[tuple[float, float, float]]:
+def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[slice],
+                    open_terms: Sequence[CauseTerm],
+                    rows: Mask) -> list[tuple[float, float, float]]:
     """Return chance, gain in log-likelihood and effective stretches of each cause."""
-    base, _ = np.linalg.qr(data.plain[rows])
+    base, _ = np.linalg.qr(data.design[rows])
     both = np.column_stack([columns, data.observed])[rows]
     both -= base @ (base.T @ both)
-    clusters = [each[rows] for each in (data.stretch, *data.places)]
+    clusters = [each[rows] for each in (data.row_stretches, *data.row_sectors)]
     sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
-    return [(1.0, 0.0, 0.0) if each.positive and float(both[:, place.start] @ both[:, -1]) <= 0.0
-            else _evidence(both[:, place], both[:, -1], clusters if CAUSES[each.cause].along
-                           in _OF_MOTION else clusters[:1], 1e-6 * sizes[place])
-            for place, each in zip(places, open_ones)]
+    return [(1.0, 0.0, 0.0) if each.is_positive
+            and float(both[:, place.start] @ both[:, -1]) <= 0.0 else _cluster_robust_evidence(
+                both[:, place], both[:, -1],
+                clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], 1e-6
+                * sizes[place]) for place, each in zip(places, open_terms)]
 
 
-def _evidence(x: Array, left: Array, clusters: Sequence[NDArray[np.intp]],
-              least: Array) -> tuple[float, float, float]:
+def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
+                             min_sizes: Array) -> tuple[float, float, float]:
     """Return chance, gain in log-likelihood and effective number by the worst clusters."""
     information = x.T @ x
     size = np.sqrt(np.diag(information))
-    if not (size > least).all():
+    if not (size > min_sizes).all():
         return 1.0, 0.0, 0.0
     # by the residual with the candidate: scores that contain the effect would overestimate scatter
-    off = left - x @ np.linalg.lstsq(x, left, rcond=None)[0]
+    off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
     count, found = x.shape[1], []
     root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size**2)))
-    square = float(np.sum((root @ x.T @ left) ** 2))
+    square = float(np.sum((root @ x.T @ residual) ** 2))
     for cluster in clusters:
         scores = np.array([np.bincount(cluster, part * off) for part in x.T])
         shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
         effective = float(shares.sum() ** 2 / (shares ** 2).sum())
         scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
-        more = float(np.linalg.eigvalsh(root @ scatter @ root.T).max())
-        statistic, freedom = square / max(more, 1.0), max(effective - count, 1.0)
+        max_variance_ratio = float(np.linalg.eigvalsh(root @ scatter @ root.T).max())
+        statistic, freedom = square / max(max_variance_ratio, 1.0), max(effective - count, 1.0)
         found.append((float(fisher.sf(statistic / count, count, freedom)), 0.5 * statistic,
                       effective))
     return max(found)
 
 
-def _cross_fitted(data: Whitened, columns: Array, places: Sequence[slice],
-                  open_ones: Sequence[Column],
-                  alike: Mapping[str, int]) -> list[tuple[float, float, float]]:
+def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice],
+               open_terms: Sequence[CauseTerm],
+               equivalent_causes: Mapping[str, int]) -> list[tuple[float, float, float]]:
     """
     Select and fit without each fold, and predict it.
 
@@ -644,23 +687,26 @@ def _cross_fitted(data: Whitened, columns: Array, places: Sequence[slice],
     one of the equivalent causes was selected
 
     """
-    numbers = np.arange(data.of_log)
-    folds = min(FOLDS, len(numbers))
+    numbers = np.arange(data.stretch_count)
+    folds = min(FOLD_COUNT, len(numbers))
     found = []
     for sets in ([numbers[fold::folds] for fold in range(folds)], np.array_split(numbers, folds)):
-        won: list[float] = []
-        same = 0
+        log_likelihood_gains: list[float] = []
+        same_choices = 0
         for fold in sets:
-            held = np.isin(data.stretch, fold)
+            held = np.isin(data.row_stretches, fold)
             rest = ~held
-            gains = [gain for _, gain, _ in _evidences(data, columns, places, open_ones, rest)]
+            gains = [
+                gain for _, gain, _ in _term_evidences(data, columns, places, open_terms, rest)
+            ]
             best = int(np.argmax(gains))
-            same += open_ones[best].cause in alike
+            same_choices += open_terms[best].cause in equivalent_causes
             off = []
-            for design in (data.plain, np.column_stack([data.plain, columns[:, places[best]]])):
+            for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):
                 values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
                 off.append(data.observed[held] - design[held] @ values)
-            won += np.bincount(np.searchsorted(fold, data.stretch[held]),
-                               0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
-        found.append((sureness(np.array(won)), float(np.sum(won)), same / folds))
+            log_likelihood_gains += np.bincount(np.searchsorted(fold, data.row_stretches[held]),
+                                                0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
+        found.append((prediction_sigmas(np.array(log_likelihood_gains)),
+                      float(np.sum(log_likelihood_gains)), same_choices / folds))
     return found

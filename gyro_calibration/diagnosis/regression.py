@@ -16,43 +16,48 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from gyro_calibration.diagnosis.candidates import Candidate, columns_of, fitted_shapes, with_shape
+from gyro_calibration.diagnosis.candidates import (
+    Candidate,
+    candidate_transforms,
+    fitted_shape_indices,
+    with_shape,
+)
 from gyro_calibration.diagnosis.noise_likelihood import (
-    log_sum,
+    Indices,
+    log_sum_exp,
+    marginalize_nuisances,
     Marginalized,
-    marginalized,
     noise_likelihood,
+    NoiseHypotheses,
     NoiseLikelihood,
-    Noises,
-    Places,
 )
 from gyro_calibration.diagnosis.replay import (
-    angles,
-    bands,
-    fall,
-    inverse,
-    levels,
+    band_starts,
+    coefficient_angles,
+    high_frequency_power_ratio,
+    inverse_cosine_transform,
     noise_grid,
+    NoiseShape,
+    relative_part_powers,
     Replay,
-    Shape,
-    SMOOTHED,
+    SMOOTHED_POWER_RATIO,
 )
-from gyro_calibration.logs.log import Array, NORMAL_95
+from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from scipy.linalg import block_diag
 
 #: Longest averaging interval of a smoothed residual, s; and number of iterations of the levels of
 #: its noise, each with the most likely noise of the levels before.
-_LONGEST, _ROUNDS = 0.1, 3
+_MAX_AVERAGING_TIME, _LEVEL_ITERATIONS = 0.1, 3
 #: Relative step of a shape for the derivative of its columns.
-_SMALL = 1e-4
+_RELATIVE_SHAPE_STEP = 1e-4
 #: Drop of the log-likelihood at the ends of a 95 % interval.
-_FALL = 1.92
+_LIKELIHOOD_DROP_95 = 1.92
 
 
 @dataclass(frozen=True)
-class Named:
+class SelectedCause:
     """
     A selected cause.
 
@@ -60,13 +65,13 @@ class Named:
     ----------
     candidate : the cause with its shapes
     values : coefficients of its columns; empty before a fit, and its shapes are then fixed
-    price : penalty for the choice of its first shapes, in log-likelihood
+    penalty : penalty for the choice of its first shapes, in log-likelihood
 
     """
 
     candidate: Candidate
     values: tuple[float, ...] = ()
-    price: float = 0.0
+    penalty: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,57 +82,61 @@ class RegressionProblem:
     Attributes
     ----------
     replays : the logs
-    first : the noise by which residual and columns are whitened first
+    reference_noise : the noise by which residual and columns are whitened first
     deviation : standard deviation of each coefficient by it, with the levels of the logs, relative
         to that of white noise, shape (m,)
-    starts : first coefficient of each band
-    shapes : noises that are tried
+    band_starts : first coefficient of each band
+    noise_shapes : noises that are tried
     noises : the same, as weights of the bands
 
     """
 
     replays: tuple[Replay, ...]
-    first: Shape
+    reference_noise: NoiseShape
     deviation: Array
-    starts: Places
-    shapes: tuple[Shape, ...]
-    noises: Noises
+    band_starts: Indices
+    noise_shapes: tuple[NoiseShape, ...]
+    noises: NoiseHypotheses
 
-    def angles(self) -> tuple[Array, Array]:
+    def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
-        parts = [angles(each.points) for each in self.replays]
+        parts = [coefficient_angles(each.point_count) for each in self.replays]
         return np.concatenate(parts), np.concatenate([
-            np.full(len(part), each.step) for part, each in zip(parts, self.replays)])
+            np.full(len(part), each.point_interval) for part, each in zip(parts, self.replays)])
 
-    def divided(self, noise: int) -> Array:
+    def whitening_factors(self, noise_index: int) -> Array:
         """Return the factors that whiten coefficients whitened by the first noise, shape (m,)."""
-        count = np.diff(np.append(self.starts, len(self.deviation)))
-        return np.repeat(np.sqrt(self.noises.weights[noise]), count)
+        count = np.diff(np.append(self.band_starts, len(self.deviation)))
+        return np.repeat(np.sqrt(self.noises.weights[noise_index]), count)
 
 
-def regression_problem(replays: Sequence[Replay]) -> RegressionProblem:
+def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
     """Set up the regression of logs with a grid of noises."""
-    reference = _rounding(replays) if any(each.rounded for each in replays) else 0.0
-    return _problem(tuple(replays), Shape(reference=reference), noise_grid(
-        min(each.step for each in replays), max(each.duration for each in replays), reference))
+    rounding_ratio = (_estimate_rounding_ratio(replays) if any(
+        each.heading_step for each in replays) else 0.0)
+    return _assemble_problem(
+        tuple(replays), NoiseShape(rounding_ratio=rounding_ratio),
+        noise_grid(min(each.point_interval for each in replays),
+                   max(each.duration for each in replays), rounding_ratio))
 
 
-def _rounding(replays: Sequence[Replay]) -> float:
+def _estimate_rounding_ratio(replays: Sequence[Replay]) -> float:
     """Return the most likely variance of the rounding of a heading, relative to white noise."""
-    shapes = [Shape(reference=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))]
-    tried = _problem(tuple(replays), Shape(), [replace(shape, walk=walk) for shape in shapes
-                                               for walk in (0.0, 1e-4, 1e-2)])
-    done = fitted(tried, [])
-    return tried.shapes[int(done.by_noise.likelihood[0].argmax())].reference
+    shapes = [NoiseShape(rounding_ratio=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))]
+    tried = _assemble_problem(
+        tuple(replays), NoiseShape(),
+        [replace(shape, walk_ratio=walk) for shape in shapes for walk in (0.0, 1e-4, 1e-2)])
+    done = fit_causes(tried, [])
+    return tried.noise_shapes[int(done.noise_likelihood.log_likelihood[0].argmax())].rounding_ratio
 
 
-def _problem(replays: tuple[Replay, ...], first: Shape,
-             shapes: Sequence[Shape]) -> RegressionProblem:
-    parts = [(angles(each.points), each.step) for each in replays]
+def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
+                      shapes: Sequence[NoiseShape]) -> RegressionProblem:
+    parts = [(coefficient_angles(each.point_count), each.point_interval) for each in replays]
     plain = np.concatenate([first.variance(angle, step) / step for angle, step in parts])
-    deviation = np.sqrt(plain * np.concatenate([each.level() for each in replays]))
+    deviation = np.sqrt(plain * np.concatenate([each.noise_level() for each in replays]))
     offsets = np.cumsum([0, *(len(angle) for angle, _ in parts)])
-    starts = np.concatenate([bands(angle, step) + offset
+    starts = np.concatenate([band_starts(angle, step) + offset
                              for (angle, step), offset in zip(parts, offsets)])
     count = np.diff(np.append(starts, offsets[-1])).astype(float)
     # The mean variance of a band is computed from some of its coefficients.
@@ -141,44 +150,45 @@ def _problem(replays: tuple[Replay, ...], first: Shape,
                         first_of)
         for shape in shapes]) / [len(part) for part in few]
     # Each combination of components has the same prior probability, whatever its number of sizes.
-    kinds = [(bool(each.walk), bool(each.strength), bool(each.flicker)) for each in shapes]
+    kinds = [(bool(each.walk_ratio), bool(each.markov_ratio), bool(each.flicker_corner))
+             for each in shapes]
     rare = [np.log(kinds.count(kind)) for kind in kinds]
-    noises = Noises(1.0 / relative, np.log(relative) @ count + 2.0 * np.array(rare))
+    noises = NoiseHypotheses(1.0 / relative, np.log(relative) @ count + 2.0 * np.array(rare))
     return RegressionProblem(replays, first, deviation, starts, tuple(shapes), noises)
 
 
 @dataclass(frozen=True)
-class Fitted:
+class RegressionFit:
     """
     A regression with some causes.
 
     Attributes
     ----------
     problem : the logs with the rate that the gyro senses, distorted by causes
-    plain : the logs with the reference rate
-    named : causes
+    original_replays : the logs with the reference rate
+    causes : causes
     residual : whitened, less the columns of causes of fixed amplitude, shape (m,)
     columns : whitened and independent: scale factor error, those of the causes, and derivatives
         with respect to their shapes, shape (q, m)
-    owner : of each column: (index of the cause, or -1 for the scale factor error, or -2; index of
-        its value, or -1 less index of its shape)
-    widths : number of columns with free values of each cause
-    marginalized, by_noise : see `noise_likelihood`
+    column_owners : of each column: (index of the cause, or -1 for the scale factor error, or -2;
+        index of its value, or -1 less index of its shape)
+    column_counts : number of columns with free values of each cause
+    marginalized, noise_likelihood : see `noise_likelihood`
 
     """
 
     problem: RegressionProblem
-    plain: tuple[Replay, ...]
-    named: tuple[Named, ...]
+    original_replays: tuple[Replay, ...]
+    causes: tuple[SelectedCause, ...]
     residual: Array
     columns: Array
-    owner: tuple[tuple[int, int], ...]
-    widths: tuple[int, ...]
+    column_owners: tuple[tuple[int, int], ...]
+    column_counts: tuple[int, ...]
     marginalized: Marginalized
-    by_noise: NoiseLikelihood
+    noise_likelihood: NoiseLikelihood
 
     @property
-    def score(self) -> float:
+    def log_likelihood(self) -> float:
         """
         Return the logarithm of the likelihood at the best values, averaged over the noises.
 
@@ -186,162 +196,174 @@ class Fitted:
         `evidence`.
 
         """
-        by_noise, best = self.by_noise, int(self.by_noise.likelihood[0].argmax())
-        _, logarithm = np.linalg.slogdet(self.marginalized.own[best])
-        return float(log_sum(by_noise.likelihood)[0] + 0.5 * (
-            logarithm - len(self.columns) * np.log(by_noise.squares[0, best])))
+        by_noise, best = (self.noise_likelihood,
+                          int(self.noise_likelihood.log_likelihood[0].argmax()))
+        _, logarithm = np.linalg.slogdet(self.marginalized.nuisance_information[best])
+        return float(log_sum_exp(by_noise.log_likelihood)[0] + 0.5 * (
+            logarithm - len(self.columns) * np.log(by_noise.residual_squares[0, best])))
 
-    def white(self, noise: Fitted | None = None) -> list[Array]:
+    def whitened_series(self, noise_fit: RegressionFit | None = None) -> list[Array]:
         """Return the residual of each log, whitened in time to variance 1: shape (points,)."""
-        return [inverse(part) for part in self.whitened(noise)]
+        return [inverse_cosine_transform(part) for part in self.whitened_transforms(noise_fit)]
 
-    def whitened(self, noise: Fitted | None = None) -> list[Array]:
+    def whitened_transforms(self, noise_fit: RegressionFit | None = None) -> list[Array]:
         """Return each log's whitened residual, by its own or another's noise: (points - 1,)."""
-        of = noise or self
-        best = int(of.by_noise.likelihood[0].argmax())
-        factor = of.problem.divided(best) * np.sqrt(
-            of.marginalized.freedom / of.by_noise.squares[0, best])
-        return [part * own for part, own in zip(self.left(), self._by_log(factor))]
+        of = noise_fit or self
+        best = int(of.noise_likelihood.log_likelihood[0].argmax())
+        factor = of.problem.whitening_factors(best) * np.sqrt(
+            of.marginalized.degrees_of_freedom / of.noise_likelihood.residual_squares[0, best])
+        return [
+            part * own for part, own in zip(self.residual_transforms(), self._split_by_log(factor))
+        ]
 
-    def left(self) -> list[Array]:
+    def residual_transforms(self) -> list[Array]:
         """Return each log's residual whitened by the first noise: shape (points - 1,)."""
         values, _ = self.estimates
-        return self._by_log(self.residual - values @ self.columns)
+        return self._split_by_log(self.residual - values @ self.columns)
 
-    def _by_log(self, coefficients: Array) -> list[Array]:
+    def _split_by_log(self, coefficients: Array) -> list[Array]:
         return np.split(coefficients,
-                        np.cumsum([each.points - 1 for each in self.problem.replays])[:-1])
+                        np.cumsum([each.point_count - 1 for each in self.problem.replays])[:-1])
 
     @property
     def estimates(self) -> tuple[Array, Array]:
         """Return the values of the independent columns and covariance, averaged over noises."""
-        probable = self.by_noise.probability[0]
+        probable = self.noise_likelihood.probability[0]
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
-        covariance = np.linalg.inv(self.marginalized.own[kept])
-        values = np.einsum('gpq,gq->gp', covariance, self.by_noise.towards[0, kept])
+        covariance = np.linalg.inv(self.marginalized.nuisance_information[kept])
+        values = np.einsum('gpq,gq->gp', covariance, self.noise_likelihood.nuisance_scores[0,
+                                                                                           kept])
         mean = weights @ values
-        variances = weights * self.by_noise.squares[0, kept] / self.marginalized.freedom
+        variances = (weights * self.noise_likelihood.residual_squares[0, kept]
+                     / self.marginalized.degrees_of_freedom)
         inside = np.einsum('g,gpq->pq', variances, covariance)
         return mean, inside + np.einsum('g,gp,gq->pq', weights, values - mean, values - mean)
 
 
-def is_of_the_rate(name: str) -> bool:
+def is_rate_distortion(name: str) -> bool:
     """Tell whether a cause distorts the rate before errors are added to it."""
     return name in CATALOGUE and CATALOGUE[name].stage == 'rate'
 
 
-def seen(each: Replay, named: Sequence[Named]) -> Replay:
+def with_distorted_rate(replay: Replay, causes: Sequence[SelectedCause]) -> Replay:
     """Return a log with the rate that the gyro senses, distorted by causes."""
-    rate, time = each.channels.rate, each.channels.time
-    for known in named:
-        if is_of_the_rate(known.candidate.cause):
+    rate, time = replay.channels.rate, replay.channels.time
+    for known in causes:
+        if is_rate_distortion(known.candidate.cause):
             distortion = CATALOGUE[known.candidate.cause].distortion
             assert distortion is not None
             rate = distortion(rate, time, *known.candidate.shapes)
-    return each.with_rate(rate)
+    return replay.with_rate(rate)
 
 
-def fitted(whole: RegressionProblem, named: Sequence[Named],
-           extra: Sequence[Candidate] = ()) -> Fitted:
+def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause],
+               nuisance_candidates: Sequence[Candidate] = ()) -> RegressionFit:
     """
     Fit causes to logs.
 
     Parameters
     ----------
-    whole : the logs with the reference rate
-    named : causes with their shapes and values
-    extra : candidates whose columns are nuisances too
+    problem : the logs with the reference rate
+    causes : causes with their shapes and values
+    nuisance_candidates : candidates whose columns are nuisances too
 
     """
-    replays = [seen(each, named) for each in whole.replays]
+    replays = [with_distorted_rate(each, causes) for each in problem.replays]
     widths = []
     residual = np.concatenate([
-        each.noisy(each.channels.output - each.reference
-                   - (new.channels.rate - each.channels.rate))
-        for each, new in zip(whole.replays, replays)])
-    columns, owner = [np.concatenate([each.coefficients(each.channels.rate)
+        each.transform_residual(each.channels.output - each.reference
+                                - (new.channels.rate - each.channels.rate))
+        for each, new in zip(problem.replays, replays)])
+    columns, owner = [np.concatenate([each.transform_samples(each.channels.rate)
                                       for each in replays])[None]], [(-1, 0)]
-    for place, known in enumerate(named):
-        own = columns_of(known.candidate, replays if not is_of_the_rate(known.candidate.cause)
-                         else whole.replays)
+    for place, known in enumerate(causes):
+        own = candidate_transforms(
+            known.candidate,
+            replays if not is_rate_distortion(known.candidate.cause) else problem.replays)
         widths.append(len(own) if known.candidate.amplitude is None else 0)
         if known.candidate.amplitude is None:
             columns.append(own)
             owner += [(place, number) for number in range(len(own))]
-        elif not is_of_the_rate(known.candidate.cause):
+        elif not is_rate_distortion(known.candidate.cause):
             residual = residual - known.candidate.amplitude * own[0]
-        changes = _changes(known, whole.replays if is_of_the_rate(known.candidate.cause)
-                           else replays, own) if known.values else []
+        changes = _shape_derivatives(
+            known, problem.replays if is_rate_distortion(known.candidate.cause) else replays,
+            own) if known.values else []
         columns += [change[None] for _, change in changes]
         owner += [(place, -1 - number) for number, _ in changes]
-    for candidate in extra:
-        own = columns_of(candidate, replays)
+    for candidate in nuisance_candidates:
+        own = candidate_transforms(candidate, replays)
         columns.append(own)
         owner += [(-2, 0)] * len(own)
-    return _summed(replace(whole, replays=tuple(replays)), whole.replays, tuple(named),
-                   residual / whole.deviation, np.concatenate(columns) / whole.deviation,
-                   tuple(owner), tuple(widths))
+    return _fit_columns(replace(problem, replays=tuple(replays)), problem.replays, tuple(causes),
+                        residual / problem.deviation, np.concatenate(columns) / problem.deviation,
+                        tuple(owner), tuple(widths))
 
 
-def _changes(known: Named, replays: Sequence[Replay], own: Array) -> list[tuple[int, Array]]:
+def _shape_derivatives(cause: SelectedCause, replays: Sequence[Replay],
+                       columns: Array) -> list[tuple[int, Array]]:
     """Return the derivative of a cause's contribution to each smooth, fitted shape."""
     found: list[tuple[int, Array]] = []
-    for place in free_shapes(known.candidate):
-        moved = _moved(known.candidate, place, max(each.duration for each in replays))
-        change = np.tensordot(known.values, columns_of(moved, replays) - own, 1)
-        found.append((place, change / (moved.shapes[place] - known.candidate.shapes[place])))
+    for place in smooth_shapes(cause.candidate):
+        moved = _perturb_shape(cause.candidate, place, max(each.duration for each in replays))
+        change = np.tensordot(cause.values, candidate_transforms(moved, replays) - columns, 1)
+        found.append((place, change / (moved.shapes[place] - cause.candidate.shapes[place])))
     return found
 
 
-def _moved(candidate: Candidate, place: int, duration: float) -> Candidate:
+def _perturb_shape(candidate: Candidate, shape_index: int, duration: float) -> Candidate:
     """Return a cause with a small change of a shape, within its bounds."""
-    shape = candidate.shapes[place]
+    shape = candidate.shapes[shape_index]
     # The phase of a wave must change little up to the end of the log.
     step = (1e-3 / duration if candidate.cause == 'interference_tone'
-            else _SMALL * abs(shape) if shape else 1e-6)
-    moved = with_shape(candidate, place, shape + step)
-    return with_shape(candidate, place, shape - step) if moved.shapes[place] == shape else moved
+            else _RELATIVE_SHAPE_STEP * abs(shape) if shape else 1e-6)
+    moved = with_shape(candidate, shape_index, shape + step)
+    return (with_shape(candidate, shape_index, shape
+                       - step) if moved.shapes[shape_index] == shape else moved)
 
 
-def free_shapes(candidate: Candidate) -> list[int]:
+def smooth_shapes(candidate: Candidate) -> list[int]:
     """Return the indices of fitted shapes on which the columns depend smoothly."""
-    return [] if candidate.cause in ('bias_step', 'dead_zone') else fitted_shapes(candidate)
+    return [] if candidate.cause in ('bias_step', 'dead_zone') else fitted_shape_indices(candidate)
 
 
-def leaping_shapes(candidate: Candidate) -> list[int]:
+def discontinuous_shapes(candidate: Candidate) -> list[int]:
     """Return the indices of fitted shapes on which the columns do not depend smoothly."""
-    return [place for place in fitted_shapes(candidate) if place not in free_shapes(candidate)]
+    return [
+        place for place in fitted_shape_indices(candidate) if place not in smooth_shapes(candidate)
+    ]
 
 
-def deviation_of_leaping(done: Fitted, place: int, shape: int) -> float:
+def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
     """Return the standard deviation of a shape by the profile of the likelihood."""
-    candidate = done.named[place].candidate
-    others = fitted(replace(done.problem, replays=done.plain),
-                    done.named[:place] + done.named[place + 1:])
-    least = with_one_more(others, candidate).score - _FALL
+    candidate = fit.causes[cause_index].candidate
+    others = fit_causes(replace(fit.problem, replays=fit.original_replays),
+                        fit.causes[:cause_index] + fit.causes[cause_index + 1:])
+    least = add_cause(others, candidate).log_likelihood - _LIKELIHOOD_DROP_95
 
-    def falls(by: float) -> bool:
-        return with_one_more(others, with_shape(
-            candidate, shape, candidate.shapes[shape] + by)).score < least
+    def is_below_threshold(by: float) -> bool:
+        return add_cause(others, with_shape(
+            candidate, shape_index, candidate.shapes[shape_index] + by)).log_likelihood < least
 
-    first = (done.plain[0].step if candidate.cause == 'bias_step'
-             else 1e-3 * candidate.shapes[shape])
-    return max(_until(falls, first), _until(falls, -first)) / NORMAL_95
+    first = (fit.original_replays[0].point_interval if candidate.cause == 'bias_step'
+             else 1e-3 * candidate.shapes[shape_index])
+    return (max(_find_first_true(is_below_threshold, first),
+                _find_first_true(is_below_threshold, -first)) / NORMAL_QUANTILE_975)
 
 
-def _until(falls: Callable[[float], bool], first: float) -> float:
+def _find_first_true(predicate: Callable[[float], bool], first: float) -> float:
     """Return the distance at which a predicate is first true, to 1 %, by doubling and halving."""
     near, far = 0.0, first
-    while not falls(far) and abs(far) < 1e6 * abs(first):
+    while not predicate(far) and abs(far) < 1e6 * abs(first):
         near, far = far, 2.0 * far
     for _ in range(7):
         middle = 0.5 * (near + far)
-        near, far = (near, middle) if falls(middle) else (middle, far)
+        near, far = (near, middle) if predicate(middle) else (middle, far)
     return abs(far)
 
 
-def filtered(done: Fitted) -> tuple[Replay, ...]:
+def estimate_noise_levels(fit: RegressionFit) -> tuple[Replay, ...]:
     """
     Return the logs with the levels of filtered noise, averaged where hardly any noise is left.
 
@@ -349,62 +371,70 @@ def filtered(done: Fitted) -> tuple[Replay, ...]:
     is delayed or filtered would pass for noise.
 
     """
-    found = [fall(part) < 1.0 for part in done.whitened()]
-    while any(deep := [fall(part) < SMOOTHED and 2.0 * each.step <= _LONGEST
-                       for each, part in zip(done.plain, done.whitened())]):
-        done = _again(done, [replace(each, every=each.every * (1 + more))
-                             for each, more in zip(done.plain, deep)])
-    for number in range(_ROUNDS if any(found) else 0):
+    is_filtered = [high_frequency_power_ratio(part) < 1.0 for part in fit.whitened_transforms()]
+    while any(needs_averaging := [
+            high_frequency_power_ratio(part) < SMOOTHED_POWER_RATIO and 2.0
+            * each.point_interval <= _MAX_AVERAGING_TIME
+            for each, part in zip(fit.original_replays, fit.whitened_transforms())
+    ]):
+        fit = _refit(fit, [replace(each, decimation=each.decimation * (1 + more))
+                           for each, more in zip(fit.original_replays, needs_averaging)])
+    for number in range(_LEVEL_ITERATIONS if any(is_filtered) else 0):
         # First by the residual that is not whitened, or slow noise would compensate the filter.
-        of = zip(done.plain, done.whitened() if number else done.left(), found)
-        done = _again(done, [each.filtered(levels(part)) if falls else each
-                             for each, part, falls in of])
-    return done.plain
+        of = zip(fit.original_replays,
+                 fit.whitened_transforms() if number else fit.residual_transforms(), is_filtered)
+        fit = _refit(fit, [
+            each.with_scaled_noise_levels(relative_part_powers(part)) if falls else each
+            for each, part, falls in of
+        ])
+    return fit.original_replays
 
 
-def _again(done: Fitted, replays: Sequence[Replay]) -> Fitted:
+def _refit(fit: RegressionFit, replays: Sequence[Replay]) -> RegressionFit:
     """Fit the same causes to the logs with other points or levels."""
-    return fitted(regression_problem(replays), done.named)
+    return fit_causes(build_problem(replays), fit.causes)
 
 
-def with_one_more(before: Fitted, candidate: Candidate) -> Fitted:
+def add_cause(fit: RegressionFit, candidate: Candidate) -> RegressionFit:
     """Add a cause to a fit at its present shapes, and keep the other columns."""
-    if is_of_the_rate(candidate.cause):
-        return fitted(replace(before.problem, replays=before.plain),
-                      [*before.named, Named(candidate)])
-    own = columns_of(candidate, before.problem.replays) / before.problem.deviation
-    residual, columns = before.residual, before.columns
-    owner, place = before.owner, len(before.named)
+    if is_rate_distortion(candidate.cause):
+        return fit_causes(replace(fit.problem, replays=fit.original_replays),
+                          [*fit.causes, SelectedCause(candidate)])
+    own = candidate_transforms(candidate, fit.problem.replays) / fit.problem.deviation
+    residual, columns = fit.residual, fit.columns
+    owner, place = fit.column_owners, len(fit.causes)
     if candidate.amplitude is None:
         columns = np.concatenate([columns, own])
         owner = (*owner, *((place, number) for number in range(len(own))))
     else:
         residual = residual - candidate.amplitude * own[0]
-    widths = (*before.widths, len(own) if candidate.amplitude is None else 0)
-    return _summed(before.problem, before.plain, (*before.named, Named(candidate)), residual,
-                   columns, owner, widths)
+    widths = (*fit.column_counts, len(own) if candidate.amplitude is None else 0)
+    return _fit_columns(fit.problem, fit.original_replays, (*fit.causes, SelectedCause(candidate)),
+                        residual, columns, owner, widths)
 
 
-def with_columns(before: Fitted, columns: Array) -> Fitted:
+def add_nuisance_columns(fit: RegressionFit, columns: Array) -> RegressionFit:
     """Add whitened columns to a fit that belong to no cause."""
-    owner = (*before.owner, *[(-2, 0)] * len(columns))
-    return _summed(before.problem, before.plain, before.named, before.residual,
-                   np.concatenate([before.columns, columns]), owner, before.widths)
+    owner = (*fit.column_owners, *[(-2, 0)] * len(columns))
+    return _fit_columns(fit.problem, fit.original_replays, fit.causes, fit.residual,
+                        np.concatenate([fit.columns, columns]), owner, fit.column_counts)
 
 
-def _summed(whole: RegressionProblem, plain: tuple[Replay, ...], named: tuple[Named, ...],
-            residual: Array, columns: Array, owner: tuple[tuple[int, int], ...],
-            widths: tuple[int, ...]) -> Fitted:
+def _fit_columns(problem: RegressionProblem, original_replays: tuple[Replay, ...],
+                 causes: tuple[SelectedCause, ...], residual: Array, columns: Array,
+                 column_owners: tuple[tuple[int, int],
+                                      ...], column_counts: tuple[int, ...]) -> RegressionFit:
     """Return the fit of a whitened residual to independent columns under each noise."""
-    kept = _independent(columns)
+    kept = _independent_columns(columns)
     of, nothing = columns[kept], np.empty((0, len(residual)))
-    by = marginalized(of, nothing, (), whole.starts, whole.noises)
-    return Fitted(whole, plain, named, residual, of, tuple(owner[place] for place in kept), widths,
-                  by, noise_likelihood(residual[None], of, nothing, whole.starts, whole.noises,
-                                       by))
+    by = marginalize_nuisances(of, nothing, (), problem.band_starts, problem.noises)
+    return RegressionFit(
+        problem, original_replays, causes, residual, of,
+        tuple(column_owners[place] for place in kept), column_counts, by,
+        noise_likelihood(residual[None], of, nothing, problem.band_starts, problem.noises, by))
 
 
-def _independent(columns: Array) -> list[int]:
+def _independent_columns(columns: Array) -> list[int]:
     """Return the columns that are linearly independent of those before them."""
     product = columns @ columns.T
     length = np.sqrt(np.diag(product))
@@ -432,94 +462,99 @@ class FittedValues:
 
     Attributes
     ----------
-    fitted : the fit
+    fit : the fit
     replays : the logs
-    lasting : whether single events of the gyro are fitted, but excluded from the contributions, as
-        in a model for other logs
+    lasting_only : whether single events of the gyro are fitted, but excluded from the
+        contributions, as in a model for other logs
 
     """
 
-    fitted: Fitted
+    fit: RegressionFit
     replays: tuple[Replay, ...]
-    lasting: bool = False
+    lasting_only: bool = False
 
     @property
-    def named(self) -> tuple[Named, ...]:
+    def causes(self) -> tuple[SelectedCause, ...]:
         """Return the causes."""
-        return self.fitted.named
+        return self.fit.causes
 
-    def explaining(self, cause: int) -> bool:
+    def is_included(self, cause_index: int) -> bool:
         """Tell whether a cause, by its index, is included in the contributions."""
-        return not (self.lasting and happens_once(self.named[cause]))
+        return not (self.lasting_only and is_single_event(self.causes[cause_index]))
 
     @cached_property
     def _estimates(self) -> tuple[dict[tuple[int, int], int], Array, Array]:
-        values, covariance = self.fitted.estimates
-        return {owner: rank for rank, owner in enumerate(self.fitted.owner)}, values, covariance
+        values, covariance = self.fit.estimates
+        return ({
+            owner: rank for rank, owner in enumerate(self.fit.column_owners)
+        }, values, covariance)
 
     @cached_property
-    def _leaping(self) -> dict[tuple[int, int], float]:
+    def _profile_deviations(self) -> dict[tuple[int, int], float]:
         """Return standard deviations of discontinuous shapes, by cause and index."""
-        return {(place, -1 - shape): deviation_of_leaping(self.fitted, place, shape)
-                for place, known in enumerate(self.named)
-                for shape in leaping_shapes(known.candidate)}
+        return {(place, -1 - shape): profile_deviation(self.fit, place, shape)
+                for place, known in enumerate(self.causes)
+                for shape in discontinuous_shapes(known.candidate)}
 
-    def place(self, cause: int, number: int) -> int | None:
+    def estimate_index(self, cause_index: int, number: int) -> int | None:
         """Return the index of a value among the estimates: column from 0, or shape below 0."""
-        ranks = [*self.fitted.owner, *self._leaping]
-        return ranks.index((cause, number)) if (cause, number) in ranks else None
+        ranks = [*self.fit.column_owners, *self._profile_deviations]
+        return ranks.index((cause_index, number)) if (cause_index, number) in ranks else None
 
     @property
     def covariance(self) -> Array:
         """Return the covariance of all estimates."""
         return np.asarray(block_diag(self._estimates[2],
-                                     np.diag(np.square(list(self._leaping.values())))))
+                                     np.diag(np.square(list(self._profile_deviations.values())))))
 
-    def _value(self, cause: int, number: int, known: float | None = None) -> Value:
+    def _estimated_value(self, cause_index: int, number: int, known: float | None = None) -> Value:
         ranks, values, covariance = self._estimates
-        place = ranks.get((cause, number))
+        place = ranks.get((cause_index, number))
         if place is None:
             return (Value(0.0, 0.0) if known is None
-                    else Value(known, self._leaping.get((cause, number), 0.0)))
+                    else Value(known, self._profile_deviations.get((cause_index, number), 0.0)))
         return Value(float(values[place]) if known is None else known,
                      float(np.sqrt(max(covariance[place, place], 0.0))))
 
     @property
     def scale_factor_error(self) -> Value:
         """Return the scale factor error relative to the simulation, 1."""
-        return self._value(-1, 0)
+        return self._estimated_value(-1, 0)
 
-    def coefficients(self, cause: int) -> list[Value]:
+    def coefficients(self, cause_index: int) -> list[Value]:
         """Return the values of the columns of a cause."""
-        candidate = self.named[cause].candidate
+        candidate = self.causes[cause_index].candidate
         if candidate.amplitude is not None:
             return []
-        return [self._value(cause, number) for number in range(len(self.named[cause].values))]
+        return [
+            self._estimated_value(cause_index, number)
+            for number in range(len(self.causes[cause_index].values))
+        ]
 
-    def shapes(self, cause: int) -> dict[int, Value]:
+    def shapes(self, cause_index: int) -> dict[int, Value]:
         """Return the fitted shapes of a cause, by their places."""
-        candidate = self.named[cause].candidate
-        return {place: self._value(cause, -1 - place, candidate.shapes[place])
-                for place in fitted_shapes(candidate)}
+        candidate = self.causes[cause_index].candidate
+        return {place: self._estimated_value(cause_index, -1 - place, candidate.shapes[place])
+                for place in fitted_shape_indices(candidate)}
 
     @cached_property
-    def explained(self) -> list[Array]:
+    def explained_outputs(self) -> list[Array]:
         """Return the contributions of causes and scale to each output, rad/s, shape (n,)."""
-        return [self.explains(each, run) for run, each in enumerate(self.replays)]
+        return [self.total_contribution(each, run) for run, each in enumerate(self.replays)]
 
-    def parts(self, each: Replay, run: int) -> dict[str, Array]:
+    def output_contributions(self, replay: Replay, log_index: int) -> dict[str, Array]:
         """Return the contributions of scale and causes to the output of a log, rad/s, (n,)."""
         found: dict[str, Array | float] = {}
-        new = each
-        for known in self.named:
-            if is_of_the_rate(known.candidate.cause):
-                before, new = new, seen(new, [known])
+        new = replay
+        for known in self.causes:
+            if is_rate_distortion(known.candidate.cause):
+                before, new = new, with_distorted_rate(new, [known])
                 found[known.candidate.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
-        for place, known in enumerate(self.named):
+        for place, known in enumerate(self.causes):
             candidate = known.candidate
-            if (is_of_the_rate(candidate.cause) or candidate.run not in (None, run)
-                    or not self.explaining(place)):
+            if (is_rate_distortion(candidate.cause) or candidate.log_index not in (None, log_index)
+                    or not self.is_included(place)):
                 continue
             values = ([candidate.amplitude] if candidate.amplitude is not None
                       else [one.value for one in self.coefficients(place)])
@@ -527,59 +562,65 @@ class FittedValues:
                 found[candidate.cause] = found.get(candidate.cause, 0.0) + value * column
         return {name: np.asarray(part) for name, part in found.items()}
 
-    def explains(self, each: Replay, run: int) -> Array:
+    def total_contribution(self, replay: Replay, log_index: int) -> Array:
         """Return the sum of the contributions of scale and causes to the output of a log."""
-        return np.asarray(sum(self.parts(each, run).values()))
+        return np.asarray(sum(self.output_contributions(replay, log_index).values()))
 
-    def heading_changes(self, run: int,
-                        plain: FittedValues | None) -> tuple[dict[str, Array], Array]:
+    def heading_contributions(self, log_index: int,
+                              plain_fit: FittedValues | None) -> tuple[dict[str, Array], Array]:
         """
         Return the contributions to the change of heading of a log, rad, and its times, s.
 
         Parameters
         ----------
-        run : number of the log
-        plain : bias and scale factor of the simulation, if they were fitted; else None
+        log_index : number of the log
+        plain_fit : bias and scale factor of the simulation, if they were fitted; else None
 
         """
-        each = self.replays[run]
-        parts = {**self.parts(each, run), 'bias': np.full(len(each.kept), self.biases[run]),
-                 'left': self.residuals[run] - self.biases[run]}
-        if plain is not None:
-            parts['scale_factor_error'] -= plain.explains(each, run)
-            parts['bias'] -= plain.biases[run]
-        return ({name: each.on_grid(part) * each.step for name, part in parts.items()},
-                np.arange(each.points + 1) * each.step)
+        each = self.replays[log_index]
+        parts = {
+            **self.output_contributions(each, log_index), 'bias': np.full(
+                len(each.valid), self.biases[log_index]),
+            'left': self.residuals[log_index] - self.biases[log_index]
+        }
+        if plain_fit is not None:
+            parts['scale_factor_error'] -= plain_fit.total_contribution(each, log_index)
+            parts['bias'] -= plain_fit.biases[log_index]
+        return ({name: each.resample(part) * each.point_interval for name, part in parts.items()},
+                np.arange(each.point_count + 1) * each.point_interval)
 
     @cached_property
     def residuals(self) -> list[Array]:
         """Return the residual of each log, with its bias, rad/s, shape (n,)."""
         return [each.channels.output - each.reference - added
-                for each, added in zip(self.replays, self.explained)]
+                for each, added in zip(self.replays, self.explained_outputs)]
 
     @cached_property
     def biases(self) -> list[float]:
         """Return the bias of each log less the simulation's, rad/s."""
-        return [float(left[each.kept].mean()) for each, left in zip(self.replays, self.residuals)]
+        return [float(left[each.valid].mean()) for each, left in zip(self.replays, self.residuals)]
 
     @cached_property
     def bias_variance(self) -> float:
         """Return the variance of the mean bias by the uncertainty of other values, (rad/s)²."""
-        means = np.array([self._mean_change(place, number) for place, number in self.fitted.owner])
+        means = np.array(
+            [self._bias_sensitivity(place, number) for place, number in self.fit.column_owners])
         return float(means @ self._estimates[2] @ means)
 
-    def _mean_change(self, cause: int, number: int) -> float:
+    def _bias_sensitivity(self, cause_index: int, number: int) -> float:
         """Return the derivative of the mean bias to a value, with the sign reversed."""
-        if cause < 0:
-            parts = [seen(each, self.named).channels.rate for each in self.replays]
-        elif number >= 0 and self.explaining(cause):
-            parts = [self.named[cause].candidate.columns(seen(each, self.named))[number]
-                     for each in self.replays]
+        if cause_index < 0:
+            parts = [with_distorted_rate(each, self.causes).channels.rate for each in self.replays]
+        elif number >= 0 and self.is_included(cause_index):
+            parts = [
+                self.causes[cause_index].candidate.columns(with_distorted_rate(
+                    each, self.causes))[number] for each in self.replays
+            ]
         else:
             return 0.0
-        return float(np.mean([part[each.kept].mean() for part, each in zip(parts, self.replays)]))
+        return float(np.mean([part[each.valid].mean() for part, each in zip(parts, self.replays)]))
 
 
-def happens_once(known: Named) -> bool:
+def is_single_event(cause: SelectedCause) -> bool:
     """Tell whether a cause is an effect of the gyro in one log alone: a step or a tone."""
-    return known.candidate.run is not None and known.candidate.cause in CATALOGUE
+    return cause.candidate.log_index is not None and cause.candidate.cause in CATALOGUE

@@ -22,23 +22,28 @@ from dataclasses import dataclass, replace
 
 from gyro_calibration.allan import allan_deviation
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
-from gyro_calibration.diagnosis.regression import Fitted, FittedValues
-from gyro_calibration.diagnosis.replay import angles, differentiated, Replay, transform
+from gyro_calibration.diagnosis.regression import FittedValues, RegressionFit
+from gyro_calibration.diagnosis.replay import (
+    coefficient_angles,
+    cosine_transform,
+    Replay,
+    spline_derivative_gain,
+)
 from gyro_calibration.logs.log import Array, Mask
-from gyro_calibration.logs.quality import white_noise
+from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
+NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 #: Probability that a frequency band of noise alone is rejected, per log.
-_BY_CHANCE = 1e-3
+_BAND_REJECTION_CHANCE = 1e-3
 #: Bins of a curve, and points of a line over time.
-BINS, POINTS = 40, 600
+CURVE_BINS, CURVE_POINTS = 40, 600
 #: Samples of which the Allan deviation is taken.
-_ALLAN_SAMPLES = 1 << 18
+_MAX_ALLAN_SAMPLES = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -49,37 +54,37 @@ class NoiseParameters:
     Attributes
     ----------
     noise : the figures
-    interval : of 95 % of each, by name
-    chance : p-value of the model's figure, by name
+    intervals : of 95 % of each, by name
+    p_values : p-value of the model's figure, by name
 
     """
 
     noise: Noise
-    interval: dict[str, tuple[float, float]]
-    chance: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+    p_values: dict[str, float]
 
 
 @dataclass(frozen=True)
-class _Bands:
+class _BandEnergies:
     """
     The coefficients of b bands.
 
     Attributes
     ----------
     energy, count : of each band
-    parts : variance of the bands by a figure of 1, shape (b, 3) or (b, 4)
-    known : variance by other noise, shape (b,)
+    unit_variances : variance of the bands by a figure of 1, shape (b, 3) or (b, 4)
+    known_variance : variance by other noise, shape (b,)
 
     """
 
     energy: Array
     count: Array
-    parts: Array
-    known: Array
+    unit_variances: Array
+    known_variance: Array
 
     def variance(self, logarithms: Array) -> Array:
         """Return the variance by squared figures, given by their logarithms."""
-        return np.asarray(self.known + self.parts @ np.exp(logarithms))
+        return np.asarray(self.known_variance + self.unit_variances @ np.exp(logarithms))
 
     def cost(self, logarithms: Array) -> float:
         """Return twice the negative log likelihood of the logarithms of squared figures."""
@@ -87,7 +92,8 @@ class _Bands:
         return float((self.count * np.log(variance) + self.energy / variance).sum())
 
 
-def noise_parameters(done: Fitted, expected: Noise, rounds: bool = False) -> NoiseParameters:
+def fit_noise_parameters(fit: RegressionFit, expected: Noise,
+                         is_rounding_modelled: bool = False) -> NoiseParameters:
     """
     Fit noise figures to the residual, and compare them with those of a model.
 
@@ -96,109 +102,116 @@ def noise_parameters(done: Fitted, expected: Noise, rounds: bool = False) -> Noi
 
     Parameters
     ----------
-    done : the fit
+    fit : the fit
     expected : the noise of the model; not compared if its angle random walk is 0
-    rounds : whether the model has quantization, so that its angle random walk is without the
-        rounding noise; otherwise it may include it
+    is_rounding_modelled : whether the model has quantization, so that its angle random walk is
+        without the rounding noise; otherwise it may include it
 
     """
-    bands = _without_tones(_bands(done))
-    without = _compared(bands, expected)
-    if rounds or not bands.known.any():
+    bands = _drop_tone_bands(_band_energies(fit))
+    without = _fit_and_test(bands, expected)
+    if is_rounding_modelled or not bands.known_variance.any():
         return without
-    whole = _compared(replace(bands, known=np.zeros_like(bands.known)), expected)
-    return replace(whole, chance={name: max(chance, without.chance[name])
-                                  for name, chance in whole.chance.items()})
+    whole = _fit_and_test(replace(bands, known_variance=np.zeros_like(bands.known_variance)),
+                          expected)
+    return replace(whole, p_values={name: max(chance, without.p_values[name])
+                                    for name, chance in whole.p_values.items()})
 
 
-def _compared(bands: _Bands, expected: Noise) -> NoiseParameters:
-    best, least = _fit(bands, {})
-    figures = {name: float(np.exp(0.5 * best[place])) for place, name in enumerate(NAMES)}
-    floor = _floors(bands, best)
-    noise = Noise(**{name: figures[name] if best[place] > floor[place] else 0.0
-                     for place, name in enumerate(NAMES)})
+def _fit_and_test(bands: _BandEnergies, expected: Noise) -> NoiseParameters:
+    best, least = _fit_noise(bands, {})
+    parameters = {name: float(np.exp(0.5 * best[place])) for place, name in enumerate(NOISE_NAMES)}
+    floors = _significance_floors(bands, best)
+    noise = Noise(**{name: parameters[name] if best[place] > floors[place] else 0.0
+                     for place, name in enumerate(NOISE_NAMES)})
     chance, intervals = {}, {}
-    for place, name in enumerate(NAMES):
-        intervals[name] = _interval(bands, place, best, least)
+    for place, name in enumerate(NOISE_NAMES):
+        intervals[name] = _likelihood_interval(bands, place, best, least)
         if expected.angle_random_walk:
-            _, cost = _fit(
+            _, cost = _fit_noise(
                 bands, {place: 2.0 * float(np.log(max(getattr(expected, name), 1e-12)))}, best)
             chance[name] = float(chi2.sf(max(cost - least, 0.0), 1))
     return NoiseParameters(noise, intervals, chance)
 
 
-def _bands(done: Fitted) -> _Bands:
-    problem, (angle, step) = done.problem, done.problem.angles()
-    left = np.concatenate(done.left()) * problem.deviation
+def _band_energies(fit: RegressionFit) -> _BandEnergies:
+    problem, (angle, step) = fit.problem, fit.problem.coefficient_angles()
+    left = np.concatenate(fit.residual_transforms()) * problem.deviation
     # The noise parameters before a filter are those of frequencies below its cut-off.
-    used = np.concatenate([angles(each.points) < 1.5 * np.pi / len(each.levels)
-                           for each in problem.replays])
-    coarse = np.concatenate([np.full(each.points - 1, each.coarse / each.every)
-                             for each in problem.replays])
+    used = np.concatenate([
+        coefficient_angles(each.point_count) < 1.5 * np.pi / len(each.noise_levels)
+        for each in problem.replays
+    ])
+    coarse = np.concatenate([
+        np.full(each.point_count - 1, each.rounding_variance / each.decimation)
+        for each in problem.replays
+    ])
     frequency = angle / (2.0 * np.pi * step)
     wave = 2.0 - 2.0 * np.cos(angle)
     parts = [1.0 / step, 1.0 / (2.0 * np.pi * frequency * step), step / wave]
-    if problem.first.reference:
-        parts.append(differentiated(angle) / step)
-    energy, count, *totals = (np.add.reduceat(part * used, problem.starts)
+    if problem.reference_noise.rounding_ratio:
+        parts.append(spline_derivative_gain(angle) / step)
+    energy, count, *totals = (np.add.reduceat(part * used, problem.band_starts)
                               for part in (left ** 2, np.ones(len(left)), coarse, *parts))
     kept = count > 0.0
     known, *means = (total[kept] / count[kept] for total in totals)
-    return _Bands(energy[kept], count[kept], np.column_stack(means), known)
+    return _BandEnergies(energy[kept], count[kept], np.column_stack(means), known)
 
 
-def _without_tones(bands: _Bands) -> _Bands:
+def _drop_tone_bands(bands: _BandEnergies) -> _BandEnergies:
     """Remove bands with more energy than the noise of the others, the most unlikely first."""
     kept: Mask = np.ones(len(bands.energy), dtype=bool)
     while kept.sum() > len(kept) / 2:
-        inside = _Bands(bands.energy[kept], bands.count[kept], bands.parts[kept],
-                        bands.known[kept])
+        kept_bands = _BandEnergies(bands.energy[kept], bands.count[kept],
+                                   bands.unit_variances[kept], bands.known_variance[kept])
         chances = np.where(kept, chi2.sf(
-            bands.energy / bands.variance(_fit(inside, {})[0]), bands.count), 1.0)
+            bands.energy / bands.variance(_fit_noise(kept_bands, {})[0]), bands.count), 1.0)
         weakest = int(chances.argmin())
-        if chances[weakest] > _BY_CHANCE / len(kept):
-            return inside
+        if chances[weakest] > _BAND_REJECTION_CHANCE / len(kept):
+            return kept_bands
         kept[weakest] = False
     return bands
 
 
-def _fit(bands: _Bands, held: dict[int, float], start: Array | None = None) -> tuple[Array, float]:
+def _fit_noise(bands: _BandEnergies, fixed: dict[int, float],
+               start: Array | None = None) -> tuple[Array, float]:
     """Return the most likely logarithms of squared figures, some of them fixed, and the cost."""
-    size = bands.parts.shape[1]
-    free = [place for place in range(size) if place not in held]
+    size = bands.unit_variances.shape[1]
+    free = [place for place in range(size) if place not in fixed]
     usual = bands.energy / bands.count
     begin = start if start is not None else np.log(np.array([
-        (usual / bands.parts[:, place]).min() for place in range(size)]))
-    whole = np.array([held.get(place, begin[place]) for place in range(size)])
+        (usual / bands.unit_variances[:, place]).min() for place in range(size)]))
+    logarithms = np.array([fixed.get(place, begin[place]) for place in range(size)])
 
     def cost(some: Array) -> float:
-        whole[free] = some
-        return bands.cost(whole)
+        logarithms[free] = some
+        return bands.cost(logarithms)
 
     found = [minimize(cost, begin[free] + shift, method='L-BFGS-B',
                       bounds=[(-60.0, 20.0)] * len(free))
              for shift in (0.0, *(-3.0 * (np.arange(len(free)) == place)
                                   for place in range(1, len(free))))]
     best = min(found, key=lambda one: one.fun)
-    whole[free] = best.x
-    return whole.copy(), float(best.fun)
+    logarithms[free] = best.x
+    return logarithms.copy(), float(best.fun)
 
 
-def _floors(bands: _Bands, best: Array) -> Array:
+def _significance_floors(bands: _BandEnergies, best: Array) -> Array:
     """Return the logarithms below which a figure is less than 1 % of the noise everywhere."""
     variance = bands.variance(best)
-    return np.array([np.log(0.01 * (variance / bands.parts[:, place]).min())
+    return np.array([np.log(0.01 * (variance / bands.unit_variances[:, place]).min())
                      for place in range(len(best))])
 
 
-def _interval(bands: _Bands, place: int, best: Array, least: float) -> tuple[float, float]:
+def _likelihood_interval(bands: _BandEnergies, place: int, best: Array,
+                         min_cost: float) -> tuple[float, float]:
     """Return the 95 % interval of a figure by the profile of the cost."""
-    limit = least + float(chi2.ppf(0.95, 1))
+    limit = min_cost + float(chi2.ppf(0.95, 1))
     ends = []
     for direction in (-1.0, 1.0):
         inside, step = 0.0, 0.02
         while (step < 12.0
-               and _fit(bands, {place: best[place] + direction * step}, best)[1] < limit):
+               and _fit_noise(bands, {place: best[place] + direction * step}, best)[1] < limit):
             inside, step = step, step * 1.6
         ends.append(best[place] + direction * 0.5 * (inside + step) if step < 12.0
                     else -np.inf if direction < 0 else best[place] + 12.0)
@@ -207,17 +220,17 @@ def _interval(bands: _Bands, place: int, best: Array, least: float) -> tuple[flo
 
 # curves
 
-def what_is_left(found: FittedValues) -> list[Array]:
+def unbiased_residuals(fit: FittedValues) -> list[Array]:
     """Return the residual of each log without its bias, rad/s, shape (n,)."""
-    return [residual - bias for residual, bias in zip(found.residuals, found.biases)]
+    return [residual - bias for residual, bias in zip(fit.residuals, fit.biases)]
 
 
-def residuals_of_model(replays: Sequence[Replay]) -> list[Array]:
+def model_residuals(replays: Sequence[Replay]) -> list[Array]:
     """Return the residual of the given model for each log, rad/s, shape (n,)."""
     return [each.channels.output - each.reference for each in replays]
 
 
-def curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
+def residual_curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
     """
     Return the mean residual in bins of each variable that changes in the logs.
 
@@ -228,18 +241,19 @@ def curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
 
     """
     replays = after.replays
-    simulated = [each.added + error - rest
-                 for each, error, rest in zip(replays, residuals_of_model(replays), before)]
-    values = [np.concatenate([part[each.kept] for part, each in zip(parts, replays)])
-              for parts in (before, what_is_left(after), simulated)]
-    found = [_curve(name, unit, [of(each)[each.kept] for each in replays], values, after)
-             for name, unit, of in _variables(replays)]
-    return [each for each in found if len(each.at) > 1] + [_spectrum(before, after)]
+    simulated = [each.simulated_error + error - rest
+                 for each, error, rest in zip(replays, model_residuals(replays), before)]
+    values = [np.concatenate([part[each.valid] for part, each in zip(parts, replays)])
+              for parts in (before, unbiased_residuals(after), simulated)]
+    found = [_binned_curve(name, unit, [of(each)[each.valid] for each in replays], values, after)
+             for name, unit, of in _curve_variables(replays)]
+    return [each for each in found if len(each.at) > 1] + [_amplitude_spectrum(before, after)]
 
 
-def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[Replay], Array]]]:
+def _curve_variables(
+        replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[Replay], Array]]]:
     """Give name, unit, and a function that returns the variable of a log."""
-    has = frozenset.intersection(*(each.has for each in replays))
+    has = frozenset.intersection(*(each.available_channels for each in replays))
     yield 'time', 's', lambda each: each.channels.time - each.channels.time[0]
     if any(np.ptp(each.channels.rate) > 0.0 for each in replays):
         yield 'rate', 'rad/s', lambda each: each.channels.rate
@@ -257,25 +271,25 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
         yield 'supply', 'V', lambda each: np.asarray(each.channels.supply)
 
 
-def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
-           after: FittedValues) -> Curve:
+def _binned_curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
+                  after: FittedValues) -> Curve:
     """Return means in even bins between the 0.1 % and 99.9 % quantiles, of 10 or more samples."""
     at = np.concatenate(parts)
     low, high = np.quantile(at, [0.001, 0.999])
     if not high > low:
         return Curve(name, unit, *(np.empty(0) for _ in range(5)))
-    bins = [np.clip(((part - low) / (high - low) * BINS).astype(int), 0, BINS - 1)
+    bins = [np.clip(((part - low) / (high - low) * CURVE_BINS).astype(int), 0, CURVE_BINS - 1)
             for part in parts]
     place = np.concatenate(bins)
-    count = np.bincount(place, minlength=BINS)
+    count = np.bincount(place, minlength=CURVE_BINS)
     enough = count > 9
-    middle, left, mended, simulated = (np.bincount(place, each, BINS)[enough] / count[enough]
+    middle, left, mended, simulated = (np.bincount(place, each, CURVE_BINS)[enough] / count[enough]
                                        for each in (at, *values))
     return Curve(name, unit, middle, left, mended,
-                 np.sqrt(_variances(after, bins)[enough]) / count[enough], simulated)
+                 np.sqrt(_bin_variances(after, bins)[enough]) / count[enough], simulated)
 
 
-def _variances(after: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
+def _bin_variances(fit: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
     """
     Return the variance by noise of the sum of the residual in each bin, (rad/s)², shape (BINS,).
 
@@ -283,37 +297,39 @@ def _variances(after: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
     among the samples of one grid point is white.
 
     """
-    total = np.zeros(BINS)
-    for each, residual, variance, place in zip(after.replays, after.residuals,
-                                               _spectra(after.fitted), bins):
-        point = np.minimum(each.place // each.every, each.points - 1)
-        held = np.bincount(place * each.points + point, minlength=BINS * each.points).reshape(
-            BINS, each.points).astype(float)
-        within = np.maximum(held.sum(axis=1) - (held ** 2).sum(axis=1) / each.every, 0.0)
-        total += (transform(held) ** 2 @ variance
-                  + white_noise(residual[each.kept]) ** 2 * within)
+    total = np.zeros(CURVE_BINS)
+    for each, residual, variance, place in zip(fit.replays, fit.residuals,
+                                               _coefficient_variances(fit.fit), bins):
+        point = np.minimum(each.grid_index // each.decimation, each.point_count - 1)
+        counts = np.bincount(place * each.point_count + point,
+                             minlength=CURVE_BINS * each.point_count).reshape(
+                                 CURVE_BINS, each.point_count).astype(float)
+        unresolved = np.maximum(
+            counts.sum(axis=1) - (counts ** 2).sum(axis=1) / each.decimation, 0.0)
+        total += (cosine_transform(counts) ** 2 @ variance
+                  + white_noise_deviation(residual[each.valid]) ** 2 * unresolved)
     return total
 
 
-def _spectra(done: Fitted) -> list[Array]:
+def _coefficient_variances(fit: RegressionFit) -> list[Array]:
     """Return each log's variances of coefficients, averaged over noises, shape (points - 1,)."""
-    whole, by_noise = done.problem, done.by_noise
-    relative = (by_noise.probability[0] * by_noise.squares[0] / done.marginalized.freedom) @ (
-        1.0 / whole.noises.weights)
-    count = np.diff(np.append(whole.starts, len(whole.deviation)))
-    variance = whole.deviation ** 2 * np.repeat(relative, count)
-    return np.split(variance, np.cumsum([each.points - 1 for each in whole.replays])[:-1])
+    problem, by_noise = fit.problem, fit.noise_likelihood
+    relative = (by_noise.probability[0] * by_noise.residual_squares[0]
+                / fit.marginalized.degrees_of_freedom) @ (1.0 / problem.noises.weights)
+    count = np.diff(np.append(problem.band_starts, len(problem.deviation)))
+    variance = problem.deviation ** 2 * np.repeat(relative, count)
+    return np.split(variance, np.cumsum([each.point_count - 1 for each in problem.replays])[:-1])
 
 
-def _spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
+def _amplitude_spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
     """Return the largest amplitude of the first log's residual in bins of frequency."""
     each = after.replays[0]
-    series = [each.on_grid(left[0]) for left in (before, what_is_left(after))]
+    series = [each.resample(left[0]) for left in (before, unbiased_residuals(after))]
     amplitude = [np.sqrt(2.0) * np.abs(np.fft.rfft(values))[1:] * np.sqrt(2.0) / len(values)
                  for values in series]
-    frequency = np.fft.rfftfreq(len(series[0]), each.step)[1:]
+    frequency = np.fft.rfftfreq(len(series[0]), each.point_interval)[1:]
     edges = np.unique(np.searchsorted(
-        frequency, np.geomspace(frequency[0], frequency[-1], BINS + 1)))[:-1]
+        frequency, np.geomspace(frequency[0], frequency[-1], CURVE_BINS + 1)))[:-1]
     largest = [np.maximum.reduceat(values, edges) for values in amplitude]
     middle = np.sqrt(frequency[edges] * frequency[np.append(edges[1:], len(frequency)) - 1])
     usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges)
@@ -321,20 +337,21 @@ def _spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
 
 
-def heading_curve(before: Sequence[Array], after: FittedValues) -> HeadingCurve:
+def heading_error_curve(before: Sequence[Array], after: FittedValues) -> HeadingCurve:
     """Return the heading error over the first log, by its residual before and after extension."""
     each = after.replays[0]
-    lines = [np.cumsum(each.on_grid(left[0])) * each.step
-             for left in (before, what_is_left(after))]
-    some = np.unique(np.linspace(0, each.points - 1, POINTS).astype(int))
-    return HeadingCurve(some * each.step, lines[0][some], lines[1][some])
+    lines = [np.cumsum(each.resample(left[0])) * each.point_interval
+             for left in (before, unbiased_residuals(after))]
+    some = np.unique(np.linspace(0, each.point_count - 1, CURVE_POINTS).astype(int))
+    return HeadingCurve(some * each.point_interval, lines[0][some], lines[1][some])
 
 
-def noise_curve(after: FittedValues, fitted: Noise, expected: Noise) -> NoiseCurve:
+def allan_curves(fit: FittedValues, fitted: Noise, expected: Noise) -> NoiseCurve:
     """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
-    each = after.replays[0]
-    chart = allan_deviation(each.on_grid(after.residuals[0])[:_ALLAN_SAMPLES], each.step)
-    times = chart.time
-    return NoiseCurve(times, chart.deviation, np.sqrt(fitted.allan_variance(times)),
+    each = fit.replays[0]
+    allan = allan_deviation(
+        each.resample(fit.residuals[0])[:_MAX_ALLAN_SAMPLES], each.point_interval)
+    times = allan.time
+    return NoiseCurve(times, allan.deviation, np.sqrt(fitted.allan_variance(times)),
                       np.sqrt(expected.allan_variance(times))
                       if expected.angle_random_walk else None)

@@ -27,40 +27,40 @@ import math
 from typing import Any, TypeAlias
 
 from gyro_calibration.diagnosis.candidates import (
-    by_cause,
     Candidate,
-    candidates,
-    columns_of,
-    effect,
-    FASTEST_LAG,
-    fitted_shapes,
+    candidate_transforms,
+    effect_candidate,
+    fitted_shape_indices,
+    gaussian_pulse,
     generic_terms,
+    indices_by_cause,
     is_named,
-    pulse,
-    spacing_of_steps,
+    MIN_THERMAL_LAG,
+    propose_candidates,
+    step_time_spacing,
     with_shape,
 )
-from gyro_calibration.diagnosis.findings import RULED_OUT, SUSPECTED
+from gyro_calibration.diagnosis.findings import RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR
 from gyro_calibration.diagnosis.noise_likelihood import (
-    drawn,
-    evidence,
-    log_sum,
-    marginalized,
+    column_evidence,
+    draw_residuals,
+    Indices,
+    log_sum_exp,
+    marginalize_nuisances,
     noise_likelihood,
-    Places,
 )
 from gyro_calibration.diagnosis.regression import (
-    Fitted,
-    fitted,
-    is_of_the_rate,
-    Named,
-    regression_problem,
+    add_cause,
+    add_nuisance_columns,
+    build_problem,
+    fit_causes,
+    is_rate_distortion,
+    RegressionFit,
     RegressionProblem,
-    seen,
-    with_columns,
-    with_one_more,
+    SelectedCause,
+    with_distorted_rate,
 )
-from gyro_calibration.diagnosis.replay import inverse, Replay, transform
+from gyro_calibration.diagnosis.replay import cosine_transform, inverse_cosine_transform, Replay
 from gyro_calibration.diagnosis.steps import OnPart
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
@@ -68,69 +68,72 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
 #: Residuals of noise alone that are drawn for the distribution of the evidence.
-DRAWS = 400
+NOISE_DRAWS = 400
 #: Most likely noises from which these residuals are drawn, at most.
-MOST_NOISES = 60
+MAX_DRAWN_NOISES = 60
 #: Least penalty of a fitted shape, in log-likelihood.
-PRICE_OF_SHAPE = 2.0
+SHAPE_PENALTY = 2.0
 #: Causes without a grid of first shapes: all frequencies or times are scanned.
-SCANNED = frozenset({'interference_tone', 'reference_slip'})
+SCANNED_CAUSES = frozenset({'interference_tone', 'reference_slip'})
 #: Largest number of a kind in one log: all slips form one cause, and more tones indicate a
 #: disturbance that is not periodic.
-MOST_OF = {'interference_tone': 3, 'reference_slip': 1}
+MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
 #: Least number of periods of a tone in a log; slower variations are bias wander.
-LEAST_PERIODS = 20
+MIN_TONE_PERIODS = 20
 #: Durations of a slip of the reference that are tried, s.
-WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
+SLIP_DURATIONS = (0.0, 0.05, 0.1, 0.2, 0.4)
 #: Largest number of slips in a log.
-MOST_SLIPS = 20
+MAX_SLIPS = 20
 #: Largest deficit in log-likelihood, relative to the best noise, of the noises that are kept.
-UNLIKELY = 12.0
+MAX_LIKELIHOOD_DEFICIT = 12.0
 #: Evidence above which an effect distorts the likelihood of the noises, so that all are kept.
-STRONG = 60.0
+STRONG_EVIDENCE = 60.0
 #: Penalty of each column beyond the first, in log-likelihood.
-PRICE_OF_COLUMN = 1.2
+COLUMN_PENALTY = 1.2
 #: Additional penalty of a structure without a name, in log-likelihood.
-MARGIN = 4.0
+UNNAMED_PENALTY = 4.0
 #: Largest number of candidates that are refined in each step.
-MOST_CONFOUNDERS = 9
+MAX_CONFOUNDERS = 9
 #: Largest number of named causes.
-MOST_CAUSES = 6
+MAX_CAUSES = 6
 #: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
 #: standard deviations (one-sided 5 %). The gain of one stretch is limited to a likelihood ratio of
 #: 20, so that no single stretch establishes a cause. Number of stretches of all logs together.
-SURELY, BOUND, STRETCHES = 1.65, 3.0, 64
+MIN_PREDICTION_SIGMAS, MAX_STRETCH_GAIN, STRETCH_COUNT = 1.65, 3.0, 64
 
 
 @dataclass(frozen=True)
-class Chance:
+class NullDistribution:
     """
     Distribution of the evidence of causes in noise alone: an exponential tail.
 
-    The evidence exceeds `start` with the probability `share`, and falls by e every `scale`.
+    The evidence exceeds `tail_start` with the probability `tail_probability`, and falls by e every
+    `tail_scale`.
 
     """
 
-    start: Mapping[str, float]
-    scale: Mapping[str, float]
-    share: float
+    tail_start: Mapping[str, float]
+    tail_scale: Mapping[str, float]
+    tail_probability: float
 
     def threshold(self, cause: str, rate: float) -> float:
         """Return the evidence that noise alone exceeds with a given probability."""
-        if cause not in self.start:  # scanned: its evidence contains the number of places already
+        # scanned: its evidence contains the number of places already
+        if cause not in self.tail_start:
             return -float(np.log(rate))
-        return self.start[cause] + self.scale[cause] * float(np.log(self.share / rate))
+        return (self.tail_start[cause]
+                + self.tail_scale[cause] * float(np.log(self.tail_probability / rate)))
 
-    def p_value(self, cause: str, found: float) -> float:
+    def p_value(self, cause: str, evidence: float) -> float:
         """Return the probability that noise alone reaches an evidence."""
-        if cause not in self.start:
-            return float(np.exp(-max(found, 0.0)))
-        return min(1.0, self.share * float(np.exp(
-            min(-(found - self.start[cause]) / self.scale[cause], 700.0))))
+        if cause not in self.tail_start:
+            return float(np.exp(-max(evidence, 0.0)))
+        return min(1.0, self.tail_probability * float(np.exp(
+            min(-(evidence - self.tail_start[cause]) / self.tail_scale[cause], 700.0))))
 
 
 @dataclass(frozen=True)
-class Bank:
+class CandidateColumns:
     """
     All candidates with their columns, for the rate that the gyro senses.
 
@@ -147,25 +150,25 @@ class Bank:
     columns: Array
 
 
-def averaged(found: Array) -> Array:
+def log_mean_exp(logarithms: Array) -> Array:
     """Return the logarithm of the mean of likelihoods along the last axis."""
-    return log_sum(found) - np.log(found.shape[-1])
+    return log_sum_exp(logarithms) - np.log(logarithms.shape[-1])
 
 
-def bank(whole: RegressionProblem, found: Sequence[Candidate],
-         named: Sequence[Named] = ()) -> Bank:
+def make_candidate_columns(problem: RegressionProblem, candidates: Sequence[Candidate],
+                           causes: Sequence[SelectedCause] = ()) -> CandidateColumns:
     """Compute the whitened columns of candidates."""
-    if not found:
-        return Bank((), (), np.empty((0, len(whole.deviation))))
-    replays = [seen(each, named) for each in whole.replays]
-    parts = [columns_of(each, replays) / whole.deviation for each in found]
+    if not candidates:
+        return CandidateColumns((), (), np.empty((0, len(problem.deviation))))
+    replays = [with_distorted_rate(each, causes) for each in problem.replays]
+    parts = [candidate_transforms(each, replays) / problem.deviation for each in candidates]
     ends = np.cumsum([len(part) for part in parts])
     groups = tuple(tuple(range(end - len(part), end)) for end, part in zip(ends, parts))
-    return Bank(tuple(found), groups, np.concatenate(parts))
+    return CandidateColumns(tuple(candidates), groups, np.concatenate(parts))
 
 
 #: Causes with their shapes.
-Key: TypeAlias = 'tuple[tuple[Any, ...], ...]'
+CausesKey: TypeAlias = 'tuple[tuple[Any, ...], ...]'
 
 
 @dataclass(frozen=True)
@@ -176,348 +179,379 @@ class Search:
     Attributes
     ----------
     problem : the logs
-    bank : columns of all candidates without causes that distort the rate
-    chance : distribution of their evidence in noise alone
+    candidate_columns : columns of all candidates without causes that distort the rate
+    null_distribution : distribution of their evidence in noise alone
     rate : false alarms per cause
-    scanned : causes that are scanned for over all frequencies or times
+    scanned_causes : causes that are scanned for over all frequencies or times
     unidentifiable : causes that these logs cannot distinguish from bias and scale factor error
-    banks, found_before : caches of columns and of steps, by the named causes
+    columns_cache, step_cache : caches of columns and of steps, by the named causes
     on_part : is called with the name of each part of the work as it begins
 
     """
 
     problem: RegressionProblem
-    bank: Bank
-    chance: Chance
+    candidate_columns: CandidateColumns
+    null_distribution: NullDistribution
     rate: float
-    scanned: frozenset[str] = SCANNED
+    scanned_causes: frozenset[str] = SCANNED_CAUSES
     unidentifiable: frozenset[str] = frozenset()
-    banks: dict[Key, Bank] = field_of(default_factory=dict)
-    found_before: dict[Key, tuple[Step | None, list[Step]]] = field_of(default_factory=dict)
+    columns_cache: dict[CausesKey, CandidateColumns] = field_of(default_factory=dict)
+    step_cache: dict[CausesKey, tuple[SearchStep | None,
+                                      list[SearchStep]]] = field_of(default_factory=dict)
     on_part: OnPart = lambda words: None
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
         """Return all causes with their first shapes."""
-        return self.bank.candidates
+        return self.candidate_columns.candidates
 
-    def excess(self, cause: str, found: float, times: float = 1.0) -> float:
+    def excess_evidence(self, cause: str, evidence: float, rate_factor: float = 1.0) -> float:
         """Return an evidence less its threshold at so many times the false-alarm rate."""
-        return found - self.chance.threshold(cause, times * self.rate)
+        return evidence - self.null_distribution.threshold(cause, rate_factor * self.rate)
 
 
-def screen(done: Fitted, stock: Bank) -> Array:
+def screen_candidates(fit: RegressionFit, columns: CandidateColumns) -> Array:
     """Return the evidence of all candidates given the named causes, shape (candidates,)."""
-    noises, starts = done.problem.noises, done.problem.starts
-    by = marginalized(done.columns, stock.columns, stock.groups, starts, noises)
-    shown = noise_likelihood(done.residual[None], done.columns, stock.columns, starts, noises, by)
-    return _priced(evidence(shown, by, stock.groups), stock)[0]
+    noises, starts = fit.problem.noises, fit.problem.band_starts
+    by = marginalize_nuisances(fit.columns, columns.columns, columns.groups, starts, noises)
+    shown = noise_likelihood(fit.residual[None], fit.columns, columns.columns, starts, noises, by)
+    return _penalize_columns(column_evidence(shown, by, columns.groups), columns)[0]
 
 
-def _priced(found: Array, stock: Bank) -> Array:
+def _penalize_columns(evidence: Array, columns: CandidateColumns) -> Array:
     """Return evidence, shape (d, candidates), less the penalty of columns beyond the first."""
-    return found - PRICE_OF_COLUMN * np.array([len(group) - 1.0 for group in stock.groups])
+    return evidence - COLUMN_PENALTY * np.array([len(group) - 1.0 for group in columns.groups])
 
 
-def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance:
+def simulate_null_distribution(fit: RegressionFit, columns: CandidateColumns,
+                               generator: np.random.Generator) -> NullDistribution:
     """Return the distribution of the evidence of causes in residuals of noise alone."""
-    probable = done.by_noise.probability[0]
-    kept = np.sort(np.argsort(-probable)[:MOST_NOISES])
-    noises = done.problem.noises.take(kept)
-    starts = done.problem.starts
-    by = marginalized(done.columns, stock.columns, stock.groups, starts, noises)
-    count = np.diff(np.append(starts, len(done.residual)))
-    single = done.columns.astype(np.float32), stock.columns.astype(np.float32)
+    probable = fit.noise_likelihood.probability[0]
+    kept = np.sort(np.argsort(-probable)[:MAX_DRAWN_NOISES])
+    noises = fit.problem.noises.take(kept)
+    starts = fit.problem.band_starts
+    by = marginalize_nuisances(fit.columns, columns.columns, columns.groups, starts, noises)
+    count = np.diff(np.append(starts, len(fit.residual)))
+    single = fit.columns.astype(np.float32), columns.columns.astype(np.float32)
     found = []
-    for _ in range(DRAWS // 100):
-        residuals = drawn(noises, count, probable[kept] / probable[kept].sum(), 100, generator)
+    for _ in range(NOISE_DRAWS // 100):
+        residuals = draw_residuals(noises, count, probable[kept] / probable[kept].sum(), 100,
+                                   generator)
         shown = noise_likelihood(residuals, *single, starts, noises, by)
-        found.append(_priced(evidence(shown, by, stock.groups), stock))
-    every = np.concatenate(found)
+        found.append(_penalize_columns(column_evidence(shown, by, columns.groups), columns))
+    null_evidence = np.concatenate(found)
     start, scale, share = {}, {}, 0.15
-    for cause, own in by_cause(stock.candidates).items():
-        if not np.isfinite(every[:, own]).any():
+    for cause, own in indices_by_cause(columns.candidates).items():
+        if not np.isfinite(null_evidence[:, own]).any():
             start[cause], scale[cause] = 0.0, 1.0  # not identifiable in these data
             continue
-        most = np.sort(averaged(every[:, own]))[int((1.0 - share) * len(every)):]
+        most = (np.sort(log_mean_exp(
+            null_evidence[:, own]))[int((1.0 - share) * len(null_evidence)):])
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
-    return Chance(start, scale, share)
+    return NullDistribution(start, scale, share)
 
 
-def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006,
-          on_part: OnPart = lambda words: None) -> Search:
+def start_search(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006,
+                 on_part: OnPart = lambda words: None) -> Search:
     """Set up a search: candidates, likely noises, and the distribution of evidence in noise."""
     on_part('candidate causes')
-    found = [*candidates(replays), *generic_terms(replays)]
-    everywhere = regression_problem(replays)
-    whole = _of_likely_noises(everywhere, found)
-    done, stock = fitted(whole, []), bank(whole, found)
-    shown, places = screen(done, stock), by_cause(found)
-    if shown.max() > STRONG:
-        whole, done = everywhere, fitted(everywhere, [])
-    hidden = frozenset(cause for cause, own in places.items()
-                       if not np.isfinite(shown[own]).any())
+    found = [*propose_candidates(replays), *generic_terms(replays)]
+    everywhere = build_problem(replays)
+    problem = _drop_unlikely_noises(everywhere, found)
+    fit, columns = fit_causes(problem, []), make_candidate_columns(problem, found)
+    shown, places = screen_candidates(fit, columns), indices_by_cause(found)
+    if shown.max() > STRONG_EVIDENCE:
+        problem, fit = everywhere, fit_causes(everywhere, [])
+    unidentifiable = frozenset(cause for cause, own in places.items()
+                               if not np.isfinite(shown[own]).any())
     on_part('significance, by simulated noise')
-    return Search(whole, stock, chances(done, stock, generator), rate / len(places),
-                  unidentifiable=hidden, on_part=on_part)
+    return Search(problem, columns, simulate_null_distribution(fit, columns, generator),
+                  rate / len(places), unidentifiable=unidentifiable, on_part=on_part)
 
 
-def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
-           rate: float) -> Search:
+def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
+                    rate: float) -> Search:
     """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
     found = [each for each in search.candidates if each.cause in causes]
-    whole = regression_problem(replays)
-    return replace(search, problem=whole, bank=bank(whole, found), rate=rate,
-                   scanned=SCANNED & frozenset(causes), banks={}, found_before={})
+    problem = build_problem(replays)
+    return replace(search, problem=problem, candidate_columns=make_candidate_columns(
+        problem, found), rate=rate, scanned_causes=SCANNED_CAUSES & frozenset(causes),
+                   columns_cache={}, step_cache={})
 
 
-def _of_likely_noises(whole: RegressionProblem, found: Sequence[Candidate]) -> RegressionProblem:
+def _drop_unlikely_noises(problem: RegressionProblem,
+                          candidates: Sequence[Candidate]) -> RegressionProblem:
     """Remove noises that are unlikely both without causes and with one column of each cause."""
-    middle = [places[len(places) // 2]
-              for places in by_cause([each for each in found if is_named(each)]).values()]
-    tried = [each.by_noise for each in (fitted(whole, []),
-                                        fitted(whole, [], [found[place] for place in middle]))]
-    kept = np.flatnonzero(np.any([each.likelihood[0] > each.likelihood[0].max() - UNLIKELY
-                                  for each in tried], axis=0))
+    middle = [
+        places[len(places) // 2]
+        for places in indices_by_cause([each for each in candidates if is_named(each)]).values()
+    ]
+    tried = [
+        each.noise_likelihood
+        for each in (fit_causes(problem, []),
+                     fit_causes(problem, [], [candidates[place] for place in middle]))
+    ]
+    kept = np.flatnonzero(
+        np.any([
+            each.log_likelihood[0] > each.log_likelihood[0].max() - MAX_LIKELIHOOD_DEFICIT
+            for each in tried
+        ], axis=0))
     if not len(kept):
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
-    return replace(whole, shapes=tuple(whole.shapes[place] for place in kept),
-                   noises=whole.noises.take(kept))
+    return replace(problem, noise_shapes=tuple(problem.noise_shapes[place] for place in kept),
+                   noises=problem.noises.take(kept))
 
 
 @dataclass(frozen=True)
-class _First:
+class _ScreenedCandidate:
     """A candidate: its evidence, and the mean evidence over all first shapes of its cause."""
 
     candidate: Candidate
-    most: float
-    mean: float
+    evidence: float
+    mean_evidence: float
 
 
 # scans over all frequencies and times
 
-def _runs(done: Fitted, cause: str) -> list[int]:
+def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
     """Return the logs that may contain one more instance of a cause."""
-    taken = [known.candidate.run for known in done.named if known.candidate.cause == cause]
-    return [run for run in range(len(done.problem.replays)) if taken.count(run) < MOST_OF[cause]]
+    taken = [known.candidate.log_index for known in fit.causes if known.candidate.cause == cause]
+    return [
+        run for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]
+    ]
 
 
-def tones(done: Fitted) -> list[_First]:
+def find_tones(fit: RegressionFit) -> list[_ScreenedCandidate]:
     """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
-    found, left = [], done.white()
-    for run in _runs(done, 'interference_tone'):
-        each, white = done.problem.replays[run], left[run]
+    found, left = [], fit.whitened_series()
+    for run in _logs_to_scan(fit, 'interference_tone'):
+        each, white = fit.problem.replays[run], left[run]
         # Zero padding: a tone between two frequencies of the log would lose half of its power.
         power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
-        lowest = 2 * LEAST_PERIODS
+        lowest = 2 * MIN_TONE_PERIODS
         if len(power) > 2 * lowest:
             best = lowest + int(power[lowest:-2].argmax())
-            frequency = _unfolded(each, 0.5 * best / each.duration)
-            if each.rounded and not _of_the_gyro(each, frequency):
+            frequency = _unalias_frequency(each, 0.5 * best / each.duration)
+            if each.heading_step and not _is_tone_of_gyro(each, frequency):
                 continue
-            most, places = float(power[best]) - PRICE_OF_COLUMN, len(power) * len(left)
-            found.append(_First(effect('interference_tone', frequency, run=run), most,
-                                most - float(np.log(places))))
-    return [max(found, key=lambda one: one.mean)] if found else []
+            most, places = float(power[best]) - COLUMN_PENALTY, len(power) * len(left)
+            found.append(
+                _ScreenedCandidate(effect_candidate('interference_tone', frequency, log_index=run),
+                                   most, most - float(np.log(places))))
+    return [max(found, key=lambda one: one.mean_evidence)] if found else []
 
 
-def _unfolded(each: Replay, frequency: float) -> float:
+def _unalias_frequency(replay: Replay, frequency: float) -> float:
     """Return the frequency of a tone before averaging: the strongest of its aliases."""
-    if each.every == 1:
+    if replay.decimation == 1:
         return frequency
-    samples = replace(each, every=1)
-    power = np.abs(np.fft.rfft(samples.on_grid(each.channels.output - each.reference),
-                               2 * samples.points)) ** 2
-    folds = np.arange(each.every // 2 + 1) / each.step
-    places = 2.0 * samples.duration * np.concatenate([folds + frequency, folds[1:] - frequency])
+    samples = replace(replay, decimation=1)
+    power = np.abs(np.fft.rfft(samples.resample(replay.channels.output - replay.reference),
+                               2 * samples.point_count)) ** 2
+    alias_frequencies = np.arange(replay.decimation // 2 + 1) / replay.point_interval
+    places = (2.0 * samples.duration
+              * np.concatenate([alias_frequencies + frequency, alias_frequencies[1:] - frequency]))
 
-    def outstanding(at: float) -> float:
+    def relative_power(at: float) -> float:
         """Return the ratio of the power at a frequency to that of its neighbours."""
         place = round(at)
         return float(power[place - 2:place + 3].max()
                      / np.median(power[max(place - 60, 0):place + 61]))
 
-    return float(max(places[places < len(power) - 3], key=outstanding)) / (2.0 * samples.duration)
+    return (float(max(places[places < len(power) - 3], key=relative_power)) /
+            (2.0 * samples.duration))
 
 
-def _of_the_gyro(each: Replay, frequency: float) -> bool:
+def _is_tone_of_gyro(replay: Replay, frequency: float) -> bool:
     """Tell whether a tone is in the output, not only in the reference of an encoder."""
-    wave = np.exp(-2.0j * np.pi * frequency * each.channels.time[each.kept])
-    output, reference = (np.abs(np.mean(values[each.kept] * wave))
-                         for values in (each.channels.output, each.reference))
+    wave = np.exp(-2.0j * np.pi * frequency * replay.channels.time[replay.valid])
+    output, reference = (np.abs(np.mean(values[replay.valid] * wave))
+                         for values in (replay.channels.output, replay.reference))
     return bool(output > 0.7 * reference)
 
 
-def slips(done: Fitted) -> list[_First]:
+def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
     """Return the clearest jumps of the reference's heading, where it accelerates."""
     found = []
-    parts = np.cumsum([each.points - 1 for each in done.problem.replays])[:-1]
-    divided = np.split(done.problem.divided(int(done.by_noise.likelihood[0].argmax()))
-                       / done.problem.deviation, parts)
-    left = done.white()
-    for run in _runs(done, 'reference_slip'):
-        each, white, factor = done.problem.replays[run], left[run], divided[run]
-        acceleration = np.abs(np.gradient(each.on_grid(each.channels.rate), each.step))
+    parts = np.cumsum([each.point_count - 1 for each in fit.problem.replays])[:-1]
+    divided = np.split(
+        fit.problem.whitening_factors(int(fit.noise_likelihood.log_likelihood[0].argmax()))
+        / fit.problem.deviation, parts)
+    left = fit.whitened_series()
+    for run in _logs_to_scan(fit, 'reference_slip'):
+        each, white, factor = fit.problem.replays[run], left[run], divided[run]
+        acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
-            tried = [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step))
-                     for width in WIDTHS]
+            tried = [
+                _fit_slips(each, run, white, factor, moments,
+                           max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS
+            ]
             # The largest number indicates a continuous disturbance, not slips.
-            if max(len(one.candidate.shapes) - 1 for one in tried) < MOST_SLIPS:
+            if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
                 found += tried
-    return [max(found, key=lambda one: one.mean)] if found else []
+    return [max(found, key=lambda one: one.mean_evidence)] if found else []
 
 
-def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places,
-             width: float) -> _First:
+def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
+               width: float) -> _ScreenedCandidate:
     """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
-    time = np.arange(each.points) * each.step
-    likely = float(np.log(len(moments) * len(WIDTHS)))
-    size, deviation = _matched(white, factor, time, width)
-    wide, _ = _matched(white, factor, time, 5.0 * width + 0.3)
-    value = 0.5 * (size[moments] / deviation) ** 2 - likely - PRICE_OF_COLUMN
+    time = np.arange(replay.point_count) * replay.point_interval
+    likely = float(np.log(len(indices) * len(SLIP_DURATIONS)))
+    size, deviation = _matched_filter(white, factor, time, width)
+    wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
+    value = 0.5 * (size[indices] / deviation) ** 2 - likely - COLUMN_PENALTY
     # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
     # of an encoder is constant at rest, and differs by up to a step between two rests.
-    value[(wide[moments] / size[moments] < 0.3)
-          | (np.abs(size[moments]) <= each.rounded)] = -np.inf
+    value[(wide[indices] / size[indices] < 0.3)
+          | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
-        single = _single(each, int(moments[place]), width)
-        if single is not None and not _of_the_reference(each, float(time[single])):
+        single = _isolated_point(replay, int(indices[place]), width)
+        if single is not None and not _is_jump_of_reference(replay, float(time[single])):
             continue
-        if (value[place] <= 0.0 and chosen) or len(chosen) == MOST_SLIPS:
+        if (value[place] <= 0.0 and chosen) or len(chosen) == MAX_SLIPS:
             break
-        at = float(each.channels.time[each.kept][0] + time[moments[place]])
+        at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
         if all(abs(at - other) > 1.0 for other in chosen):
             chosen.append(at)
             total += float(value[place])
-    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen),
-                  total if chosen else -np.inf)
+    return _ScreenedCandidate(
+        effect_candidate('reference_slip', width, *chosen, log_index=log_index),
+        total + likely * len(chosen), total if chosen else -np.inf)
 
 
-def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Array, float]:
+def _matched_filter(white: Array, whitening_factor: Array, time: Array,
+                    width: float) -> tuple[Array, float]:
     """Return the size of a pulse at each time, rad, and its standard deviation."""
-    kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
+    kernel = inverse_cosine_transform(
+        cosine_transform(gaussian_pulse(time, time[len(time) // 2], width)) * whitening_factor)
     return (correlate(white, kernel, 'same') / (kernel @ kernel),
             float(1.0 / np.sqrt(kernel @ kernel)))
 
 
-def _single(each: Replay, at: int, width: float) -> int | None:
+def _isolated_point(replay: Replay, index: int, width: float) -> int | None:
     """Return the point near another that has most of the deviation; None if there are several."""
-    left = each.on_grid(each.channels.output - each.channels.rate)
-    reach = max(3, round(2.0 * width / each.step))
-    begin = max(at - reach, 0)
-    near = left[begin:at + reach + 1]
+    left = replay.resample(replay.channels.output - replay.channels.rate)
+    reach = max(3, round(2.0 * width / replay.point_interval))
+    begin = max(index - reach, 0)
+    near = left[begin:index + reach + 1]
     off = (near - np.median(near)) ** 2
     return (begin + int(off.argmax())
             if off.max() > max(40.0 * np.median(off), 0.4 * off.sum()) else None)
 
 
-def _of_the_reference(each: Replay, moment: float) -> bool:
+def _is_jump_of_reference(replay: Replay, moment: float) -> bool:
     """Tell whether the reference jumps more than the output at a time."""
-    at = int(np.clip(np.searchsorted(each.channels.time[each.kept],
-                                     moment + each.channels.time[each.kept][0]),
-                     3, each.kept.sum() - 4))
-    off = [np.abs(np.diff(values[each.kept][at - 3:at + 4], 2)).max()
-           for values in (each.reference, each.channels.output)]
+    at = int(np.clip(np.searchsorted(replay.channels.time[replay.valid],
+                                     moment + replay.channels.time[replay.valid][0]),
+                     3, replay.valid.sum() - 4))
+    off = [np.abs(np.diff(values[replay.valid][at - 3:at + 4], 2)).max()
+           for values in (replay.reference, replay.channels.output)]
     return bool(off[0] > off[1])
 
 
 # one more cause
 
-def _stock(search: Search, named: Sequence[Named]) -> Bank:
+def _columns_given_causes(search: Search, causes: Sequence[SelectedCause]) -> CandidateColumns:
     """Return all candidates for the rate that the gyro senses, with shapes to two digits."""
-    changes = [each for each in named if is_of_the_rate(each.candidate.cause)]
+    changes = [each for each in causes if is_rate_distortion(each.candidate.cause)]
     key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes))
                 for each in changes)
     if not changes:
-        return search.bank
-    if key not in search.banks:
-        search.banks.clear()  # one is hundreds of megabytes
-        search.banks[key] = bank(search.problem, search.candidates, changes)
-    return search.banks[key]
+        return search.candidate_columns
+    if key not in search.columns_cache:
+        search.columns_cache.clear()  # one is hundreds of megabytes
+        search.columns_cache[key] = make_candidate_columns(search.problem, search.candidates,
+                                                           changes)
+    return search.columns_cache[key]
 
 
 @dataclass(frozen=True)
-class Step:
+class SearchStep:
     """A list of causes and its score."""
 
-    named: tuple[Named, ...]
+    causes: tuple[SelectedCause, ...]
     score: float
 
 
-def refined(before: Fitted, candidate: Candidate, price: float) -> Step:
+def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> SearchStep:
     """
     Add a cause with its best shape near the given one.
 
     Parameters
     ----------
-    before : fit to which the cause is added
+    fit : fit to which the cause is added
     candidate : the cause
-    price : penalty for the choice of its shape, in log-likelihood
+    penalty : penalty for the choice of its shape, in log-likelihood
 
     """
-    if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
-        done = with_one_more(before, candidate)
-        columns = PRICE_OF_COLUMN * max(done.widths[-1] - 1, 0)
-        margin = 0.0 if is_named(candidate) else MARGIN
-        return Step((*before.named, Named(candidate, price=price)),
-                    done.score - columns - price - margin)
-    begin = candidate if candidate.amplitude is None else _unbent(before, candidate)
-    place = fitted_shapes(candidate)[0]
-    low, high = _around(before.plain, begin, place)
+    if not fitted_shape_indices(candidate) or candidate.cause == 'reference_slip':
+        done = add_cause(fit, candidate)
+        columns = COLUMN_PENALTY * max(done.column_counts[-1] - 1, 0)
+        margin = 0.0 if is_named(candidate) else UNNAMED_PENALTY
+        return SearchStep((*fit.causes, SelectedCause(candidate, penalty=penalty)),
+                          done.log_likelihood - columns - penalty - margin)
+    begin = candidate if candidate.amplitude is None else _linearized_start(fit, candidate)
+    place = fitted_shape_indices(candidate)[0]
+    low, high = _shape_bounds(fit.original_replays, begin, place)
 
     def cost(at: float) -> float:
-        return -with_one_more(before, with_shape(begin, place, _shape(at, begin, place))).score
+        return (
+            -add_cause(fit, with_shape(begin, place, _to_shape(at, begin, place))).log_likelihood)
 
     best = minimize_scalar(cost, bounds=(low, high), method='bounded',
                            options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
-    columns = PRICE_OF_COLUMN if candidate.cause == 'interference_tone' else 0.0
-    found = Named(with_shape(begin, place, _shape(best.x, begin, place)), price=price)
-    return Step((*before.named, found), -float(best.fun) - price - columns)
+    columns = COLUMN_PENALTY if candidate.cause == 'interference_tone' else 0.0
+    found = SelectedCause(with_shape(begin, place, _to_shape(best.x, begin, place)),
+                          penalty=penalty)
+    return SearchStep((*fit.causes, found), -float(best.fun) - penalty - columns)
 
 
-def _shape(at: float, begin: Candidate, place: int) -> float:
-    return (at if begin.cause == 'bias_step'
-            else float(np.copysign(np.exp(at), begin.shapes[place])))
+def _to_shape(search_value: float, candidate: Candidate, shape_index: int) -> float:
+    return (search_value if candidate.cause == 'bias_step'
+            else float(np.copysign(np.exp(search_value), candidate.shapes[shape_index])))
 
 
-def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[float, float]:
+def _shape_bounds(replays: Sequence[Replay], candidate: Candidate,
+                  shape_index: int) -> tuple[float, float]:
     """Return the bounds of the search for a shape, in logarithms except for times."""
-    mine = begin.shapes[place]
-    if begin.cause == 'bias_step':
-        width = 1.5 * max(spacing_of_steps(each, len(replays)) for each in replays)
-        return mine - width, mine + width
-    if begin.amplitude is not None:
-        return float(np.log(abs(mine))) - 0.7, float(np.log(abs(mine))) + 0.7
-    if begin.cause == 'interference_tone':
-        width = 1.0 / (mine * replays[begin.run or 0].duration)
-        return float(np.log(mine)) - width, float(np.log(mine)) + width
+    shape = candidate.shapes[shape_index]
+    if candidate.cause == 'bias_step':
+        width = 1.5 * max(step_time_spacing(each, len(replays)) for each in replays)
+        return shape - width, shape + width
+    if candidate.amplitude is not None:
+        return float(np.log(abs(shape))) - 0.7, float(np.log(abs(shape))) + 0.7
+    if candidate.cause == 'interference_tone':
+        width = 1.0 / (shape * replays[candidate.log_index or 0].duration)
+        return float(np.log(shape)) - width, float(np.log(shape)) + width
     width = 0.8
-    low = float(np.log(FASTEST_LAG)) if begin.cause == 'thermal_lag' else -np.inf
-    return max(float(np.log(abs(mine))) - width, low), float(np.log(abs(mine))) + width
+    low = float(np.log(MIN_THERMAL_LAG)) if candidate.cause == 'thermal_lag' else -np.inf
+    return max(float(np.log(abs(shape))) - width, low), float(np.log(abs(shape))) + width
 
 
 #: Exponent with which an effect grows with its shape.
-_POWERS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
+_SHAPE_EXPONENTS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
 
 
-def _unbent(before: Fitted, candidate: Candidate) -> Candidate:
+def _linearized_start(fit: RegressionFit, candidate: Candidate) -> Candidate:
     """Return a cause of fixed amplitude with the shape that a fit of its amplitude suggests."""
-    if candidate.cause not in _POWERS:
+    if candidate.cause not in _SHAPE_EXPONENTS:
         return candidate
-    own = columns_of(candidate, before.problem.replays) / before.problem.deviation
-    free = with_columns(before, own)
+    own = candidate_transforms(candidate, fit.problem.replays) / fit.problem.deviation
+    free = add_nuisance_columns(fit, own)
     values, _ = free.estimates
     ratio = float(values[-1])
-    place = fitted_shapes(candidate)[0]
-    return with_shape(candidate, place, candidate.shapes[place]
-                      * float(np.copysign(abs(ratio) ** (1.0 / _POWERS[candidate.cause]), ratio)))
+    place = fitted_shape_indices(candidate)[0]
+    return with_shape(
+        candidate, place, candidate.shapes[place]
+        * float(np.copysign(abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio)))
 
 
-def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
+def find_strongest(search: Search,
+                   causes: Sequence[SelectedCause]) -> tuple[SearchStep | None, list[SearchStep]]:
     """
     Search for one more cause.
 
@@ -527,102 +561,115 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
     cause is significant, those of suspected causes
 
     """
-    key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes)
-                for each in named)
-    if key not in search.found_before:
-        search.on_part(f'search for causes after {len(named)} found' if named
+    key = tuple((each.candidate.cause, each.candidate.log_index, *each.candidate.shapes)
+                for each in causes)
+    if key not in search.step_cache:
+        search.on_part(f'search for causes after {len(causes)} found' if causes
                        else 'search for causes')
-        search.found_before[key] = _strongest(search, named)
-    return search.found_before[key]
+        search.step_cache[key] = _search_strongest(search, causes)
+    return search.step_cache[key]
 
 
-def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
-    done = fitted(search.problem, named)
-    first = _first(search, done, named)
-    if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
-        found = [refined(done, each.candidate, each.most - each.mean) for each in first
-                 if search.excess(each.candidate.cause, each.mean,
-                                  SUSPECTED if lasts(each.candidate) else 1.0) > 0.0]
+def _search_strongest(
+        search: Search,
+        causes: Sequence[SelectedCause]) -> tuple[SearchStep | None, list[SearchStep]]:
+    fit = fit_causes(search.problem, causes)
+    first = _screen_causes(search, fit, causes)
+    if not any(
+            search.excess_evidence(each.candidate.cause, each.mean_evidence) > 0.0
+            for each in first):
+        found = [
+            refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
+            for each in first if search.excess_evidence(
+                each.candidate.cause, each.mean_evidence,
+                SUSPECTED_RATE_FACTOR if is_lasting(each.candidate) else 1.0) > 0.0
+        ]
         return None, sorted(found, key=lambda step: -step.score)
-    top = max(first, key=lambda each: each.most)
+    top = max(first, key=lambda each: each.evidence)
     # Causes that distort the rate are equal to first order; large ones need refined shapes.
-    alike = is_of_the_rate(top.candidate.cause)
-    worth = [each for each in first if each.most > 0.8 * top.most - 8.0
-             or (alike and is_of_the_rate(each.candidate.cause))]
+    alike = is_rate_distortion(top.candidate.cause)
+    worth = [each for each in first if each.evidence > 0.8 * top.evidence - 8.0
+             or (alike and is_rate_distortion(each.candidate.cause))]
     worth = [each for each in worth if is_named(each.candidate)
-             or search.excess(each.candidate.cause, each.mean) > 0.0]
-    worth.sort(key=lambda each: -each.most)
-    steps = [refined(done, each.candidate, each.most - each.mean)
-             for each in worth[:MOST_CONFOUNDERS]]
+             or search.excess_evidence(each.candidate.cause, each.mean_evidence) > 0.0]
+    worth.sort(key=lambda each: -each.evidence)
+    steps = [refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
+             for each in worth[:MAX_CONFOUNDERS]]
     # The screening fits a free size at the first shape; after refinement a cause may explain less
     # than its penalty.
-    steps = sorted((step for step in steps if step.score > done.score),
+    steps = sorted((step for step in steps if step.score > fit.log_likelihood),
                    key=lambda step: -step.score)
     beyond = (step for step in steps
-              if search.excess(step.named[-1].candidate.cause, step.score - done.score) > 0.0)
+              if search.excess_evidence(step.causes[-1].candidate.cause, step.score
+                                        - fit.log_likelihood) > 0.0)
     return next(beyond, None), steps
 
 
-def lasts(candidate: Candidate) -> bool:
+def is_lasting(candidate: Candidate) -> bool:
     """
     Tell whether a cause acts in all logs and has a free size: only such causes are suspected.
 
     A limit or a delay has no size apart from its shape, and its refinement would fit single peaks.
 
     """
-    return is_named(candidate) and candidate.run is None and candidate.amplitude is None
+    return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
 
-def suspected(search: Search, named: Sequence[Named]) -> Step | None:
-    """Return the named causes and one more that is significant at `SUSPECTED` times the rate."""
-    _, steps = strongest(search, named)
-    score = fitted(search.problem, named).score if steps else 0.0
-    causes = {each.candidate.cause for each in named}
-    candidates = ((step, step.named[-1].candidate) for step in steps)
-    return next((step for step, candidate in candidates
-                 if lasts(candidate) and candidate.cause not in causes
-                 and search.excess(candidate.cause, step.score - score, SUSPECTED) > 0.0), None)
+def find_suspected(search: Search, selected: Sequence[SelectedCause]) -> SearchStep | None:
+    """Return the named causes and one more, at `SUSPECTED_RATE_FACTOR` times the rate."""
+    _, steps = find_strongest(search, selected)
+    score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
+    cause_names = {each.candidate.cause for each in selected}
+    candidates = ((step, step.causes[-1].candidate) for step in steps)
+    return next(
+        (step for step, candidate in candidates
+         if is_lasting(candidate) and candidate.cause not in cause_names and
+         search.excess_evidence(candidate.cause, step.score - score, SUSPECTED_RATE_FACTOR) > 0.0),
+        None)
 
 
-def _first(search: Search, done: Fitted, named: Sequence[Named]) -> list[_First]:
+def _screen_causes(search: Search, fit: RegressionFit,
+                   causes: Sequence[SelectedCause]) -> list[_ScreenedCandidate]:
     """Return the best first shape of each cause."""
-    found = screen(done, _stock(search, named))
+    found = screen_candidates(fit, _columns_given_causes(search, causes))
     # A second cause without a free size would only correct the shape of the first.
-    taken = {each.candidate.cause for each in named if each.candidate.amplitude is not None}
-    first = [_First(search.candidates[max(own, key=lambda place: found[place])],
-                    float(found[own].max()), float(averaged(found[own])))
-             for cause, own in by_cause(search.candidates).items()
+    taken = {each.candidate.cause for each in causes if each.candidate.amplitude is not None}
+    first = [_ScreenedCandidate(search.candidates[max(own, key=lambda place: found[place])],
+                                float(found[own].max()), float(log_mean_exp(found[own])))
+             for cause, own in indices_by_cause(search.candidates).items()
              if cause not in taken and np.isfinite(found[own]).any()]
-    scans = {'interference_tone': tones, 'reference_slip': slips}
-    return first + [each for cause in sorted(search.scanned) for each in scans[cause](done)
-                    if np.isfinite(each.mean)]
+    scans = {'interference_tone': find_tones, 'reference_slip': find_slips}
+    return first + [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)
+                    if np.isfinite(each.mean_evidence)]
 
 
-def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
+def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> tuple[SelectedCause, ...]:
     """Refine all shapes and values together by Gauss-Newton steps."""
-    current = tuple(named)
-    for _ in range(3 if named else 0):
-        done = fitted(search.problem, current)
+    current = tuple(causes)
+    for _ in range(3 if causes else 0):
+        done = fit_causes(search.problem, current)
         values, _ = done.estimates
-        current = tuple(_updated(done, place, values) for place in range(len(current)))
+        current = tuple(_gauss_newton_update(done, place, values) for place in range(len(current)))
     return current
 
 
-def _updated(done: Fitted, place: int, values: Array) -> Named:
-    known = done.named[place]
-    own = dict(zip(done.owner, values))
-    free = tuple(float(own.get((place, number), 0.0)) for number in range(done.widths[place]))
+def _gauss_newton_update(fit: RegressionFit, cause_index: int, values: Array) -> SelectedCause:
+    known = fit.causes[cause_index]
+    own = dict(zip(fit.column_owners, values))
+    free = tuple(
+        float(own.get((cause_index, number), 0.0))
+        for number in range(fit.column_counts[cause_index]))
     found = free or (known.candidate.amplitude or 0.0,)
     candidate = known.candidate
-    for shape in fitted_shapes(candidate):
-        change = own.get((place, -1 - shape), 0.0)
+    for shape in fitted_shape_indices(candidate):
+        change = own.get((cause_index, -1 - shape), 0.0)
         before = candidate.shapes[shape]
         candidate = with_shape(candidate, shape, before + float(
             np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
     return replace(known, candidate=candidate, values=found or known.values)
 
 
-def searched(search: Search) -> tuple[Named, ...]:
+def search_causes(search: Search) -> tuple[SelectedCause, ...]:
     """
     Return the causes that the data support, with values.
 
@@ -630,97 +677,104 @@ def searched(search: Search) -> tuple[Named, ...]:
     a name is found, the search is repeated without generic terms, and the likelier result is used.
 
     """
-    everything = _grown(search)
+    everything = _select_forward(search)
     if all(is_named(each.candidate) for each in everything):
         return everything
     nameable = [each for each in search.candidates if is_named(each)]
-    named = _grown(replace(search, bank=bank(search.problem, nameable), banks={}, found_before={}))
+    named = _select_forward(
+        replace(search, candidate_columns=make_candidate_columns(search.problem, nameable),
+                columns_cache={}, step_cache={}))
     return max((everything, named),
-               key=lambda named: fitted(search.problem, named).score - sum(
-                   price_of_freedom(each) + (0.0 if is_named(each.candidate) else MARGIN)
+               key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
+                   complexity_penalty(each) + (0.0
+                                               if is_named(each.candidate) else UNNAMED_PENALTY)
                    for each in named))
 
 
-def price_of_freedom(known: Named) -> float:
+def complexity_penalty(cause: SelectedCause) -> float:
     """Return the penalty of shapes and columns of a cause, in log-likelihood."""
-    shapes = max(known.price, PRICE_OF_SHAPE * len(fitted_shapes(known.candidate)))
-    return shapes + PRICE_OF_COLUMN * max(len(known.values) - 1, 0)
+    shapes = max(cause.penalty, SHAPE_PENALTY * len(fitted_shape_indices(cause.candidate)))
+    return shapes + COLUMN_PENALTY * max(len(cause.values) - 1, 0)
 
 
-def _grown(search: Search) -> tuple[Named, ...]:
+def _select_forward(search: Search) -> tuple[SelectedCause, ...]:
     """Add causes one by one (forward selection)."""
-    named: tuple[Named, ...] = ()
-    for _ in range(2 * MOST_CAUSES):  # some are removed again
-        step, _ = strongest(search, named) if len(named) < MOST_CAUSES else (None, [])
+    named: tuple[SelectedCause, ...] = ()
+    for _ in range(2 * MAX_CAUSES):  # some are removed again
+        step, _ = find_strongest(search, named) if len(named) < MAX_CAUSES else (None, [])
         if step is None:
             break
-        named = polished(search, step.named)
+        named = refine_jointly(search, step.causes)
         if len(named) > 1:
-            named = pruned(search, named)
-    return _exchanged(search, pruned(search, named))
+            named = eliminate_backward(search, named)
+    return _exchange_causes(search, eliminate_backward(search, named))
 
 
-def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
+def eliminate_backward(search: Search,
+                       causes: tuple[SelectedCause, ...]) -> tuple[SelectedCause, ...]:
     """Remove causes that are not significant given the others, the weakest first."""
-    return without_weakest(search, named, lambda some: [
-        search.excess(each.candidate.cause, evidence_of(search, some, place))
+    return remove_weakest(search, causes, lambda some: [
+        search.excess_evidence(each.candidate.cause, evidence_for(search, some, place))
         for place, each in enumerate(some)], 0.0)[0]
 
 
-def without_weakest(search: Search, named: tuple[Named, ...],
-                    strengths: Callable[[tuple[Named, ...]], Sequence[float]],
-                    least: float) -> tuple[tuple[Named, ...], list[Named]]:
+def remove_weakest(search: Search, causes: tuple[SelectedCause, ...],
+                   strength_of: Callable[[tuple[SelectedCause, ...]], Sequence[float]],
+                   threshold: float) -> tuple[tuple[SelectedCause, ...], list[SelectedCause]]:
     """Remove the weakest cause and refine the others until all exceed a strength."""
-    out: list[Named] = []
-    while named:
-        found = strengths(named)
+    removed: list[SelectedCause] = []
+    while causes:
+        found = strength_of(causes)
         weakest = int(np.argmin(found))
-        if found[weakest] > least:
+        if found[weakest] > threshold:
             break
-        out.append(named[weakest])
-        named = polished(search, named[:weakest] + named[weakest + 1:])
-    return named, out
+        removed.append(causes[weakest])
+        causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
+    return causes, removed
 
 
-def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
+def _exchange_causes(search: Search,
+                     causes: tuple[SelectedCause, ...]) -> tuple[SelectedCause, ...]:
     """Remove each cause on trial, and replace it if another is better or none is needed."""
-    for known in named[:-1]:
-        others = tuple(each for each in named if each is not known)
-        step, _ = strongest(search, others)
+    for known in causes[:-1]:
+        others = tuple(each for each in causes if each is not known)
+        step, _ = find_strongest(search, others)
         if step is None:
-            return polished(search, others)
-        if (step.named[-1].candidate.cause != known.candidate.cause
-                and step.score > fitted(search.problem, named).score + 1.0):
-            return polished(search, step.named)
-    return named
+            return refine_jointly(search, others)
+        if (step.causes[-1].candidate.cause != known.candidate.cause
+                and step.score > fit_causes(search.problem, causes).log_likelihood + 1.0):
+            return refine_jointly(search, step.causes)
+    return causes
 
 
-def alternatives(search: Search, named: tuple[Named, ...],
-                 place: int) -> list[tuple[Named, float]]:
+def find_alternatives(search: Search, causes: tuple[SelectedCause, ...],
+                      cause_index: int) -> list[tuple[SelectedCause, float]]:
     """Return a named cause and its alternatives, with their deficits in log-likelihood."""
-    cause = named[place].candidate.cause
-    _, steps = strongest(search, named[:place] + named[place + 1:])
-    mine = max((step.score for step in steps if step.named[-1].candidate.cause == cause),
+    cause = causes[cause_index].candidate.cause
+    _, steps = find_strongest(search, causes[:cause_index] + causes[cause_index + 1:])
+    mine = max((step.score for step in steps if step.causes[-1].candidate.cause == cause),
                default=np.inf)
-    return [(step.named[-1], mine - step.score) for step in steps
-            if mine - step.score < RULED_OUT and is_named(step.named[-1].candidate)]
+    return [(step.causes[-1], mine - step.score) for step in steps
+            if mine - step.score < RULED_OUT_DEFICIT and is_named(step.causes[-1].candidate)]
 
 
-def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
+def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: int) -> float:
     """Return the evidence for one of the causes given the others."""
-    others = tuple(each for number, each in enumerate(named) if number != place)
-    return (fitted(search.problem, named).score - fitted(search.problem, others).score
-            - price_of_freedom(named[place]))
+    others = tuple(each for number, each in enumerate(causes) if number != cause_index)
+    return (fit_causes(search.problem, causes).log_likelihood
+            - fit_causes(search.problem, others).log_likelihood
+            - complexity_penalty(causes[cause_index]))
 
 
-def sureness(won: Array) -> float:
+def prediction_sigmas(log_likelihood_gains: Array) -> float:
     """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
-    bounded = np.clip(won, -BOUND, BOUND)
-    scatter = float(np.std(bounded, ddof=1)) * len(won) ** 0.5
-    return float(np.sum(bounded)) / max(scatter, 1e-9) if np.sum(won) > 0.0 else 0.0
+    clipped_gains = np.clip(log_likelihood_gains, -MAX_STRETCH_GAIN, MAX_STRETCH_GAIN)
+    scatter = float(np.std(clipped_gains, ddof=1)) * len(log_likelihood_gains) ** 0.5
+    return (float(np.sum(clipped_gains))
+            / max(scatter, 1e-9) if np.sum(log_likelihood_gains) > 0.0 else 0.0)
 
 
-def sureness_of(search: Search, named: Sequence[Named]) -> list[float]:
+def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[float]:
     """
     Return the gain of each cause on held-out stretches in standard deviations.
 
@@ -728,21 +782,21 @@ def sureness_of(search: Search, named: Sequence[Named]) -> list[float]:
     turn. Slips are single events, and are not required to predict other stretches.
 
     """
-    full, found = fitted(search.problem, named), []
-    left = full.white()
-    count = max(STRETCHES // len(left), 1)
+    full, found = fit_causes(search.problem, causes), []
+    left = full.whitened_series()
+    count = max(STRETCH_COUNT // len(left), 1)
     stretch = np.concatenate([run * count + np.arange(len(each)) * count // len(each)
                               for run, each in enumerate(left)])
     off = np.concatenate(left)
-    for place, known in enumerate(named):
+    for place, known in enumerate(causes):
         if known.candidate.cause == 'reference_slip':
             found.append(math.inf)
             continue
-        rest = fitted(search.problem, [*named[:place], *named[place + 1:]])
-        before = np.concatenate(rest.white(full))
+        rest = fit_causes(search.problem, [*causes[:place], *causes[place + 1:]])
+        before = np.concatenate(rest.whitened_series(full))
         added = before - off
         score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
         size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
-        found.append(sureness(0.5 * np.bincount(
+        found.append(prediction_sigmas(0.5 * np.bincount(
             stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
     return found

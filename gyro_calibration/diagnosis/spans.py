@@ -21,8 +21,8 @@ the heading ``psi`` of the reference is, at points ``t`` and except for a consta
 
 with the integrals ``J``. A point is the mean over some samples; the observations are the
 differences between points, so that a gap of the reference is a long span. The length of the spans
-and the components of the noise depend on the kind of the reference (`Treatment`). The computing
-time is proportional to the number of spans.
+and the components of the noise depend on the kind of the reference (`ReferenceTreatment`). The
+computing time is proportional to the number of spans.
 
 """
 
@@ -32,19 +32,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.encoder import LARGEST_TIME_OFFSET
+from gyro_calibration.calibration.encoder import MAX_TIME_OFFSET
 from gyro_calibration.calibration.noise_grid import (
+    bias_wander_columns,
+    fit_noise_grid,
     GridFit,
     heading_noise,
-    noise_grid,
     SharedNoise,
-    wander,
 )
-from gyro_calibration.diagnosis.data_quality import encoder_step, heading_errors, rate_noise_share
-from gyro_calibration.diagnosis.expected_output import angle_of, bridged, integral_of
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_95
-from gyro_calibration.logs.quality import robust_deviation, white_noise
-from gyro_calibration.model.channels import channels_of
+from gyro_calibration.diagnosis.data_quality import (
+    encoder_step,
+    heading_difference,
+    rate_noise_share,
+)
+from gyro_calibration.diagnosis.expected_output import (
+    bridge_gaps,
+    integrate_trapezoidal,
+    integrate_with_curvature,
+)
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.quality import robust_deviation, white_noise_deviation
+from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
@@ -53,77 +61,79 @@ from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
 #: Names of the values that are always fitted.
-PLAIN = ('scale_factor_error', 'bias', 'time_offset')
+BASE_VALUES = ('scale_factor_error', 'bias', 'time_offset')
 #: Least effective number of stretches of an established value.
-FEWEST_STRETCHES = 3.0
+MIN_STRETCHES = 3.0
 #: Largest standard deviation of an outlying point, relative to the others.
-_FARTHEST = 10.0
+_MAX_POINT_DEVIATION = 10.0
 #: Factor of the prior of a value that is not fitted.
-_FIXED = 1e-6
+_FIXED_PRIOR_FACTOR = 1e-6
 #: Trial delays of a reference, s.
-_DELAYS = np.arange(-1.5, 1.501, 0.05)
+_TRIAL_DELAYS = np.arange(-1.5, 1.501, 0.05)
 #: Largest share of noise in the column of a delay, and largest half-width of the means that reduce
 #: it, s.
-_NOISY, _LONGEST = 0.05, 0.5
+_MAX_RATE_NOISE_SHARE, _MAX_SMOOTHING_HALF_WIDTH = 0.05, 0.5
 #: Number of robust fits of values and outlying points.
-_PASSES = 2
+_ROBUST_PASSES = 2
 #: Sector of a shaft, rad, in which encoder readings are not independent.
-_CELL = 10.0 * DEGREE
+_SHAFT_SECTOR = 10.0 * DEGREE
 #: Shortest rest of a gyro while its course is lost, s, and largest ratio of its scatter to the
 #: smallest of the log.
-_REST, _QUIET = 3.0, 2.0
+_MIN_REST_DURATION, _MAX_REST_SCATTER_RATIO = 3.0, 2.0
 
 
 @dataclass(frozen=True)
-class Treatment:
+class ReferenceTreatment:
     """
     Settings of the comparison of a kind of reference with the gyro.
 
     Attributes
     ----------
-    span : least length, s
-    most : largest number of spans of a log
+    min_span : least length, s
+    max_spans : largest number of spans of a log
     prior : standard deviations of scale factor error, bias (rad/s) and delay (s)
-    walk : smallest and largest angle random walk, in units of `Spans.walk`
-    largest_walk : largest angle random walk, rad/√s, as white noise may be vibration
-    cosines : number of cosines of the wandering bias
-    flicker, random_walk : smallest and largest bias instability and rate random walk, rad/s and
-        rad/s/√s; relative to the angle random walk if `relative`
-    relative : whether they are relative
-    stretch : length of stretches whose scores are independent, s
-    of_heading : whether the reference has errors of a heading, not of an integrated rate
-    averaged : whether a point is the mean of a span
+    walk_range : smallest and largest angle random walk, in units of `Spans.walk`
+    max_walk : largest angle random walk, rad/√s, as white noise may be vibration
+    cosine_count : number of cosines of the wandering bias
+    flicker_range, random_walk_range : smallest and largest bias instability and rate random walk,
+        rad/s and rad/s/√s; relative to the angle random walk if `is_relative`
+    is_relative : whether they are relative
+    stretch_duration : length of stretches whose scores are independent, s
+    errs_as_heading : whether the reference has errors of a heading, not of an integrated rate
+    averages_span : whether a point is the mean of a span
 
     """
 
-    span: float
-    most: int
+    min_span: float
+    max_spans: int
     prior: tuple[float, float, float]
-    walk: tuple[float, float]
-    largest_walk: float
-    cosines: int
-    flicker: tuple[float, float]
-    random_walk: tuple[float, float] | None
-    relative: bool
-    stretch: float
-    of_heading: bool
-    averaged: bool
+    walk_range: tuple[float, float]
+    max_walk: float
+    cosine_count: int
+    flicker_range: tuple[float, float]
+    random_walk_range: tuple[float, float] | None
+    is_relative: bool
+    stretch_duration: float
+    errs_as_heading: bool
+    averages_span: bool
 
 
 #: Data-sheet limits of gyros for vehicles: scale factor 1 %, bias 1 deg/s, angle random walk 1.7
 #: deg/√h, bias instability 40 deg/h; and delays of a course of 1 s.
-COURSE = Treatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 5e-4, 12, (1e-6, 2e-4), None, False,
-                   15.0, True, True)
+COURSE_TREATMENT = ReferenceTreatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 5e-4, 12,
+                                      (1e-6, 2e-4), None, False, 15.0, True, True)
 #: A reference with errors of an instrument; bias wander is relative to the white noise.
-HEADING = Treatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), math.inf, 24, (3e-3, 0.5),
-                    (1e-4, 0.1), True, 5.0, True, True)
+HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), math.inf,
+                                       24, (3e-3, 0.5), (1e-4, 0.1), True, 5.0, True, True)
 #: An encoder on the host of the gyro; small delays, as a swing agrees again a period later.
-ENCODER = replace(HEADING, prior=(*HEADING.prior[:2], LARGEST_TIME_OFFSET / 1.5))
-RATE = replace(HEADING, of_heading=False, averaged=False, cosines=60)
+ENCODER_TREATMENT = replace(HEADING_TREATMENT,
+                            prior=(*HEADING_TREATMENT.prior[:2], MAX_TIME_OFFSET / 1.5))
+RATE_TREATMENT = replace(HEADING_TREATMENT, errs_as_heading=False, averages_span=False,
+                         cosine_count=60)
 
 
 @dataclass(frozen=True)
-class Column:
+class CauseTerm:
     """
     One cause as columns of the regression.
 
@@ -131,15 +141,15 @@ class Column:
     ----------
     cause : its name
     shapes : of the effect
-    once : whether it is a single event
-    positive : whether its value is at least 0
+    is_single_event : whether it is a single event
+    is_positive : whether its value is at least 0
 
     """
 
     cause: str
     shapes: tuple[float, ...] = ()
-    once: bool = False
-    positive: bool = False
+    is_single_event: bool = False
+    is_positive: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,47 +161,47 @@ class Spans:
     ----------
     log : with output, time and reference heading
     channels : inputs of the effects; the rate is that of the gyro, as corrected so far
-    place : point of each known value of the reference
-    at : times of these values, s
+    point_index : point of each known value of the reference
+    value_times : times of these values, s
     time, heading : of the points, s and rad, shape (n + 1,)
     rests : begin and end row of each stretch at rest
     treatment : of the kind of the reference
-    walk : the angle random walk by the white noise of the samples, with that of a reference rate,
-        and by the difference of gyro and reference over a second, the smaller first, rad/√s
-    noisier : ratio of the noise of a reference rate to that of the gyro
+    walk_bounds : the angle random walk by the white noise of the samples, with that of a reference
+        rate, and by the difference of gyro and reference over a second, the smaller first, rad/√s
+    reference_noise_ratio : ratio of the noise of a reference rate to that of the gyro
     delay : of the stamps of the gyro relative to the reference, s
-    by_code : whether the points are changes of the code of an encoder
+    uses_code_changes : whether the points are changes of the code of an encoder
 
     """
 
     log: Log
     channels: Channels
-    at: Array
-    place: NDArray[np.intp]
+    value_times: Array
+    point_index: NDArray[np.intp]
     time: Array
     heading: Array
     rests: tuple[tuple[int, int], ...]
-    treatment: Treatment
-    walk: tuple[float, float]
-    noisier: float = 0.0
+    treatment: ReferenceTreatment
+    walk_bounds: tuple[float, float]
+    reference_noise_ratio: float = 0.0
     delay: float = 0.0
-    by_code: bool = False
+    uses_code_changes: bool = False
 
     @property
-    def fine(self) -> bool:
+    def is_fine(self) -> bool:
         """Tell whether the errors of the reference are small enough to show lags and events."""
-        return self.treatment.relative
+        return self.treatment.is_relative
 
     @property
-    def stretches(self) -> NDArray[np.intp]:
+    def stretch_numbers(self) -> NDArray[np.intp]:
         """Return the number of the stretch of each observation, shape (n + r,)."""
         middle = 0.5 * (self.time[1:] + self.time[:-1]) - self.time[0]
-        count = max(int(np.ceil(middle[-1] / self.treatment.stretch)), 1)
+        count = max(int(np.ceil(middle[-1] / self.treatment.stretch_duration)), 1)
         of_spans = np.minimum(middle * count / (middle[-1] + 1e-9), count - 1).astype(np.intp)
         return np.concatenate([of_spans, count + np.arange(len(self.rests))])
 
     @property
-    def places(self) -> NDArray[np.intp]:
+    def shaft_sectors(self) -> NDArray[np.intp]:
         """
         Return the number of the sector and sense of the shaft of each observation, shape (n + r,).
 
@@ -199,40 +209,40 @@ class Spans:
         Stretches in time would count them as independent.
 
         """
-        middle = self.points(np.asarray(self.channels.heading))
-        cell = np.floor(0.5 * (middle[1:] + middle[:-1]) / _CELL)
+        middle = self.point_means(np.asarray(self.channels.heading))
+        cell = np.floor(0.5 * (middle[1:] + middle[:-1]) / _SHAFT_SECTOR)
         keys = np.concatenate([2.0 * cell + (np.diff(middle) > 0.0), np.zeros(len(self.rests))])
         return np.unique(keys, return_inverse=True)[1].astype(np.intp)
 
-    def points(self, values: Array) -> Array:
+    def point_means(self, values: Array) -> Array:
         """Return the means of a signal at the points, corrected for the delay, shape (n + 1,)."""
         assert self.log.time is not None
-        moved = np.interp(self.at + self.delay, self.log.time, values)
-        return np.bincount(self.place, moved) / np.bincount(self.place)
+        delayed_values = np.interp(self.value_times + self.delay, self.log.time, values)
+        return np.bincount(self.point_index, delayed_values) / np.bincount(self.point_index)
 
-    def integrals(self, rate: Array) -> Array:
+    def span_integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         assert self.log.time is not None
-        whole = angle_of(self.log.time, np.broadcast_to(rate, self.log.time.shape))
+        whole = integrate_with_curvature(self.log.time, np.broadcast_to(rate, self.log.time.shape))
         still = [whole[end] - whole[begin] for begin, end in self.rests]
-        return np.concatenate([np.diff(self.points(whole)), still])
+        return np.concatenate([np.diff(self.point_means(whole)), still])
 
-    def changes(self, values: Array) -> Array:
+    def span_changes(self, values: Array) -> Array:
         """Return the change of a signal over spans, 0 over rests, shape (n + r,)."""
-        return np.concatenate([np.diff(self.points(values)), np.zeros(len(self.rests))])
+        return np.concatenate([np.diff(self.point_means(values)), np.zeros(len(self.rests))])
 
     @property
     def observed(self) -> Array:
         """Return the change of the reference less that of the integral of the output, (n + r,)."""
         assert self.log.output is not None
         turned = np.concatenate([np.diff(self.heading), np.zeros(len(self.rests))])
-        return turned - self.integrals(self.log.output)
+        return turned - self.span_integrals(self.log.output)
 
-    def plain(self) -> Array:
+    def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
         rate = np.asarray(self.channels.rate)
         return np.column_stack([
-            -self.integrals(rate), -self.integrals(np.ones_like(rate)),
+            -self.span_integrals(rate), -self.span_integrals(np.ones_like(rate)),
             np.concatenate([self._rate_changes(), np.zeros(len(self.rests))])])
 
     def _rate_changes(self) -> Array:
@@ -244,56 +254,60 @@ class Spans:
 
         """
         assert self.log.time is not None and self.log.output is not None
-        turned = (np.asarray(self.channels.heading) if self.fine
-                  else angle_of(self.log.time, self.log.output))
-        at, half = self.at + self.delay, float(np.median(np.diff(self.log.time)))
+        turned = (np.asarray(self.channels.heading) if self.is_fine
+                  else integrate_with_curvature(self.log.time, self.log.output))
+        at, half = self.value_times + self.delay, float(np.median(np.diff(self.log.time)))
         while True:
             forth, back = (np.interp(at + way, self.log.time, turned) for way in (half, -half))
-            change = np.diff(np.bincount(self.place, (forth - back) / (2.0 * half))
-                             / np.bincount(self.place))
-            if self.walk[0] ** 2 / half < _NOISY * np.mean(change ** 2) or half > _LONGEST:
+            change = np.diff(np.bincount(self.point_index, (forth - back) / (2.0 * half))
+                             / np.bincount(self.point_index))
+            if (self.walk_bounds[0] ** 2 / half < _MAX_RATE_NOISE_SHARE * np.mean(change ** 2)
+                    or half > _MAX_SMOOTHING_HALF_WIDTH):
                 return np.asarray(change)
             half *= 2.0
 
-    def columns(self, cause: Column) -> Array:
+    def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
         channels = self.channels
         if cause.cause == 'reference_once_per_rev':
             heading = np.asarray(channels.heading)
-            return np.column_stack([self.changes(np.sin(heading)), self.changes(np.cos(heading))])
+            return np.column_stack(
+                [self.span_changes(np.sin(heading)),
+                 self.span_changes(np.cos(heading))])
         if cause.cause == 'reference_slip':
             late = np.asarray(channels.time) >= cause.shapes[0]
-            return self.changes(late.astype(float))[:, None]
+            return self.span_changes(late.astype(float))[:, None]
         if cause.cause == 'bandwidth':
             # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
             assert self.log.time is not None and self.log.output is not None
             change = np.gradient(self.log.output, self.log.time)
-            return -self.changes(change)[:, None]
+            return -self.span_changes(change)[:, None]
         return np.column_stack([
-            -self.integrals(np.asarray(each))
+            -self.span_integrals(np.asarray(each))
             for each in CATALOGUE[cause.cause].columns(channels, *cause.shapes)])
 
-    def rates(self) -> Array:
+    def point_rates(self) -> Array:
         """Return the rate at the points, rad/s, shape (n + 1,)."""
-        return self.points(np.asarray(self.channels.rate))
+        return self.point_means(np.asarray(self.channels.rate))
 
-    def corrected(self, values: Array) -> Spans:
+    def with_corrected_rate(self, values: Array) -> Spans:
         """Return the spans with the rate corrected for scale factor error, bias and delay."""
         assert self.log.output is not None and self.log.time is not None
         rate: Array = (self.log.output - values[1]) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]))
-        turned = angle_of(self.log.time, rate)
+        turned = integrate_with_curvature(self.log.time, rate)
         # the heading of the reference, between its points that of the gyro
         at = self.log.time - moved.delay
-        away: Array = self.heading - moved.points(turned)
-        if self.fine:
-            away = self._of_both(away)
-            steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(away) - 2)
-            rate = rate + (np.diff(away) / np.diff(self.time))[steps]
-        return replace(moved, channels=replace(self.channels.moving(rate, self.log.output),
-                                               heading=turned + np.interp(at, self.time, away)))
+        heading_change: Array = self.heading - moved.point_means(turned)
+        if self.is_fine:
+            heading_change = self._difference_of_gyro(heading_change)
+            steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
+            rate = rate + (np.diff(heading_change) / np.diff(self.time))[steps]
+        return replace(
+            moved, channels=replace(self.channels.with_rate(rate, self.log.output),
+                                    heading=turned + np.interp(at, self.time, heading_change)))
 
-    def _of_both(self, away: Array) -> Array:
+    def _difference_of_gyro(self, heading_change: Array) -> Array:
         """
         Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
 
@@ -302,15 +316,15 @@ class Spans:
         the gyro alone are, which matters if two columns are nearly the same.
 
         """
-        if not self.treatment.of_heading:
-            return away / (1.0 + self.noisier ** 2)
-        walk: Array = self.walk[0] ** 2 * np.diff(self.time)
-        second = robust_deviation(np.diff(away, 2)) ** 2
-        stiff = max(second / 6.0 - float(np.median(walk)) / 3.0, 0.0) / walk
-        both = np.zeros((2, len(away)))
-        both[1] = 1.0 + np.append(stiff, 0.0) + np.append(0.0, stiff)
-        both[0, 1:] = -stiff
-        return np.asarray(solveh_banded(both, away))
+        if not self.treatment.errs_as_heading:
+            return heading_change / (1.0 + self.reference_noise_ratio ** 2)
+        walk: Array = self.walk_bounds[0] ** 2 * np.diff(self.time)
+        second = robust_deviation(np.diff(heading_change, 2)) ** 2
+        stiffness = max(second / 6.0 - float(np.median(walk)) / 3.0, 0.0) / walk
+        banded = np.zeros((2, len(heading_change)))
+        banded[1] = 1.0 + np.append(stiffness, 0.0) + np.append(0.0, stiffness)
+        banded[0, 1:] = -stiffness
+        return np.asarray(solveh_banded(banded, heading_change))
 
 
 @dataclass(frozen=True)
@@ -324,50 +338,51 @@ class SpanFit:
     causes : in addition to scale factor error, bias and delay
     fit : of the restricted likelihood
     values, covariance : estimates and their cluster-robust covariance
-    stretches_of : effective number of stretches that determine each value
+    effective_stretches : effective number of stretches that determine each value
     freedom : degrees of freedom of the deviation of each value
     prior : standard deviations of the prior of scale factor error, bias and delay
 
     """
 
     spans: Spans
-    causes: tuple[Column, ...]
+    causes: tuple[CauseTerm, ...]
     fit: GridFit
     values: Array
     covariance: Array
-    stretches_of: Array
+    effective_stretches: Array
     freedom: Array
     prior: Array
 
-    def half(self, place: int) -> float:
+    def half_width(self, value_index: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
-        freedom = self.freedom[place]
-        deviation = math.sqrt(max(self.covariance[place, place], 0.0))
+        freedom = self.freedom[value_index]
+        deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
         half = float(student.ppf(0.975, freedom)) * deviation
         prior = self.spans.treatment.prior
-        return min(half, NORMAL_95 * prior[place]) if place < len(prior) else half
+        return (min(half, NORMAL_QUANTILE_975
+                    * prior[value_index]) if value_index < len(prior) else half)
 
     @property
     def scale_held(self) -> bool:
         """Tell whether the log does not show the scale factor error, which is left at 0."""
         return bool(self.prior[0] < self.spans.treatment.prior[0])
 
-    def places(self, cause: Column) -> slice:
+    def value_slice(self, cause: CauseTerm) -> slice:
         """Return the places of the values of a cause."""
-        start = len(PLAIN)
+        start = len(BASE_VALUES)
         for each in self.causes:
-            width = self.spans.columns(each).shape[1]
+            width = self.spans.cause_columns(each).shape[1]
             if each == cause:
                 break
             start += width
         return slice(start, start + width)
 
-    def size(self, name: str) -> float:
+    def noise_size(self, name: str) -> float:
         """Return the likeliest size of a part of the noise."""
-        return float(self.fit.likely.get(name, 0.0))
+        return float(self.fit.likeliest_sizes.get(name, 0.0))
 
 
-def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
+def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
     """
     Divide a log with a reference into spans.
 
@@ -379,23 +394,28 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
 
     """
     assert log.time is not None and log.output is not None
-    treatment = {'rate_command': RATE, 'encoder': ENCODER, 'motion_capture': HEADING,
-                 'gyro': HEADING}.get(kind, COURSE)
+    treatment = {
+        'rate_command': RATE_TREATMENT,
+        'encoder': ENCODER_TREATMENT,
+        'motion_capture': HEADING_TREATMENT,
+        'gyro': HEADING_TREATMENT
+    }.get(kind, COURSE_TREATMENT)
     if prior is not None:
         scale, bias, delay = treatment.prior
         treatment = replace(treatment, prior=(min(scale, float(prior[0])),
                                               min(bias, float(prior[1])), delay))
-    time, output = log.time - log.time[0], bridged(log.output)
-    white = white_noise(log.output)
+    time, output = log.time - log.time[0], bridge_gaps(log.output)
+    white = white_noise_deviation(log.output)
     reference, noisier = log.reference_heading, 0.0
     if reference is None:
         assert log.reference_rate is not None
         noisier = rate_noise_share(log)
-        white = math.hypot(white, white_noise(log.reference_rate))
-        reference = angle_of(time, bridged(log.reference_rate))
+        white = math.hypot(white, white_noise_deviation(log.reference_rate))
+        reference = integrate_with_curvature(time, bridge_gaps(log.reference_rate))
     log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
-    if treatment.relative and not treatment.of_heading and heading_errors(log).larger:
-        treatment = replace(treatment, of_heading=True)  # a heading that was differentiated
+    if (treatment.is_relative and not treatment.errs_as_heading
+            and heading_difference(log).is_significant):
+        treatment = replace(treatment, errs_as_heading=True)  # a heading that was differentiated
     at, by_code = time, kind == 'encoder' and encoder_step(reference) > 0.0
     if by_code:
         # between two samples with different codes the shaft was in the middle of both; a single
@@ -405,33 +425,37 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
                                        0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
     known = np.flatnonzero(np.isfinite(reference))
     stamps = at[known]
-    length = max(treatment.span, float(stamps[-1] - stamps[0]) / treatment.most,
+    length = max(treatment.min_span, float(stamps[-1] - stamps[0]) / treatment.max_spans,
                  2.0 * float(np.median(np.diff(time))))
     # a gap begins a new point
     number = np.floor((stamps - stamps[0]) / length + 1e-6)
     place = np.cumsum((np.diff(number, prepend=number[0]) > 0.0)
                       | (np.diff(stamps, prepend=stamps[0]) > length))
-    if not treatment.averaged:
+    if not treatment.averages_span:
         known = known[np.diff(place, prepend=-1) > 0]
         place = np.arange(len(known))
     count = np.bincount(place)
-    channels = replace(channels_of(log), rate=output, time=time, heading=integral_of(time, output))
-    return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
-                 np.bincount(place, reference[known]) / count, _rests(time, output, known),
-                 treatment, _walk(log, white, treatment), noisier, by_code=by_code)
+    channels = replace(channels_from_log(log), rate=output, time=time,
+                       heading=integrate_trapezoidal(time, output))
+    return Spans(log, channels, at[known], place,
+                 np.bincount(place, at[known]) / count,
+                 np.bincount(place, reference[known]) / count, _find_rests(time, output,
+                                                                           known), treatment,
+                 _walk_bounds(log, white, treatment), noisier, uses_code_changes=by_code)
 
 
-def _walk(log: Log, white: float, treatment: Treatment) -> tuple[float, float]:
+def _walk_bounds(log: Log, white: float, treatment: ReferenceTreatment) -> tuple[float, float]:
     """Return bounds of the angle random walk, except for a factor, rad/√s."""
     assert log.time is not None
     walk = white * math.sqrt(float(np.median(np.diff(log.time))))
     # vibration adds white noise without a random walk, and a filter reduces the white noise
-    walks = walk, heading_errors(log).both if treatment.relative else walk
-    least, most = (min(max(each, 1e-9), treatment.largest_walk) for each in sorted(walks))
+    walks = walk, heading_difference(log).total_walk if treatment.is_relative else walk
+    least, most = (min(max(each, 1e-9), treatment.max_walk) for each in sorted(walks))
     return least, most
 
 
-def _rests(time: Array, output: Array, known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
+def _find_rests(time: Array, output: Array,
+                known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
     """Return begin and end row of stretches without a course in which the gyro is quiet."""
     edges = np.concatenate([[0], known, [len(time) - 1]])
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
@@ -439,7 +463,7 @@ def _rests(time: Array, output: Array, known: NDArray[np.intp]) -> tuple[tuple[i
     if blocks < 8:
         return ()
     scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    quiet = _QUIET * float(scatter.min()) + 1e-12
+    quiet = _MAX_REST_SCATTER_RATIO * float(scatter.min()) + 1e-12
     found = []
     for begin, end in zip(edges[:-1], edges[1:]):
         first, last = -(-int(begin) // second) + 1, int(end) // second - 1
@@ -448,53 +472,54 @@ def _rests(time: Array, output: Array, known: NDArray[np.intp]) -> tuple[tuple[i
             if 0 <= block < blocks and scatter[block] <= quiet:
                 run.append(block)
                 continue
-            if len(run) >= _REST:
+            if len(run) >= _MIN_REST_DURATION:
                 found.append((run[0] * second, (run[-1] + 1) * second - 1))
             run = []
     return tuple(found)
 
 
-def fit_spans(spans: Spans, causes: Sequence[Column] = ()) -> SpanFit:
+def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
-    A scale factor error that is determined by fewer than `FEWEST_STRETCHES` stretches cannot be
+    A scale factor error that is determined by fewer than `MIN_STRETCHES` stretches cannot be
     separated from errors of the reference. It is kept at 0, and its interval is that of the prior.
 
     """
     prior = np.array(spans.treatment.prior)
-    free = np.concatenate([prior, np.full(all_columns(spans, causes).shape[1] - 3, np.inf)])
+    free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
     def disagreement(delay: float) -> float:
         """Return the robust difference of gyro and reference at a delay, rad."""
         moved = replace(spans, delay=delay)
-        left = _robustly(moved.plain()[:, :2], moved.observed, prior[:2])[1]
+        left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
         return float(np.mean(np.minimum(np.abs(left[:len(spans.time) - 1]), 10.0 * DEGREE)))
 
-    moved = replace(spans, delay=spans.delay or min(
-        _DELAYS[np.abs(_DELAYS) <= 1.5 * prior[2]].tolist(), key=disagreement))
-    outlying: Array = np.ones(len(spans.time))
-    for _ in range(_PASSES):
-        values = _robustly(all_columns(moved, causes), moved.observed, free)[0]
-        moved = moved.corrected(values)
+    delayed = replace(spans, delay=spans.delay or min(
+        _TRIAL_DELAYS[np.abs(_TRIAL_DELAYS) <= 1.5 * prior[2]].tolist(), key=disagreement))
+    point_variances: Array = np.ones(len(spans.time))
+    for _ in range(_ROBUST_PASSES):
+        values = _robust_least_squares(design_matrix(delayed, causes), delayed.observed, free)[0]
+        delayed = delayed.with_corrected_rate(values)
         values[2] = 0.0
-        left = moved.observed - all_columns(moved, causes) @ values
-        outlying = _outlying(left[:len(spans.time) - 1])
-    done = _with_deviations(moved, causes, outlying, prior)
-    if done.stretches_of[0] >= FEWEST_STRETCHES:
-        return done
-    moved = moved.corrected(np.append(0.0, done.fit.values[1:3]))
-    done = _with_deviations(moved, causes, outlying, prior * [_FIXED, 1.0, 1.0])
-    done.covariance[0, 0] = prior[0] ** 2
-    return done
+        left = delayed.observed - design_matrix(delayed, causes) @ values
+        point_variances = _point_variances(left[:len(spans.time) - 1])
+    fit = _fit_with_noise(delayed, causes, point_variances, prior)
+    if fit.effective_stretches[0] >= MIN_STRETCHES:
+        return fit
+    delayed = delayed.with_corrected_rate(np.append(0.0, fit.fit.values[1:3]))
+    fit = _fit_with_noise(delayed, causes, point_variances,
+                          prior * [_FIXED_PRIOR_FACTOR, 1.0, 1.0])
+    fit.covariance[0, 0] = prior[0] ** 2
+    return fit
 
 
-def all_columns(spans: Spans, causes: Sequence[Column]) -> Array:
+def design_matrix(spans: Spans, causes: Sequence[CauseTerm]) -> Array:
     """Return the columns of scale factor error, bias and delay, and those of causes."""
-    return np.column_stack([spans.plain(), *(spans.columns(each) for each in causes)])
+    return np.column_stack([spans.base_columns(), *(spans.cause_columns(each) for each in causes)])
 
 
-def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
+def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
     """Return values by robust weighted least squares, and the residual."""
     left: Array = observed
     values: Array = np.zeros(columns.shape[1])
@@ -509,42 +534,45 @@ def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Arr
     return values, left
 
 
-def _outlying(left: Array) -> Array:
+def _point_variances(left: Array) -> Array:
     """Return the relative variance of each point, larger for outliers."""
     point = np.concatenate([[0.0], np.cumsum(left)])
     off = np.abs(point - median_filter(point, 9, mode='nearest'))
     # a monotonic drift is equal to its median
     size = 1.4826 * max(float(np.median(off)), float(np.median(np.abs(np.diff(point, 2))))
                         / math.sqrt(6.0)) + 1e-9
-    return np.clip(off / (3.0 * size), 1.0, _FARTHEST) ** 2
+    return np.clip(off / (3.0 * size), 1.0, _MAX_POINT_DEVIATION) ** 2
 
 
-def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
-                     prior: Array) -> SpanFit:
+def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: Array,
+                    prior: Array) -> SpanFit:
     """Fit by the restricted likelihood over a grid of noise, rests with the spans."""
     assert spans.log.time is not None
-    columns, (least, most) = all_columns(spans, causes), spans.walk
-    still = np.array([spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
-    low, high = spans.treatment.walk
+    columns, (least, most) = design_matrix(spans, causes), spans.walk_bounds
+    rest_durations = np.array(
+        [spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
+    low, high = spans.treatment.walk_range
     parts = [replace(part, diagonal=np.concatenate([
-        part.diagonal, still if part.neighbours is None else 0.0 * still]),
-        neighbours=None if part.neighbours is None
-        else np.concatenate([part.neighbours, 0.0 * still]))
-        for part in heading_noise(spans.time, spans.rates(), outlying,
+        part.diagonal, rest_durations if part.off_diagonal is None else 0.0 * rest_durations]),
+        off_diagonal=None if part.off_diagonal is None
+        else np.concatenate([part.off_diagonal, 0.0 * rest_durations]))
+        for part in heading_noise(spans.time, spans.point_rates(), point_variances,
                                   angle_random_walk=(low * least, high * most))
-        if spans.treatment.of_heading or part.name == 'angle_random_walk']
-    waves, shared = _waves(spans)
+        if spans.treatment.errs_as_heading or part.name == 'angle_random_walk']
+    waves, shared = _wander_columns(spans)
     deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
-    fit = noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
+    fit = fit_noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
     values = fit.values.copy()
     values[2] += spans.delay
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
                    np.ones(len(values)), prior)
-    covariance, effective, freedom = _cluster_robust(whitened(done, causes), fit)
-    return replace(done, covariance=covariance, stretches_of=effective, freedom=freedom)
+    covariance, effective, freedom = _cluster_robust_covariance(whiten_regression(done, causes),
+                                                                fit)
+    return replace(done, covariance=covariance, effective_stretches=effective, freedom=freedom)
 
 
-def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array, Array]:
+def _cluster_robust_covariance(data: WhitenedRegression,
+                               fit: GridFit) -> tuple[Array, Array, Array]:
     """
     Return the covariance of the values, not less than the scatter of the scores between stretches.
 
@@ -557,29 +585,29 @@ def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array, Array]:
     information of the stretches over the sum of its squares; and the degrees of freedom.
 
     """
-    count, stretch = len(fit.values), data.stretch
-    values = np.linalg.lstsq(data.plain, data.observed, rcond=None)[0]
-    left = data.observed - data.plain @ values
-    influence = data.plain @ np.linalg.pinv(data.plain.T @ data.plain)[:, :count]
-    inside = stretch < data.of_log
+    count, stretch = len(fit.values), data.row_stretches
+    values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]
+    left = data.observed - data.design @ values
+    influence = data.design @ np.linalg.pinv(data.design.T @ data.design)[:, :count]
+    inside = stretch < data.stretch_count
     scores = np.array([np.bincount(stretch, part * left) for part in influence.T])
     number = float(stretch.max()) + 1.0
-    found = np.maximum(np.diag(fit.covariance), np.sum(scores ** 2, axis=1) * number / max(
+    variances = np.maximum(np.diag(fit.covariance), np.sum(scores ** 2, axis=1) * number / max(
         number - 1.0, 0.5))
-    effective = _effective(stretch[inside], data.plain[inside, :count])
+    effective = _effective_clusters(stretch[inside], data.design[inside, :count])
     freedom = np.maximum(effective - 1.0, 1.0)
-    for cluster in data.places:
-        rests_on = _effective(cluster[inside], influence[inside])
+    for cluster in data.row_sectors:
+        rests_on = _effective_clusters(cluster[inside], influence[inside])
         scatter = _jackknife(data, cluster, inside)[:count]
-        freedom = np.where(scatter > found, np.maximum(rests_on - 1.0, 1.0), freedom)
-        found = np.maximum(found, scatter)
-    larger = np.sqrt(found / np.diag(fit.covariance))
-    return fit.covariance * np.outer(larger, larger), effective, freedom
+        freedom = np.where(scatter > variances, np.maximum(rests_on - 1.0, 1.0), freedom)
+        variances = np.maximum(variances, scatter)
+    inflation = np.sqrt(variances / np.diag(fit.covariance))
+    return fit.covariance * np.outer(inflation, inflation), effective, freedom
 
 
-def _jackknife(data: Whitened, cluster: NDArray[np.intp], inside: Mask) -> Array:
+def _jackknife(data: WhitenedRegression, cluster: NDArray[np.intp], inside: Mask) -> Array:
     """Return the variance of the values by what they are without each cluster in turn."""
-    rows = np.column_stack([data.plain, data.observed])
+    rows = np.column_stack([data.design, data.observed])
     scale = np.sqrt(np.sum(rows ** 2, axis=0)) + 1e-300
     rows = rows / scale
     whole, without = rows.T @ rows, []
@@ -591,34 +619,34 @@ def _jackknife(data: Whitened, cluster: NDArray[np.intp], inside: Mask) -> Array
     return np.asarray((parts - 1) * np.var(without, axis=0) * (scale[-1] / scale[:-1]) ** 2)
 
 
-def _effective(cluster: NDArray[np.intp], columns: Array) -> Array:
+def _effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
     """Return the effective number of clusters that determine each column."""
     shares = np.array([np.bincount(cluster, part ** 2) for part in columns.T])
     return np.asarray(shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300))
 
 
-def _waves(spans: Spans) -> tuple[Array, list[SharedNoise]]:
+def _wander_columns(spans: Spans) -> tuple[Array, list[SharedNoise]]:
     """Return the columns of a wandering bias over spans and rests, and their noise."""
     assert spans.log.time is not None
     treatment = spans.treatment
-    least, most = spans.walk if treatment.relative else (1.0, 1.0)
+    least, most = spans.walk_bounds if treatment.is_relative else (1.0, 1.0)
     flicker, walk = (None if limits is None else (limits[0] * least, limits[1] * most)
-                     for limits in (treatment.flicker, treatment.random_walk))
-    waves, shared = wander(spans.time, flicker, walk, treatment.cosines)
+                     for limits in (treatment.flicker_range, treatment.random_walk_range))
+    waves, shared = bias_wander_columns(spans.time, flicker, walk, treatment.cosine_count)
     begin, end = spans.time[0], spans.time[-1]
     omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
-    still = [np.clip(spans.log.time[list(rest)], begin, end) - begin for rest in spans.rests]
+    rest_times = [np.clip(spans.log.time[list(rest)], begin, end) - begin for rest in spans.rests]
     return np.vstack([waves, *(np.diff(np.sin(omega * each[:, None]), axis=0) / omega
-                               for each in still)]), shared
+                               for each in rest_times)]), shared
 
 
-def shared_noise(spans: Spans) -> list[SharedNoise]:
+def wander_noise(spans: Spans) -> list[SharedNoise]:
     """Return the parts of the noise of a bias that wanders."""
-    return _waves(spans)[1]
+    return _wander_columns(spans)[1]
 
 
 @dataclass(frozen=True)
-class Whitened:
+class WhitenedRegression:
     """
     A whitened regression, for which ordinary least squares is generalized least squares.
 
@@ -628,52 +656,59 @@ class Whitened:
     Attributes
     ----------
     observed : shape (n + r + m,)
-    plain : columns of scale factor error, bias, delay and causes, then those of the wander
-    stretch : of each row
-    places : of an encoder, the place of the shaft of each row
-    of_log : number of stretches of the log; those after them are priors
+    design : columns of scale factor error, bias, delay and causes, then those of the wander
+    row_stretches : of each row
+    row_sectors : of an encoder, the place of the shaft of each row
+    stretch_count : number of stretches of the log; those after them are priors
 
     """
 
     observed: Array
-    plain: Array
-    stretch: NDArray[np.intp]
-    places: tuple[NDArray[np.intp], ...]
-    of_log: int
+    design: Array
+    row_stretches: NDArray[np.intp]
+    row_sectors: tuple[NDArray[np.intp], ...]
+    stretch_count: int
     _fit: GridFit
 
-    def columns(self, columns: Array) -> Array:
+    def whiten_columns(self, columns: Array) -> Array:
         """Return more columns, shape (n + r, k), in units of the noise, shape (n + r + m, k)."""
         more = len(self.observed) - len(columns)
         return np.pad(self._fit.whiten(columns), ((0, more), (0, 0)))
 
 
-def whitened(done: SpanFit, causes: Sequence[Column], noise: SpanFit | None = None,
-             most: bool = False) -> Whitened:
+def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: SpanFit | None = None,
+                      use_max_random_walk: bool = False) -> WhitenedRegression:
     """
     Return the regression of a log on causes, under the noise of a fit of the same log.
 
     Parameters
     ----------
-    done : the log and the prior
+    fit : the log and the prior
     causes : the columns in addition to scale factor error, bias and delay
-    noise : the fit whose noise is used; None is `done`
-    most : whether to use the upper 95 % limit of the rate random walk, as slow bias wander may
-        pass for a cause otherwise
+    noise_fit : the fit whose noise is used; None is `fit`
+    use_max_random_walk : whether to use the upper 95 % limit of the rate random walk, as slow bias
+        wander may pass for a cause otherwise
 
     """
-    spans, noise = done.spans, noise or done
-    waves, shared = _waves(noise.spans)
-    sizes = {part.name: noise.fit.sizes[part.name][2] if most and part.name == 'rate_random_walk'
-             else noise.fit.likely[part.name] for part in shared}
+    spans, noise_fit = fit.spans, noise_fit or fit
+    waves, shared = _wander_columns(noise_fit.spans)
+    sizes = {
+        part.name: noise_fit.fit.sizes[part.name][2] if use_max_random_walk
+        and part.name == 'rate_random_walk' else noise_fit.fit.likeliest_sizes[part.name]
+        for part in shared
+    }
     variance = np.sum([sizes[part.name] ** 2 * part.variance for part in shared], axis=0)
-    columns = np.column_stack([all_columns(spans, causes), waves])
+    columns = np.column_stack([design_matrix(spans, causes), waves])
     width = columns.shape[1] - waves.shape[1]
     prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
-    prior[:3, :3] = np.diag(1.0 / done.prior)
+    prior[:3, :3] = np.diag(1.0 / fit.prior)
     prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
-    clusters = [np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
-                for each in (spans.stretches, *([spans.places] if spans.by_code else []))]
-    return Whitened(np.append(noise.fit.whiten(spans.observed), np.zeros(len(prior))),
-                    np.concatenate([noise.fit.whiten(columns), prior]),
-                    clusters[0], tuple(clusters[1:]), int(spans.stretches.max()) + 1, noise.fit)
+    clusters = [
+        np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
+        for each in (spans.stretch_numbers,
+                     *([spans.shaft_sectors] if spans.uses_code_changes else []))
+    ]
+    return WhitenedRegression(
+        np.append(noise_fit.fit.whiten(spans.observed), np.zeros(len(prior))),
+        np.concatenate([noise_fit.fit.whiten(columns), prior]), clusters[0], tuple(clusters[1:]),
+        int(spans.stretch_numbers.max()) + 1, noise_fit.fit)

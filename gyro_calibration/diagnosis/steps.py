@@ -17,16 +17,16 @@ from itertools import accumulate
 from typing import TypeAlias
 
 #: The first step of every diagnosis in time.
-CHECKS = 'checks of the log'
+CHECKS_STEP = 'checks of the log'
 #: Is called with the share of the work done, which never decreases, and the name of the next step.
 OnProgress: TypeAlias = Callable[[float, str], object]
 #: Is called with the name of the next part.
 OnPart: TypeAlias = Callable[[str], object]
 #: Share of the rest of a step that is assumed for each part, if their number is not known.
-_PART = 0.12
+_PART_SHARE = 0.12
 
 
-class Steps:
+class ProgressSteps:
     """
     The steps of a diagnosis, each with its share of the time.
 
@@ -40,15 +40,15 @@ class Steps:
     def __init__(self, on_progress: OnProgress, shares: Mapping[str, float]) -> None:
         self.on_progress = on_progress
         ends = [end / sum(shares.values()) for end in accumulate(shares.values())]
-        self._span = dict(zip(shares, zip([0.0, *ends], ends)))
-        self._done = self._end = 0.0
+        self._step_ranges = dict(zip(shares, zip([0.0, *ends], ends)))
+        self._done_share = self._step_end = 0.0
 
     def begin(self, words: str) -> None:
         """Report that a step begins."""
-        self._done, self._end = self._span[words]
-        self.on_progress(self._done, words)
+        self._done_share, self._step_end = self._step_ranges[words]
+        self.on_progress(self._done_share, words)
 
-    def within(self, words: str) -> None:
+    def begin_part(self, words: str) -> None:
         """Report that a part of the step under way begins; how many follow is not known."""
-        self.on_progress(self._done, words)
-        self._done += _PART * (self._end - self._done)
+        self.on_progress(self._done_share, words)
+        self._done_share += _PART_SHARE * (self._step_end - self._done_share)

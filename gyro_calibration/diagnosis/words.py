@@ -24,11 +24,11 @@ from gyro_calibration.diagnosis.findings import (
     Diagnosis,
     Estimate,
     Finding,
-    LEAST_PROBABILITY,
+    MIN_PROBABILITY,
     Unexplained,
 )
-from gyro_calibration.logs.log import DEGREE, NORMAL_95
-from gyro_calibration.model.gyro_model import GyroModel, same_effects
+from gyro_calibration.logs.log import DEGREE, NORMAL_QUANTILE_975
+from gyro_calibration.model.gyro_model import GyroModel, have_same_effects
 
 _HOUR = 3600.0
 
@@ -37,18 +37,24 @@ _UNITS = {'1': ('%', 100.0), '1/K': ('%/K', 100.0), 'degC': ('°C', 1.0),
           'rad/√s': ('deg/√h', math.sqrt(_HOUR) / DEGREE),
           'rad/s/√s': ('deg/h/√h', _HOUR ** 1.5 / DEGREE), 'K/s': ('K/min', 60.0)}
 #: Parameters with another displayed unit than others of the same SI unit.
-_PARAMETERS = {'bias_instability': ('deg/h', _HOUR / DEGREE),
-               'rate_ramp': ('deg/s/h', _HOUR / DEGREE), 'k': ('s', 1.0), 'unit_error': ('', 1.0),
-               'outliers': ('', 1.0), 'stuck_samples': ('', 1.0), 'dropped_samples': ('', 1.0)}
+_PARAMETER_UNITS = {
+    'bias_instability': ('deg/h', _HOUR / DEGREE),
+    'rate_ramp': ('deg/s/h', _HOUR / DEGREE),
+    'k': ('s', 1.0),
+    'unit_error': ('', 1.0),
+    'outliers': ('', 1.0),
+    'stuck_samples': ('', 1.0),
+    'dropped_samples': ('', 1.0)
+}
 #: (unit, value below which a finer unit is used, finer unit, factor to it).
-_FINER = (('s', 0.5, 'ms', 1e3), ('%', 0.01, 'ppm', 1e4))
+_FINER_UNITS = (('s', 0.5, 'ms', 1e3), ('%', 0.01, 'ppm', 1e4))
 _RADIANS = re.compile(r'(/?)rad([²³]?)')
 
 
-def for_people(unit: str, parameter: str = '') -> tuple[str, float]:
+def display_unit(unit: str, parameter: str = '') -> tuple[str, float]:
     """Return the displayed unit for an SI unit, and the factor to it."""
-    if parameter in _PARAMETERS or unit in _UNITS:
-        return _PARAMETERS.get(parameter) or _UNITS[unit]
+    if parameter in _PARAMETER_UNITS or unit in _UNITS:
+        return _PARAMETER_UNITS.get(parameter) or _UNITS[unit]
     radians = _RADIANS.search(unit)
     if radians is None:
         return unit, 1.0
@@ -76,88 +82,91 @@ class Quantity:
 
     def __str__(self) -> str:
         """Return it for a sentence, such as 20.1 (19.8 to 20.4) ms."""
-        return _joined(self.value, f'({self.interval})' if self.interval else '', self.power,
-                       self.unit)
+        return _join_words(self.value, f'({self.interval})' if self.interval else '', self.power,
+                           self.unit)
 
     @property
     def estimate(self) -> str:
         """Return the value alone."""
-        return _joined(self.value, self.power, self.unit)
+        return _join_words(self.value, self.power, self.unit)
 
     @property
     def bounds(self) -> str:
         """Return the interval alone, without the unit."""
-        return (_joined(f'({self.interval})', self.power) if self.interval and self.power
+        return (_join_words(f'({self.interval})', self.power) if self.interval and self.power
                 else self.interval)
 
 
-def _joined(*parts: str) -> str:
+def _join_words(*parts: str) -> str:
     return ' '.join(filter(None, parts))
 
 
-def quantity(estimate: Estimate, parameter: str = '') -> Quantity:
+def format_quantity(estimate: Estimate, parameter: str = '') -> Quantity:
     """Return an estimate as people read it."""
-    unit, factor = for_people(estimate.unit, parameter)
+    unit, factor = display_unit(estimate.unit, parameter)
     given = estimate.estimate, *estimate.interval
-    unit, factor = _finer(unit, factor, max(filter(math.isfinite, map(abs, given)), default=0.0),
-                          parameter)
+    unit, factor = _finer_unit(unit, factor,
+                               max(filter(math.isfinite, map(abs, given)), default=0.0), parameter)
     numbers = [factor * number for number in given]
-    power = _power(max((abs(number) for number in numbers if math.isfinite(number)), default=0.0))
+    power = _display_power(
+        max((abs(number) for number in numbers if math.isfinite(number)), default=0.0))
     value, low, high = (number / 10.0 ** power for number in numbers)
     width = high - low
     # two digits of the half-width of the interval
     decimals = (min(max(0, 1 - math.floor(math.log10(0.5 * width))), 8)
                 if 0.0 < width < math.inf else None)
-    interval = f'{_fixed(low, decimals)} to {_fixed(high, decimals)}' if width > 0.0 else ''
-    return Quantity(_fixed(value, decimals), interval, _times(power), unit)
+    interval = (f'{_format_fixed(low, decimals)} to {_format_fixed(high, decimals)}'
+                if width > 0.0 else '')
+    return Quantity(_format_fixed(value, decimals), interval, _power_suffix(power), unit)
 
 
-def _finer(unit: str, factor: float, value: float, parameter: str) -> tuple[str, float]:
-    for name, below, finer, many in _FINER:
-        if unit == name and 0.0 < abs(value * factor) < below and parameter not in _PARAMETERS:
+def _finer_unit(unit: str, factor: float, value: float, parameter: str) -> tuple[str, float]:
+    for name, below, finer, many in _FINER_UNITS:
+        if (unit == name and 0.0 < abs(value * factor) < below
+                and parameter not in _PARAMETER_UNITS):
             return finer, factor * many
     return unit, factor
 
 
-def _power(largest: float) -> int:
+def _display_power(largest: float) -> int:
     """Return the power of ten to write after numbers up to this one: 0 if not needed."""
     return 0 if largest == 0.0 or 1e-4 <= largest < 1e6 else math.floor(math.log10(largest))
 
 
-def _fixed(value: float, decimals: int | None) -> str:
+def _format_fixed(value: float, decimals: int | None) -> str:
     if not math.isfinite(value):
         return 'not known' if math.isnan(value) else '∞' if value > 0.0 else '−∞'
     text = f'{value:.4g}' if decimals is None else f'{value:.{decimals}f}'
     return text.replace('-', '−' if float(text) else '')
 
 
-def _times(power: int) -> str:
-    return f'× 10{raised(power)}' if power else ''
+def _power_suffix(power: int) -> str:
+    return f'× 10{superscript(power)}' if power else ''
 
 
-def raised(power: int) -> str:
+def superscript(power: int) -> str:
     """Return a power as it is written after a ten."""
     return str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
 
 
-def amount(value: float, unit: str, parameter: str = '', digits: int = 3) -> str:
+def format_amount(value: float, unit: str, parameter: str = '', digits: int = 3) -> str:
     """Return a value of SI as people read it, such as 0.123 deg/s."""
-    name, factor = for_people(unit, parameter)
-    name, factor = _finer(name, factor, value, parameter)
-    return _joined(number(value * factor, digits), name)
+    name, factor = display_unit(unit, parameter)
+    name, factor = _finer_unit(name, factor, value, parameter)
+    return _join_words(format_number(value * factor, digits), name)
 
 
-def number(value: float, digits: int = 3) -> str:
+def format_number(value: float, digits: int = 3) -> str:
     """Return a number with so many digits."""
     if not math.isfinite(value):
-        return _fixed(value, None)
-    power = _power(abs(value))
+        return _format_fixed(value, None)
+    power = _display_power(abs(value))
     text = (f'{value / 10.0 ** power:.{digits}g}' if abs(value) < 10.0 ** digits or power
             else f'{value:.0f}')
-    return _joined(text, _times(power)).replace('-', '−')
+    return _join_words(text, _power_suffix(power)).replace('-', '−')
 
 
-def span(seconds: float) -> tuple[str, float]:
+def time_unit(seconds: float) -> tuple[str, float]:
     """Return the unit in which people read times up to this one, and the factor to it."""
     for unit, size, most in (('s', 1.0, 600.0), ('min', 60.0, 4.0 * _HOUR)):
         if seconds <= most:
@@ -165,45 +174,45 @@ def span(seconds: float) -> tuple[str, float]:
     return 'h', 1.0 / _HOUR
 
 
-def chance(probability: float) -> str:
+def format_probability(probability: float) -> str:
     """Return a probability in words."""
     if math.isnan(probability):
         return 'not known'
-    if probability < LEAST_PROBABILITY:
-        return f'below 1 in {1.0 / LEAST_PROBABILITY:,.0f}'.replace(',', ' ')
+    if probability < MIN_PROBABILITY:
+        return f'below 1 in {1.0 / MIN_PROBABILITY:,.0f}'.replace(',', ' ')
     if probability >= 0.1:
         return f'{100.0 * probability:.0f} %'
     return f'1 in {float(f"{1.0 / probability:.2g}"):,.0f}'.replace(',', ' ')
 
 
 #: Largest length of lines for a terminal.
-_WIDTH = 120
+_LINE_WIDTH = 120
 #: Largest number of causes in one sentence.
-_NAMED = 3
-_FIGURES = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
-            'rate_random_walk': 'rad/s/√s'}
+_MAX_NAMED_CAUSES = 3
+_NOISE_UNITS = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
+                'rate_random_walk': 'rad/s/√s'}
 
 
-def clean(text: str) -> str:
+def sanitize_text(text: str) -> str:
     """Return a text, such as a file name, without control characters."""
     plain = text.encode(errors='replace').decode()
     return ''.join('\ufffd' if unicodedata.category(each) in ('Cc', 'Cf') else each
                    for each in plain)
 
 
-def spoken(name: str) -> str:
+def readable_name(name: str) -> str:
     """Return the name of an effect or a parameter as words."""
-    return clean(name).replace('_', ' ')
+    return sanitize_text(name).replace('_', ' ')
 
 
-def listed(words: Sequence[str], last: str = 'and') -> str:
+def join_list(words: Sequence[str], last: str = 'and') -> str:
     """Return words as a list in a sentence."""
     return f' {last} '.join(filter(None, [', '.join(words[:-1]), *words[-1:]]))
 
 
-def sentence(text: str) -> str:
+def as_sentence(text: str) -> str:
     """Return a text with a capital and a full stop."""
-    text = clean(text).strip()
+    text = sanitize_text(text).strip()
     return text if not text else text[0].upper() + text[1:] + ('' if text[-1] in '.!?' else '.')
 
 
@@ -216,39 +225,44 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         return found.cause, f'No cause can be named until this is corrected: {found.remedy}.'
     if diagnosis.verdict == 'adequate':
         return ('Simulation and measurement differ by no more than noise.',
-                _gained(diagnosis))
+                _gain_sentence(diagnosis))
     parts = []
     if established := [each for each in diagnosis.findings if each.status == 'established']:
-        parts.append(f'because of {_named(established)}')
+        parts.append(f'because of {_cause_list_phrase(established)}')
     if unexplained := diagnosis.unexplained:
         most = max(each.share_of_variance for each in unexplained)
         up_to = 'up to ' if len(unexplained) > 1 and most >= 1e-3 else ''
-        parts.append(f'along {listed([spoken(each.along) for each in unexplained[:_NAMED]])} by '
-                     f'{"something" if parts else "structure"} that no cause in the catalogue '
-                     f'explains ({up_to}{_share(most)} of the variance of the residual)')
-    return f'Simulation and measurement differ {", and ".join(parts)}.', _gained(diagnosis)
+        variables = join_list([readable_name(each.along)
+                               for each in unexplained[:_MAX_NAMED_CAUSES]])
+        parts.append(
+            f'along {variables} by '
+            f'{"something" if parts else "structure"} that no cause in the catalogue '
+            f'explains ({up_to}{_format_share(most)} of the variance of the residual)')
+    return f'Simulation and measurement differ {", and ".join(parts)}.', _gain_sentence(diagnosis)
 
 
-def _named(findings: Sequence[Finding]) -> str:
+def _cause_list_phrase(findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
-        shown = [spoken(each.effect) + (' (or {})'.format(
-            listed([spoken(name) for name in each.ambiguous_with], 'or'))
-            if each.ambiguous_with else '') for each in findings[:_NAMED]]
-        more = [f'{len(findings) - _NAMED} more'] if len(findings) > _NAMED else []
-        return f'{len(findings)} causes: {listed(shown + more)}'
+        shown = [readable_name(each.effect) + (' (or {})'.format(
+            join_list([readable_name(name) for name in each.ambiguous_with], 'or'))
+            if each.ambiguous_with else '') for each in findings[:_MAX_NAMED_CAUSES]]
+        more = ([f'{len(findings) - _MAX_NAMED_CAUSES} more']
+                if len(findings) > _MAX_NAMED_CAUSES else [])
+        return f'{len(findings)} causes: {join_list(shown + more)}'
     (found,) = findings
-    size = next(iter(sizes(found).values()), None)
+    size = next(iter(parameter_quantities(found).values()), None)
     if not found.ambiguous_with:
-        return spoken(found.effect) + ('' if size is None else f': {size}')
-    taken = '' if size is None else f'; taken as {spoken(found.effect)} it is {size}'
-    names = listed([spoken(name) for name in (found.effect, *found.ambiguous_with)], 'or')
+        return readable_name(found.effect) + ('' if size is None else f': {size}')
+    taken = '' if size is None else f'; taken as {readable_name(found.effect)} it is {size}'
+    names = join_list([readable_name(name) for name in (found.effect, *found.ambiguous_with)],
+                      'or')
     return f'{names}, which these data cannot distinguish{taken}'
 
 
-def verdict(diagnosis: Diagnosis) -> str:
+def verdict_phrase(diagnosis: Diagnosis) -> str:
     """Return the verdict in a few words."""
     if diagnosis.verdict == 'extended':
-        return ('Extended: causes were found' if offered(diagnosis)
+        return ('Extended: causes were found' if is_model_extended(diagnosis)
                 else 'Not extended: causes were found, none was added to the model')
     return {'adequate': 'Adequate: no cause was found',
             'unexplained': 'Unexplained: a difference has no known cause',
@@ -256,7 +270,7 @@ def verdict(diagnosis: Diagnosis) -> str:
                 diagnosis.verdict]
 
 
-def divided(diagnosis: Diagnosis) -> str:
+def heading_error_sentence(diagnosis: Diagnosis) -> str:
     """Return the shares of refitted values and of named causes in the heading error."""
     shares = diagnosis.heading_shares
     named = {each.effect for each in diagnosis.findings if each.status == 'established'}
@@ -266,77 +280,78 @@ def divided(diagnosis: Diagnosis) -> str:
                 if name in shares and name not in named]
     parts = []
     if refitted:
-        parts.append(f'{_share(sum(shares[name] for name in refitted))} is '
-                     f'{listed(list(map(spoken, refitted)))}, refitted in any case')
+        parts.append(f'{_format_share(sum(shares[name] for name in refitted))} is '
+                     f'{join_list(list(map(readable_name, refitted)))}, refitted in any case')
     causes = [shares[name] for name in named & set(shares)]
-    parts.append(f'{_share(sum(causes))} is of the named causes' if causes
+    parts.append(f'{_format_share(sum(causes))} is of the named causes' if causes
                  else 'no part is of the named causes')
     return f'Of the mean square heading error over 60 s, {", and ".join(parts)}.'
 
 
-def sizes(found: Finding) -> dict[str, Quantity]:
+def parameter_quantities(found: Finding) -> dict[str, Quantity]:
     """Return the parameters of a cause as people read them."""
-    return {name: quantity(value, name) for name, value in found.parameters.items()}
+    return {name: format_quantity(value, name) for name, value in found.parameters.items()}
 
 
-def _share(share: float) -> str:
+def _format_share(share: float) -> str:
     """Return a share in percent, at least 0.1 %."""
     return ('less than 0.1 %' if share < 1e-3 else f'{100.0 * share:.0f} %' if share >= 0.1
-            else f'{number(100.0 * share, 2)} %')
+            else f'{format_number(100.0 * share, 2)} %')
 
 
-def offered(diagnosis: Diagnosis) -> bool:
+def is_model_extended(diagnosis: Diagnosis) -> bool:
     """Tell whether the model was extended: its effects, their values or its noise."""
     before, after = diagnosis.before, diagnosis.model
-    return ((bool(diagnosis.findings) or before.prior is not None)
-            and not (same_effects(before, after) and before.noise == after.noise))
+    return ((bool(diagnosis.findings) or before.prior_deviations is not None)
+            and not (have_same_effects(before, after) and before.noise == after.noise))
 
 
-def is_inside(found: Finding, diagnosis: Diagnosis) -> bool:
+def is_in_extended_model(found: Finding, diagnosis: Diagnosis) -> bool:
     """Tell whether the extended model has a cause: by a new value, and by shapes if several."""
     alone = sum(each.effect == found.effect for each in diagnosis.findings) == 1
-    return offered(diagnosis) and any(
+    return is_model_extended(diagnosis) and any(
         alone or all(found.parameters[shape.name].estimate == value
-                     for shape, value in zip(term.effect.shapes, term.values)
+                     for shape, value in zip(term.effect.nonlinear_parameters, term.values)
                      if shape.name in found.parameters)
         for term in diagnosis.model.terms
         if term.effect.name == found.effect and term not in diagnosis.before.terms)
 
 
-def _gained(diagnosis: Diagnosis) -> str:
+def _gain_sentence(diagnosis: Diagnosis) -> str:
     gain = diagnosis.gain
-    if not offered(diagnosis) and (gain is None or gain.models.get('given')
-                                   == gain.models.get('extended')):
+    if not is_model_extended(diagnosis) and (gain is None or gain.models.get('given')
+                                             == gain.models.get('extended')):
         return 'No extended model is offered: the model is unchanged.'
-    model = ('The extended model' if offered(diagnosis) else
-             f'The model, {_values(diagnosis.model)} alone,')
+    model = ('The extended model' if is_model_extended(diagnosis) else
+             f'The model, {_model_values_phrase(diagnosis.model)} alone,')
     if gain is None:
         return 'An extended model is offered; its gain was not measured.'
     if gain.heading is None:
-        return (f'{model} {change(gain.rate, "rad/s", "the rate error")}, measured on '
-                f'{clean(gain.held_out)}.')
+        return (f'{model} {change_phrase(gain.rate, "rad/s", "the rate error")}, measured on '
+                f'{sanitize_text(gain.held_out)}.')
     what = f'the heading error over {gain.window:g} s'
-    return (f'{model} {change(gain.heading, "rad", what)}, measured on '
-            f'{clean(gain.held_out)}.')
+    return (f'{model} {change_phrase(gain.heading, "rad", what)}, measured on '
+            f'{sanitize_text(gain.held_out)}.')
 
 
-def _values(model: GyroModel) -> str:
+def _model_values_phrase(model: GyroModel) -> str:
     """Return the fitted values of a model with their intervals of 95 %."""
     return ' and '.join(
-        f'{spoken(effect)} {quantity(Estimate.about(value, half, parameter.unit), effect)}'
+        f'{readable_name(effect)} '
+        f'{format_quantity(Estimate.from_half_width(value, half, parameter.unit), effect)}'
         for effect, parameter, value, deviation in model.estimates()
-        for half in [NORMAL_95 * deviation if math.isfinite(deviation) else 0.0])
+        for half in [NORMAL_QUANTILE_975 * deviation if math.isfinite(deviation) else 0.0])
 
 
-def change(errors: Change, unit: str, what: str) -> str:
+def change_phrase(errors: Change, unit: str, what: str) -> str:
     """Return the change of an error, as the end of a sentence."""
-    before, after = (amount(value, unit) for value in (errors.before, errors.after))
+    before, after = (format_amount(value, unit) for value in (errors.before, errors.after))
     if errors.interval is None:
         return (f'changes {what} from {before} to {after} rms; one part was held out, so there '
                 'is no interval')
     if errors.interval[0] > 0.0:
         return f'reduces {what} from {before} to {after} rms'
-    if errors.worse:
+    if errors.is_worse:
         return f'increases {what} from {before} to {after} rms'
     return (f'changes {what} from {before} to {after} rms; the 95 % interval of the reduction '
             'includes zero')
@@ -344,107 +359,110 @@ def change(errors: Change, unit: str, what: str) -> str:
 
 # single causes
 
-def shown_by(found: Finding) -> list[str]:
+def cause_sentences(found: Finding) -> list[str]:
     """Return description and evidence of a cause, a sentence each."""
-    return [sentence(text) for text in (found.cause, found.evidence) if text.strip()]
+    return [as_sentence(text) for text in (found.cause, found.evidence) if text.strip()]
 
 
-def certainty(found: Finding) -> list[str]:
+def certainty_sentences(found: Finding) -> list[str]:
     """Return whether a cause is confirmed, its probability by noise alone, and where it is."""
     status = 'Suspected' if found.status == 'suspected' else 'Established'
     where = '' if found.where is None else ' in {:.4g} to {:.4g} s of the log'.format(*found.where)
     if not found.p_value:  # seen in the samples themselves, without a test
         return [f'{status}{where}.'] if where or found.status == 'suspected' else []
-    return [f'{status}{where}; probability by noise alone: {chance(found.p_value)}.']
+    return [f'{status}{where}; probability by noise alone: {format_probability(found.p_value)}.']
 
 
-def remedy(found: Finding, diagnosis: Diagnosis) -> str:
+def remedy_sentence(found: Finding, diagnosis: Diagnosis) -> str:
     """Return what to do about a cause, as a sentence; empty where nothing is known."""
-    if is_inside(found, diagnosis):
+    if is_in_extended_model(found, diagnosis):
         return 'It is in the extended model.'
-    return f'Remedy: {clean(found.remedy).rstrip(".")}.' if found.remedy else ''
+    return f'Remedy: {sanitize_text(found.remedy).rstrip(".")}.' if found.remedy else ''
 
 
-def alternatives(found: Finding) -> str:
+def alternatives_sentence(found: Finding) -> str:
     """Return the alternatives and the experiment that would distinguish them; '' without any."""
     if not found.ambiguous_with:
         return ''
-    others = listed([spoken(name) for name in found.ambiguous_with], 'or')
-    experiment = clean(found.separate_by).rstrip('.')
+    others = join_list([readable_name(name) for name in found.ambiguous_with], 'or')
+    experiment = sanitize_text(found.separate_by).rstrip('.')
     way = (f' To distinguish them: {experiment}.' if experiment
            else ' No experiment is known that would distinguish them.')
     stated = experiment and experiment in found.remedy
     return f'These data do not exclude {others} instead.{"" if stated else way}'
 
 
-def smallest(found: Finding) -> str:
+def detectability_sentence(found: Finding) -> str:
     """Return the smallest detectable size, as a sentence; empty where that has no meaning."""
     if found.minimum_detectable is None or not found.parameters:
         return ''
     name, first = next(iter(found.parameters.items()))
-    return f'Smallest detectable: {amount(found.minimum_detectable, first.unit, name, 2)}.'
+    return f'Smallest detectable: {format_amount(found.minimum_detectable, first.unit, name, 2)}.'
 
 
-def unknown(each: Unexplained) -> str:
+def structure_sentence(each: Unexplained) -> str:
     """Return share and probability of structure that no cause explains."""
-    share = _share(each.share_of_variance)
-    return (f'Along {spoken(each.along)}: {share} of the variance of the residual; probability by '
-            f'noise alone: {chance(each.p_value)}.')
+    share = _format_share(each.share_of_variance)
+    return (f'Along {readable_name(each.along)}: {share} of the variance of the residual; '
+            'probability by '
+            f'noise alone: {format_probability(each.p_value)}.')
 
 
-def heading_shares(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+def heading_share_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Return each cause, the reference and the rest with their parts of the heading error."""
     names = {'reference': 'errors of the reference', 'left': 'not explained'}
-    return [(names.get(name, spoken(name)), _share(share))
+    return [(names.get(name, readable_name(name)), _format_share(share))
             for name, share in sorted(diagnosis.heading_shares.items(), key=lambda each: -each[1])]
 
 
-def noise_figures(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+def noise_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Return the name of each noise figure, that of the residual, and that of the simulation."""
-    def shown(value: float, name: str) -> str:
-        return amount(value, _FIGURES[name], name) if value else 'none'
-    return [(spoken(name), shown(getattr(diagnosis.noise, name), name),
-             shown(getattr(diagnosis.simulated, name), name))
-            for name in _FIGURES]
+    def format_value(value: float, name: str) -> str:
+        return format_amount(value, _NOISE_UNITS[name], name) if value else 'none'
+    return [(readable_name(name), format_value(getattr(diagnosis.noise, name), name),
+             format_value(getattr(diagnosis.simulated, name), name))
+            for name in _NOISE_UNITS]
 
 
-def hidden(cannot_show: Mapping[str, str]) -> dict[str, list[str]]:
+def causes_by_reason(cannot_show: Mapping[str, str]) -> dict[str, list[str]]:
     """Return the causes that the logs cannot show, by the reason."""
     reasons: dict[str, list[str]] = {}
     for name, reason in cannot_show.items():
-        reasons.setdefault(sentence(reason), []).append(spoken(name))
+        reasons.setdefault(as_sentence(reason), []).append(readable_name(name))
     return reasons
 
 
 # for a terminal
 
-def lines(diagnosis: Diagnosis) -> Iterator[str]:
+def terminal_lines(diagnosis: Diagnosis) -> Iterator[str]:
     """Give the diagnosis for a terminal: the finding in two sentences, then a short list."""
-    yield from map(_wrapped, headline(diagnosis))
+    yield from map(_wrap_line, headline(diagnosis))
     for place, found in enumerate(diagnosis.findings, 1):
         mark = f'{place}. '
-        parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}'
-                      for name, size in sizes(found).items()]
+        parameters = [str(size) if name == found.effect else f'{readable_name(name)} {size}'
+                      for name, size in parameter_quantities(found).items()]
         yield ''
-        yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}'
-                       f'{", ".join(parameters)}', len(mark))
-        for text in (' '.join([*shown_by(found), *certainty(found), smallest(found)]),
-                     alternatives(found), remedy(found, diagnosis)):
+        yield _wrap_line(f'{mark}{readable_name(found.effect)}{": " if parameters else ""}'
+                         f'{", ".join(parameters)}', len(mark))
+        for text in (' '.join([
+                *cause_sentences(found), *certainty_sentences(found),
+                detectability_sentence(found)
+        ]), alternatives_sentence(found), remedy_sentence(found, diagnosis)):
             if text:
-                yield _wrapped(' ' * len(mark) + text, len(mark))
+                yield _wrap_line(' ' * len(mark) + text, len(mark))
     for title, items in (
-            ('Structure that no cause explains:', map(unknown, diagnosis.unexplained)),
+            ('Structure that no cause explains:', map(structure_sentence, diagnosis.unexplained)),
             ('Shares of the mean square heading error over 60 s'
              + (', above 100 % where causes cancel each other:'
                 if max(diagnosis.heading_shares.values(), default=0.0) > 1.0 else ':'),
-             [f'{name}: {share}' for name, share in heading_shares(diagnosis)]),
-            ('These data cannot show:', [f'{listed(names)}: {reason}' for reason, names
-                                         in hidden(diagnosis.cannot_show).items()]),
-            ('Remarks:', map(sentence, diagnosis.remarks))):
+             [f'{name}: {share}' for name, share in heading_share_rows(diagnosis)]),
+            ('These data cannot show:', [f'{join_list(names)}: {reason}' for reason, names
+                                         in causes_by_reason(diagnosis.cannot_show).items()]),
+            ('Remarks:', map(as_sentence, diagnosis.remarks))):
         if texts := list(items):
-            yield from ('', title, *(_wrapped(f'- {text}', 2) for text in texts))
+            yield from ('', title, *(_wrap_line(f'- {text}', 2) for text in texts))
 
 
-def _wrapped(text: str, indent: int = 0) -> str:
-    return textwrap.fill(text, _WIDTH, subsequent_indent=' ' * indent, break_long_words=False,
+def _wrap_line(text: str, indent: int = 0) -> str:
+    return textwrap.fill(text, _LINE_WIDTH, subsequent_indent=' ' * indent, break_long_words=False,
                          break_on_hyphens=False)

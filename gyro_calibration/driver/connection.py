@@ -30,9 +30,9 @@ import termios
 import threading
 from typing import NamedTuple, TypeVar
 
-from gyro_calibration.driver.protocols import Decoder, find, Protocol, Sample, Settings
-from gyro_calibration.driver.protocols.listening import BAUDS, Recognition, recognize
-from gyro_calibration.driver.timestamps import SampleClock, steady
+from gyro_calibration.driver.protocols import Decoder, find_protocol, Protocol, Sample, Settings
+from gyro_calibration.driver.protocols.listening import BAUDS, Recognition, recognize_protocol
+from gyro_calibration.driver.timestamps import read_steady_clock, SampleClock
 import serial
 
 _Result = TypeVar('_Result')
@@ -80,11 +80,11 @@ class SerialPort:
             self._port = serial.Serial(self.path, self.baud, timeout=self._timeout,
                                        write_timeout=1.0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
-            raise PortError(f'cannot open {self.path}: {_reason(error)}') from error
+            raise PortError(f'cannot open {self.path}: {_describe_error(error)}') from error
 
     def read(self) -> bytes:
         """Return the available bytes; wait for the first one up to the timeout."""
-        def take(port: serial.Serial) -> bytes:
+        def read_available(port: serial.Serial) -> bytes:
             # read of pyserial returns the first byte alone, and needs two more calls for the rest
             if not select.select([port], [], [], self._timeout)[0]:
                 return b''
@@ -93,11 +93,11 @@ class SerialPort:
                 raise OSError(errno.EIO, 'end of file')
             return data
 
-        return self._guarded(take)
+        return self._call_port(read_available)
 
     def write(self, data: bytes) -> None:
         """Send bytes to the device."""
-        self._guarded(lambda port: port.write(data))
+        self._call_port(lambda port: port.write(data))
 
     def set_baud(self, baud: int) -> None:
         """Change the baud rate and discard input, without opening the port again."""
@@ -107,7 +107,7 @@ class SerialPort:
             port.baudrate = baud
             port.reset_input_buffer()
 
-        self._guarded(change)
+        self._call_port(change)
 
     def close(self) -> None:
         """Close the port, if it is open."""
@@ -115,17 +115,17 @@ class SerialPort:
         if port is not None:
             port.close()
 
-    def _guarded(self, action: Callable[[serial.Serial], _Result]) -> _Result:
+    def _call_port(self, action: Callable[[serial.Serial], _Result]) -> _Result:
         if self._port is None:
             raise PortError(f'{self.path} is not open: open it first')
         try:
             return action(self._port)
         except (OSError, ValueError, termios.error) as error:
             self.close()
-            raise PortError(f'lost {self.path}: {_reason(error)}') from error
+            raise PortError(f'lost {self.path}: {_describe_error(error)}') from error
 
 
-def _reason(error: BaseException) -> str:
+def _describe_error(error: BaseException) -> str:
     """Return why a port failed, with a remedy; pyserial has some error numbers in the cause."""
     cause: BaseException | None = error
     while cause is not None:
@@ -139,14 +139,15 @@ def _reason(error: BaseException) -> str:
 AUTO = 'auto'
 """Name of the protocol that stands for recognition by listening."""
 
-_SILENCE = 2.0  # s; time without a sample, after which the port is opened again
-_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
-_REOPEN = (0.1, 5.0)  # s; first and longest delay before a lost port is opened again
-_RESTART = 5.0  # s; longest silence of a board that restarts when its port is opened
-_ASKING = 0.8  # s; interval of requests to send: a gyro that starts does not receive them
-_LISTENING = 1.0  # s; listening time, in which a gyro of 10 Hz sends enough
-_POLLING = 0.1  # s; interval of attempts to recognize the protocol
-_MOST_BYTES = 16384  # last bytes that are used to recognize the protocol
+_SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
+_SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
+_REOPEN_DELAYS = (0.1, 5.0)  # s; first and longest delay before a lost port is opened again
+_RESTART_DURATION = 5.0  # s; longest silence of a board that restarts when its port is opened
+# s; interval of requests to send: a gyro that starts does not receive them
+_REQUEST_INTERVAL = 0.8
+_LISTENING_DURATION = 1.0  # s; listening time, in which a gyro of 10 Hz sends enough
+_RECOGNITION_INTERVAL = 0.1  # s; interval of attempts to recognize the protocol
+_MAX_RECOGNITION_BYTES = 16384  # last bytes that are used to recognize the protocol
 
 
 @dataclass(frozen=True)
@@ -159,16 +160,16 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class State:
+class ConnectionState:
     """State of a connection: opening, listening, reading (samples come) or failed."""
 
     name: str
     problem: str = ''  # one sentence while failed
-    waiting: float = 0.0  # s; while failed: time until the port is opened again
+    retry_delay: float = 0.0  # s; while failed: time until the port is opened again
 
 
 @dataclass(frozen=True)
-class Counts:
+class ConnectionCounts:
     """Counts since the start."""
 
     samples: int = 0
@@ -179,7 +180,7 @@ class Counts:
     discarded_bytes: int = 0  # outside of frames
 
 
-def resolve(port: str) -> str:
+def resolve_port(port: str) -> str:
     """
     Return the port that matches a pattern such as ``/dev/serial/by-id/*A9003XYZ*``.
 
@@ -198,43 +199,43 @@ def resolve(port: str) -> str:
     return matches[0]
 
 
-class _Silence:
+class _SilenceTimer:
     """
     Timer of the silence since the port was opened or since the last sample.
 
-    At `end`, after `timeout`, s, the port is opened again. Until the second sample, which shows
-    the period, the timer allows 5 s more: opening the port again would restart a board that is
-    still starting.
+    At `deadline`, after `timeout`, s, the port is opened again. Until the second sample, which
+    shows the period, the timer allows 5 s more: opening the port again would restart a board that
+    is still starting.
 
     """
 
     def __init__(self, period: float, now: float):
-        self._samples, self._asked = 0, now
+        self._samples, self._last_request = 0, now
         self.restart(period, now)
 
     def restart(self, period: float, now: float, samples: int = 0) -> None:
         """Start the timer again, after some samples."""
         self._samples += samples
-        self.timeout = max(_SILENCE, _PERIODS * period)
-        self.end = now + self.timeout + (_RESTART if self._samples < 2 else 0.0)
-        self._begin, self._polls = now, 0
+        self.timeout = max(_SILENCE_TIMEOUT, _SILENCE_PERIODS * period)
+        self.deadline = now + self.timeout + (_RESTART_DURATION if self._samples < 2 else 0.0)
+        self._start, self._polls = now, 0
 
-    def is_to_ask(self, now: float) -> bool:
+    def is_request_due(self, now: float) -> bool:
         """Tell whether another request to send is due; then count it as sent."""
-        if self._samples or now - self._asked < _ASKING:
+        if self._samples or now - self._last_request < _REQUEST_INTERVAL:
             return False
-        self._asked = now
+        self._last_request = now
         return True
 
     def poll(self, now: float) -> bool:
         """Tell whether another half of the timeout, or all time, has passed."""
-        if now < min(self._begin + 0.5 * self.timeout * (self._polls + 1), self.end):
+        if now < min(self._start + 0.5 * self.timeout * (self._polls + 1), self.deadline):
             return False
         self._polls += 1
         return True
 
     @property
-    def is_problem(self) -> bool:
+    def has_timed_out(self) -> bool:
         """Whether the silence has lasted for the timeout."""
         return self._polls > 1
 
@@ -256,7 +257,7 @@ class Connection:
     protocol : name of a protocol, or ``'auto'``
     baud : bits per second; 0 for that of the protocol
     settings : Settings or None
-    on_change : is called with each new `State`, in the thread that reads
+    on_change : is called with each new `ConnectionState`, in the thread that reads
     clock : returns seconds of a steady clock
     make_port : makes a `SerialPort` of a path and a baud
 
@@ -266,8 +267,8 @@ class Connection:
     protocol, clock, baud : None and 0 until the protocol is known
     path : the device of the port when it was last opened, links resolved
     detected : result of the recognition by listening, in a sentence
-    openings : number of times that the port was opened
-    waited : total waiting time for the port, s
+    open_count : number of times that the port was opened
+    waited_duration : total waiting time for the port, s
     longest_gap : longest time between two samples, s; 0 while none exceeds 1.5 periods
     last_error : str
 
@@ -283,40 +284,41 @@ class Connection:
         protocol: str = AUTO,
         baud: int = 0,
         settings: Settings | None = None,
-        on_change: Callable[[State], None] = lambda state: None,
-        clock: Callable[[], float] = steady,
+        on_change: Callable[[ConnectionState], None] = lambda state: None,
+        clock: Callable[[], float] = read_steady_clock,
         make_port: Callable[[str, int], SerialPort] = SerialPort,
     ):
         self._pattern, self._settings = port, settings or Settings()
         self._bauds = (baud,) if baud else BAUDS
-        self._on_change, self._now, self._make_port = on_change, clock, make_port
-        self.state = State('opening')
+        self._on_change, self._read_clock, self._make_port = on_change, clock, make_port
+        self.state = ConnectionState('opening')
         self.protocol: Protocol | None = None
         self.clock: SampleClock | None = None
         self._decoder: Decoder | None = None
         self._port: SerialPort | None = None
         self._last_stamp = -math.inf
-        self._past, self._samples, self._delay, self._read_bytes = Counts(), 0, _REOPEN[0], 0
+        self._previous_counts, self._samples, self._reopen_delay, self._read_bytes = (
+            ConnectionCounts(), 0, _REOPEN_DELAYS[0], 0)
         self.baud, self.path, self.detected, self.last_error = 0, '', '', ''
-        self.openings, self.waited, self.longest_gap = 0, 0.0, 0.0
+        self.open_count, self.waited_duration, self.longest_gap = 0, 0.0, 0.0
         self._is_auto = protocol == AUTO
         if not self._is_auto:
             try:
-                known = find(protocol)
+                known = find_protocol(protocol)
             except ValueError as error:
                 raise ValueError(f'{error}, or {AUTO} to find it by listening') from None
-            self._use(known, baud or known.baud)
+            self._set_protocol(known, baud or known.baud)
 
-    def counts(self) -> Counts:
+    def counts(self) -> ConnectionCounts:
         """Return the counts since the start; may be called from any thread."""
-        past, decoder, clock = self._past, self._decoder, self.clock
+        past, decoder, clock = self._previous_counts, self._decoder, self.clock
         if decoder is None or clock is None:
             return replace(past, samples=self._samples)
-        return Counts(self._samples, past.lost_samples + clock.lost,
-                      past.refused_samples + decoder.refused_samples,
-                      past.refused_temperatures + decoder.refused_temperatures,
-                      past.device_faults + decoder.faults,
-                      past.discarded_bytes + decoder.discarded_bytes)
+        return ConnectionCounts(self._samples, past.lost_samples + clock.lost_count,
+                                past.refused_samples + decoder.refused_samples,
+                                past.refused_temperatures + decoder.refused_temperatures,
+                                past.device_faults + decoder.device_faults,
+                                past.discarded_bytes + decoder.discarded_bytes)
 
     def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
         """
@@ -331,15 +333,15 @@ class Connection:
                     yield from self._read(self._open(stop), stop)
                 except PortError as error:
                     self._close()
-                    self._fail(str(error), self._delay)
-                    begin = self._now()
-                    stop.wait(self._delay)
-                    self.waited += self._now() - begin
-                    self._delay = min(2.0 * self._delay, _REOPEN[1])
+                    self._set_failed(str(error), self._reopen_delay)
+                    begin = self._read_clock()
+                    stop.wait(self._reopen_delay)
+                    self.waited_duration += self._read_clock() - begin
+                    self._reopen_delay = min(2.0 * self._reopen_delay, _REOPEN_DELAYS[1])
         finally:
             self._close()
 
-    def _use(self, protocol: Protocol, baud: int) -> None:
+    def _set_protocol(self, protocol: Protocol, baud: int) -> None:
         self._decoder = protocol.decoder(self._settings)
         self.clock = SampleClock(protocol.nominal_rate(self._settings), protocol.modulus,
                                  self._last_stamp)
@@ -347,11 +349,11 @@ class Connection:
 
     def _open(self, stop: threading.Event) -> SerialPort:
         """Open the port, listen if the protocol is unknown, and request the gyro to send."""
-        path = resolve(self._pattern)
+        path = resolve_port(self._pattern)
         self.path = os.path.realpath(path)
         self._port = port = self._make_port(path, self.baud if self.protocol else self._bauds[0])
         port.open()
-        self.openings += 1
+        self.open_count += 1
         if self.protocol is None:
             self._listen(port, stop)
         if self.protocol is not None:
@@ -369,8 +371,8 @@ class Connection:
         time until they send.
 
         """
-        self._change(State('listening'))
-        end = self._now() + _SILENCE + _RESTART
+        self._set_state(ConnectionState('listening'))
+        end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:
             tried: list[Recognition] = []
             for baud in self._bauds:
@@ -380,72 +382,74 @@ class Connection:
                     return
                 found = tried[-1].protocol
                 if found is not None:
-                    self.detected = tried[-1].words
+                    self.detected = tried[-1].summary
                     try:
-                        self._use(found, baud)
+                        self._set_protocol(found, baud)
                     except ValueError as error:
                         raise PortError(f'{found.name} comes on {self._pattern}, but '
                                         f'{error}') from error
                     return
-            best = max(tried, key=lambda each: each.explained)
+            best = max(tried, key=lambda each: each.explained_share)
             self._report_or_raise(
                 f'bytes come on {self._pattern}, but no protocol was recognized at '
-                f'{", ".join(map(str, self._bauds))} bit/s; nearest: {best.words}', end)
+                f'{", ".join(map(str, self._bauds))} bit/s; nearest: {best.summary}', end)
 
-    def _recognize(self, port: SerialPort, restarted: float, stop: threading.Event) -> Recognition:
+    def _recognize(self, port: SerialPort, deadline: float, stop: threading.Event) -> Recognition:
         """Return the result of the recognition within 1 s after the first byte."""
-        data, opened, end, due = b'', self._now(), math.inf, 0.0
+        data, opened, end, due = b'', self._read_clock(), math.inf, 0.0
         while not stop.is_set():
-            data = (data + port.read())[-_MOST_BYTES:]
-            now = self._now()
-            if not data and now - opened > _SILENCE:
-                self._report_or_raise(self._nothing(_SILENCE), restarted)
+            data = (data + port.read())[-_MAX_RECOGNITION_BYTES:]
+            now = self._read_clock()
+            if not data and now - opened > _SILENCE_TIMEOUT:
+                self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), deadline)
             if data and now >= due:
-                recognition = recognize(data, self._settings)
-                due, end = now + _POLLING, min(end, now + _LISTENING)
+                recognition = recognize_protocol(data, self._settings)
+                due, end = now + _RECOGNITION_INTERVAL, min(end, now + _LISTENING_DURATION)
                 if recognition.protocol is not None or now >= end:
                     return recognition
-        return recognize(b'', self._settings)
+        return recognize_protocol(b'', self._settings)
 
-    def _report_or_raise(self, problem: str, end: float) -> None:
+    def _report_or_raise(self, problem: str, deadline: float) -> None:
         """Report a problem while the port stays open; raise `PortError` after a time."""
-        now = self._now()
-        if now >= end:
+        now = self._read_clock()
+        if now >= deadline:
             raise PortError(problem)
         if problem != self.state.problem:
-            self._fail(problem, end - now)
+            self._set_failed(problem, deadline - now)
 
     def _read(self, port: SerialPort, stop: threading.Event) -> Iterator[Chunk]:
         decoder, clock = self._decoder, self.clock
         if decoder is None or clock is None:  # stopped while listening
             return
-        silence, counts = _Silence(clock.period, self._now()), self._unusable(decoder)
+        silence, counts = (_SilenceTimer(clock.period,
+                                         self._read_clock()), self._unusable_counts(decoder))
         while not stop.is_set():
             data = port.read()
-            arrival = self._now()
+            arrival = self._read_clock()
             samples = decoder.feed(data)
             self._read_bytes += len(data)
             if samples:
-                yield self._chunk(samples, arrival)
+                yield self._make_chunk(samples, arrival)
                 silence.restart(clock.period, arrival, len(samples))
                 continue
-            if silence.is_to_ask(arrival):
+            if silence.is_request_due(arrival):
                 assert self.protocol is not None
                 port.write(self.protocol.startup)
             if silence.poll(arrival):
-                before, counts = counts, self._unusable(decoder)
-                if silence.is_problem:
-                    problem = self._why_silent(decoder, before, silence.timeout)
-                    self._report_or_raise(problem, silence.end)
+                before, counts = counts, self._unusable_counts(decoder)
+                if silence.has_timed_out:
+                    problem = self._explain_silence(decoder, before, silence.timeout)
+                    self._report_or_raise(problem, silence.deadline)
 
-    def _unusable(self, decoder: Decoder) -> tuple[int, int, int]:
+    def _unusable_counts(self, decoder: Decoder) -> tuple[int, int, int]:
         """Return the counts of bytes, values marked as invalid, and refused values."""
-        return self._read_bytes, decoder.faults, decoder.refused_samples
+        return self._read_bytes, decoder.device_faults, decoder.refused_samples
 
-    def _why_silent(self, decoder: Decoder, before: tuple[int, int, int], limit: float) -> str:
-        counts, port = self._unusable(decoder), self._pattern
+    def _explain_silence(self, decoder: Decoder, previous_counts: tuple[int, int, int],
+                         limit: float) -> str:
+        counts, port = self._unusable_counts(decoder), self._pattern
         has_bytes, has_faults, is_beyond = (
-            now > then for now, then in zip(counts, before, strict=True))
+            now > then for now, then in zip(counts, previous_counts, strict=True))
         if has_faults:
             return (f'the gyro on {port} marks all samples as invalid for {limit:g} s: turn it '
                     'off and on, then have it checked')
@@ -453,38 +457,39 @@ class Connection:
             return (f'all samples on {port} are beyond full scale for {limit:g} s: check '
                     'protocol, sensitivity and full_scale')
         if not has_bytes:
-            return self._nothing(limit)
+            return self._no_data_message(limit)
         assert self.protocol is not None
         problem = (f'bytes come on {port}, but no sample of {self.protocol.name} for {limit:g} s: '
                    'check protocol, baud and columns')
         if self._is_auto:
             # keep the counts, and listen again
-            self._past, self._decoder, self.clock, self.protocol = self.counts(), None, None, None
+            self._previous_counts, self._decoder, self.clock, self.protocol = (
+                self.counts(), None, None, None)
             raise PortError(problem)
         return problem
 
-    def _nothing(self, limit: float) -> str:
+    def _no_data_message(self, limit: float) -> str:
         return (f'nothing comes on {self._pattern} for {limit:g} s: check the power and the wires '
                 'of the gyro')
 
-    def _chunk(self, samples: list[Sample], arrival: float) -> Chunk:
+    def _make_chunk(self, samples: list[Sample], arrival: float) -> Chunk:
         assert self.clock is not None
-        stamps = self.clock.stamp(samples, arrival)
+        stamps = self.clock.stamp_samples(samples, arrival)
         if self._samples:
             longest = max(map(sub, stamps, [self._last_stamp, *stamps]))
             if longest > max(self.longest_gap, 1.5 * self.clock.period):
                 self.longest_gap = longest
         self._samples, self._last_stamp = self._samples + len(samples), stamps[-1]
         if self.state.name != 'reading':
-            self._delay = _REOPEN[0]
-            self._change(State('reading'))
+            self._reopen_delay = _REOPEN_DELAYS[0]
+            self._set_state(ConnectionState('reading'))
         return Chunk(samples, stamps, arrival)
 
-    def _fail(self, problem: str, waiting: float) -> None:
+    def _set_failed(self, problem: str, waiting: float) -> None:
         self.last_error = problem
-        self._change(State('failed', problem, waiting))
+        self._set_state(ConnectionState('failed', problem, waiting))
 
-    def _change(self, state: State) -> None:
+    def _set_state(self, state: ConnectionState) -> None:
         self.state = state
         self._on_change(state)
 
@@ -493,15 +498,15 @@ class Connection:
             self._port.close()
 
 
-class Mean(NamedTuple):
+class SampleMean(NamedTuple):
     """The mean stamp, s, and the mean of a number of samples."""
 
     stamp: float
     sample: Sample
-    size: int
+    sample_count: int
 
 
-class Decimation:
+class Decimator:
     """Averages groups of samples; a group with losses has fewer samples and the same length."""
 
     def __init__(self, size: int):
@@ -509,7 +514,7 @@ class Decimation:
         self._group: list[tuple[float, Sample]] = []
 
     def add(self, samples: Sequence[Sample], stamps: Sequence[float],
-            period: float) -> Iterator[Mean]:
+            period: float) -> Iterator[SampleMean]:
         """Add samples with stamps and the period of the gyro, s; give means of complete groups."""
         longest = (self._size - 0.5) * period
         for sample, stamp in zip(samples, stamps, strict=True):
@@ -519,17 +524,17 @@ class Decimation:
             if len(self._group) >= self._size:
                 yield from self.flush()
 
-    def flush(self) -> Iterator[Mean]:
+    def flush(self) -> Iterator[SampleMean]:
         """Give the mean of an incomplete group, before a wait for the next sample."""
         if not self._group:
             return
         group, self._group = self._group, []
         if len(group) == 1:
-            yield Mean(*group[0], 1)
+            yield SampleMean(*group[0], 1)
             return
         begin = group[0][0]  # sums of seconds since 1970 would lose digits
         samples = [sample for _, sample in group]
-        yield Mean(
+        yield SampleMean(
             begin + _mean([stamp - begin for stamp, _ in group]),
             Sample(_mean([sample.output for sample in samples]),
                    _known_mean([sample.temperature for sample in samples]),

@@ -31,9 +31,9 @@ import tty
 
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
 
-_POLL = 0.05  # s; interval of checks for a reader or a stop
-_SETTLING = 0.2  # s; delay after a reader has opened the port, which then discards its input
-_LINGERING = 1.0  # s; delay before closing, which discards data that were not read
+_POLL_INTERVAL = 0.05  # s; interval of checks for a reader or a stop
+_SETTLING_DELAY = 0.2  # s; delay after a reader has opened the port, which then discards its input
+_LINGER_DURATION = 1.0  # s; delay before closing, which discards data that were not read
 
 
 class Emulator:
@@ -67,7 +67,7 @@ class Emulator:
     """
 
     #: s; samples due within this time are written together, since waits are not shorter
-    _BATCH = 0.0005
+    _BATCH_DURATION = 0.0005
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Emulator:
         if not speed > 0.0:
             raise ValueError(f'speed is {speed}, but must be above 0; 1 is real time')
         self._settings = settings or Settings()
-        protocol.check(self._settings)
+        protocol.check_settings(self._settings)
         self._protocol, self._samples, self._speed = protocol, samples, speed
         self.link = None if link is None else Path(link)
         self._wait_for_reader = wait_for_reader
@@ -107,15 +107,15 @@ class Emulator:
     def run(self) -> None:
         """Send the samples, which must have times, until they end or `stop` is called."""
         if self._wait_for_reader:
-            while not self.is_read() and not self._stop.wait(_POLL):
+            while not self.has_reader() and not self._stop.wait(_POLL_INTERVAL):
                 pass
-            self._stop.wait(_SETTLING)
+            self._stop.wait(_SETTLING_DELAY)
         self._send(self._protocol.preamble)
         self._send_in_time()
-        if self.is_read():
-            self._stop.wait(_LINGERING)
+        if self.has_reader():
+            self._stop.wait(_LINGER_DURATION)
 
-    def is_read(self) -> bool:
+    def has_reader(self) -> bool:
         """Return whether a program has the port open; discard its output."""
         events = dict(self._reader_poll.poll(0)).get(self._master, 0)
         if events & select.POLLIN:
@@ -160,7 +160,7 @@ class Emulator:
         os.symlink(self.path, temporary)
         os.replace(temporary, self.link)
 
-    def _frames(self) -> Iterator[tuple[float, bytes]]:
+    def _timed_frames(self) -> Iterator[tuple[float, bytes]]:
         """Give the time of each sample after the first, s by the host clock, and its bytes."""
         begin, encode = None, self._protocol.encoder(self._settings)
         for number, sample in enumerate(self._samples):
@@ -176,16 +176,16 @@ class Emulator:
     def _send_in_time(self) -> None:
         """Send each sample at its time, or with others that are due at once."""
         start, pending, sent = time.monotonic(), b'', -math.inf
-        for due, data in self._frames():
+        for due, data in self._timed_frames():
             if pending and start + due > time.monotonic():
                 self._send(pending)
                 pending, sent = b'', time.monotonic()
             now = time.monotonic()
-            if (self._stop.wait(max(start + due, sent + self._BATCH) - now) if start + due > now
-                    else self._stop.is_set()):
+            if (self._stop.wait(max(start + due, sent + self._BATCH_DURATION) - now) if start
+                    + due > now else self._stop.is_set()):
                 return
             pending += data
-            if time.monotonic() >= sent + self._BATCH:
+            if time.monotonic() >= sent + self._BATCH_DURATION:
                 self._send(pending)
                 pending, sent = b'', time.monotonic()
         self._send(pending)
@@ -193,7 +193,7 @@ class Emulator:
     def _send(self, data: bytes) -> None:
         while data and not self._stop.is_set():
             written = 0
-            if self.is_read():
+            if self.has_reader():
                 with contextlib.suppress(BlockingIOError):
                     written = os.write(self._master, data)
             self.sent_bytes += written
@@ -202,7 +202,7 @@ class Emulator:
                 self.lost_bytes += len(data)
                 return
             if data:
-                self._stop.wait(_POLL / 10)
+                self._stop.wait(_POLL_INTERVAL / 10)
 
 
 def emulate(emulator: Emulator, announce: Callable[[str], None] = lambda path: None) -> None:

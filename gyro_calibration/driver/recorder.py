@@ -35,15 +35,15 @@ from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSU
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import LogError
-from gyro_calibration.logs.ros_bag import ABOUT, MCAP_END, McapWriter, Message
+from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message, METADATA_NAME
 
-KINDS = '.csv', '.csv.gz', '.mcap'
+FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 
 #: Interval of pieces, s: the longest time that samples stay in memory.
-PIECE = 0.5
+WRITE_INTERVAL = 0.5
 #: Longest wait of the first piece of a log for a temperature, s.
-_PATIENCE = 3.0
-_LARGEST_CHUNK = 1 << 22  # bytes
+_TEMPERATURE_WAIT = 3.0
+_MAX_CHUNK_BYTES = 1 << 22  # bytes
 
 
 class DiskFull(OSError):
@@ -100,10 +100,10 @@ class AtomicAppender:
 
 
 #: Returns the notes of a recording; called with the first piece, when all notes are known.
-Notes = Callable[[], Mapping[str, str]]
+NotesCallback = Callable[[], Mapping[str, str]]
 
 
-def about(**details: object) -> dict[str, str]:
+def recording_notes(**details: object) -> dict[str, str]:
     """Return the notes of a recording: program, date, and details except empty ones."""
     known = {name.replace('_', ' '): str(value)
              for name, value in details.items() if value not in (None, '')}
@@ -114,7 +114,7 @@ def about(**details: object) -> dict[str, str]:
 class _Recorder:
     """A new file with notes; raises as `AtomicAppender` does."""
 
-    def __init__(self, path: str, notes: Notes):
+    def __init__(self, path: str, notes: NotesCallback):
         self._file, self._notes = AtomicAppender(path), notes
 
     @property
@@ -133,19 +133,20 @@ class McapRecorder(_Recorder):
 
     """
 
-    def __init__(self, path: str, notes: Notes):
+    def __init__(self, path: str, notes: NotesCallback):
         super().__init__(path, notes)
         self._writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Write a sample as messages on the topics of the driver; the stamp is in ns."""
         force, temperature = sample.specific_force, sample.temperature
-        of_force = cdr.NO_COVARIANCE if force is None else cdr.along_z(ASSUMED_FORCE_NOISE ** 2)
+        of_force = (cdr.NOT_REPORTED_COVARIANCE
+                    if force is None else cdr.z_axis_covariance(ASSUMED_FORCE_NOISE ** 2))
         messages = [] if temperature is None else [
             ('/imu/temperature', cdr.TEMPERATURE, [temperature, 0.0])]
         messages.append(('/imu/data_raw', cdr.IMU, [
-            0.0, 0.0, 0.0, 1.0, *cdr.NO_COVARIANCE,
-            0.0, 0.0, sample.output, *cdr.along_z(self.variance),
+            0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE,
+            0.0, 0.0, sample.output, *cdr.z_axis_covariance(self.variance),
             0.0, 0.0, force or 0.0, *of_force]))
         for topic, kind, numbers in messages:
             data = cdr.serialize(stamp, 'gyro', numbers)
@@ -154,15 +155,15 @@ class McapRecorder(_Recorder):
     def add_message(self, message: Message, definition: str) -> None:
         """Write a message with the definition of its kind, as text."""
         self._writer.add(message.topic, message.kind, definition, message.received, message.data)
-        if self._writer.pending > _LARGEST_CHUNK:
+        if self._writer.pending_bytes > _MAX_CHUNK_BYTES:
             self.flush()
 
     def flush(self) -> None:
         """Write the messages so far as a piece."""
-        if self._writer.pending:
-            head = b'' if self.size else self._writer.begin(
-                f'gyro_calibration {__version__}', ABOUT, self._notes())
-            self._file.append(head + self._writer.chunk())
+        if self._writer.pending_bytes:
+            head = b'' if self.size else self._writer.pack_header(
+                f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
+            self._file.append(head + self._writer.pack_chunk())
 
     def close(self) -> None:
         """Write the last piece and the closing part; on a full disk without the index."""
@@ -170,7 +171,7 @@ class McapRecorder(_Recorder):
             if not self._file.is_full:
                 self.flush()
                 if self.size:
-                    self._file.append(self._writer.end())
+                    self._file.append(self._writer.pack_summary())
             elif self.size:
                 with suppress(DiskFull):  # a reader then takes the file for truncated
                     self._file.append(MCAP_END)
@@ -188,64 +189,65 @@ class CsvRecorder(_Recorder):
 
     Attributes
     ----------
-    missed : columns that came after the first piece and are not in the file
+    late_columns : columns that came after the first piece and are not in the file
 
     """
 
-    def __init__(self, path: str, notes: Notes):
+    def __init__(self, path: str, notes: NotesCallback):
         super().__init__(path, notes)
-        self._is_packed = path.endswith('.gz')
+        self._is_compressed = path.endswith('.gz')
         self._rows: list[tuple[int, dict[str, float]]] = []
-        self._current: dict[str, float] = {}
+        self._held_values: dict[str, float] = {}
         self._columns: list[str] = []
-        self._begin = 0
-        self.missed: set[str] = set()
+        self._start_stamp = 0
+        self.late_columns: set[str] = set()
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Add a sample; the stamp is in ns."""
         values = {'temperature_degc': sample.temperature,
                   'acceleration_mps2': sample.specific_force, **sample.health}
-        self._current |= {name: value for name, value in values.items() if value is not None}
+        self._held_values |= {name: value for name, value in values.items() if value is not None}
         if self._columns:
-            self.missed.update(set(self._current) - set(self._columns))
-        self._rows.append((stamp, {'gyro_rad_s': sample.output, **self._current}))
+            self.late_columns.update(set(self._held_values) - set(self._columns))
+        self._rows.append((stamp, {'gyro_rad_s': sample.output, **self._held_values}))
 
-    def flush(self, everything: bool = False) -> None:
+    def flush(self, is_final: bool = False) -> None:
         """Write the rows so far as a piece."""
         if not self._rows:
             return
-        if not (self._columns or everything):
+        if not (self._columns or is_final):
             waited = (self._rows[-1][0] - self._rows[0][0]) / NSEC_PER_SEC
-            if not waited > (2.0 * PIECE if 'temperature_degc' in self._current else _PATIENCE):
+            if not waited > (2.0 * WRITE_INTERVAL
+                             if 'temperature_degc' in self._held_values else _TEMPERATURE_WAIT):
                 return
         text = io.StringIO()
         writer = csv.writer(text, lineterminator='\n')
         if not self._columns:
-            self._open(text, writer)
+            self._write_header(text, writer)
         for time, values in self._rows:
-            writer.writerow([repr((time - self._begin) / NSEC_PER_SEC),
+            writer.writerow([repr((time - self._start_stamp) / NSEC_PER_SEC),
                              *(repr(values[name]) for name in self._columns)])
         data = text.getvalue().encode()
-        self._file.append(gzip.compress(data, 6, mtime=0) if self._is_packed else data)
+        self._file.append(gzip.compress(data, 6, mtime=0) if self._is_compressed else data)
         self._rows.clear()
 
     def close(self) -> None:
         """Write the last piece, unless one failed before: it may have had the header."""
         try:
             if not self._file.is_full:
-                self.flush(everything=True)
+                self.flush(is_final=True)
         finally:
             self._file.close()
 
-    def _open(self, text: io.StringIO, writer: Any) -> None:
+    def _write_header(self, text: io.StringIO, writer: Any) -> None:
         """Write notes and header; the first value of each column applies from the beginning."""
         first: dict[str, float] = {}
         for _, values in reversed(self._rows):
             first |= values
         self._rows = [(time, {**first, **values}) for time, values in self._rows]
         self._columns = list(self._rows[-1][1])
-        self._begin = self._rows[0][0]
-        seconds, nanoseconds = divmod(self._begin, NSEC_PER_SEC)
+        self._start_stamp = self._rows[0][0]
+        seconds, nanoseconds = divmod(self._start_stamp, NSEC_PER_SEC)
         begin = 'time_s counts from', f'{seconds}.{nanoseconds:09d} s'
         for name, value in (*self._notes().items(), begin):
             text.write(f'# {name}: {" ".join(value.split())}\n')

@@ -17,20 +17,31 @@ import csv
 import io
 from typing import Any
 
-from gyro_calibration.diagnosis.charts import Chart, draw, element, joined, Line, Markup
+from gyro_calibration.diagnosis.charts import Chart, draw_chart, element, join_markup, Line, Markup
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.report import page
-from gyro_calibration.diagnosis.words import amount, for_people, quantity, sentence, spoken
+from gyro_calibration.diagnosis.report import render_page
+from gyro_calibration.diagnosis.words import (
+    as_sentence,
+    display_unit,
+    format_amount,
+    format_quantity,
+    readable_name,
+)
 from gyro_calibration.fleet.pooling import Component, DRIVES, Interval, POWER_ONS, UNITS
-from gyro_calibration.fleet.summary import Found, in_words, sentences, TypeFound
-from gyro_calibration.logs.log import Array, NORMAL_95
+from gyro_calibration.fleet.summary import (
+    describe_type,
+    format_interval,
+    TypeSummary,
+    ValueSummary,
+)
+from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 import numpy as np
 
-_SPREADS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
-            (DRIVES, 'common to a drive'))
-_PER = {'age': 'year', 'temperature': 'K'}
+_COMPONENT_LABELS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
+                     (DRIVES, 'common to a drive'))
+_SLOPE_UNITS = {'age': 'year', 'temperature': 'K'}
 #: Tables with more rows are scrolled inside the page and have a search field.
-_LONG = 12
+_MAX_UNSCROLLED_ROWS = 12
 _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')
 #: Sorts a table by the clicked column, and shows the rows that contain a text.
@@ -73,13 +84,13 @@ input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-w
 </style>""")
 
 
-def report(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> str:
+def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
     """
     Return the page, HTML in UTF-8.
 
     Parameters
     ----------
-    types : as `summary.summarized` returns them
+    types : as `summary.summarize_types` returns them
     records : of all logs, including excluded ones
 
     """
@@ -87,81 +98,94 @@ def report(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> 
     title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
              f'{len(types)} {"type" if len(types) == 1 else "types"}')
     about = f'{len(records) - used} more logs are excluded.' if used < len(records) else None
-    body = joined(
+    body = join_markup(
         element('header', element('p', 'Fleet', class_='about'), element('h1', title),
                 element('p', about, class_='gained') if about else None),
         element('main', *(part for place, found in enumerate(types)
-                          for part in _type(found, place)), _logs(records)),
+                          for part in _type_sections(found, place)), _log_section(records)),
         _STYLE, _SCRIPT)
-    return page(f'Fleet: {title}', body)
+    return render_page(f'Fleet: {title}', body)
 
 
-def _type(found: TypeFound, place: int) -> Iterator[Markup]:
-    name = found.name or 'Type not stated'
-    items = [element('li', sentence(text)) for text in sentences(found)]
-    yield element('section', element('h2', name), element('ul', *items), _variances(found))
-    values = [each for each in found.values.values() if not each.slow]
+def _type_sections(summary: TypeSummary, index: int) -> Iterator[Markup]:
+    name = summary.name or 'Type not stated'
+    items = [element('li', as_sentence(text)) for text in describe_type(summary)]
+    yield element('section', element('h2', name), element('ul', *items), _variance_table(summary))
+    values = [each for each in summary.values.values() if not each.is_slow]
     yield element(
         'section', element('h2', f'{name}: units'),
         element('p', 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
                 class_='quiet'),
-        element('div', *(draw(_chart(each, f't{place}-{each.name}-units', 'unit', found.units,
-                                     each.units, 'after')) for each in values), class_='pairs'),
-        _units(found, values))
-    shared = [each for each in found.values.values() if DRIVES in each.components]
+        element(
+            'div',
+            *(draw_chart(
+                _interval_chart(each, f't{index}-{each.name}-units', 'unit', summary.units,
+                                each.units, 'after')) for each in values), class_='pairs'),
+        _unit_table(summary, values))
+    shared = [each for each in summary.values.values() if DRIVES in each.components]
     if shared:
         yield element(
             'section', element('h2', f'{name}: drives'),
-            element('p', 'An error that all units of a drive have in common is assigned to its '
-                    'reference or to the vehicle.', class_='quiet'),
-            element('div', *(draw(_chart(each, f't{place}-{each.name}-drives', 'drive',
-                                         found.drives, each.drives, 'before'))
-                             for each in shared), class_='pairs'))
-    if len(found.dates) > 1:
-        yield element('section', element('h2', f'{name}: over time'), element('div', *(
-            draw(_dates_chart(found, each, f't{place}-{each.name}-dates')) for each in values),
-            class_='pairs'))
+            element(
+                'p', 'An error that all units of a drive have in common is assigned to its '
+                'reference or to the vehicle.', class_='quiet'),
+            element(
+                'div',
+                *(draw_chart(
+                    _interval_chart(each, f't{index}-{each.name}-drives', 'drive', summary.drives,
+                                    each.drives, 'before')) for each in shared), class_='pairs'))
+    if len(summary.dates) > 1:
+        yield element(
+            'section', element('h2', f'{name}: over time'),
+            element(
+                'div',
+                *(draw_chart(_dates_chart(summary, each, f't{index}-{each.name}-dates'))
+                  for each in values), class_='pairs'))
 
 
-def _variances(found: TypeFound) -> Markup:
-    drifts = any(each.slopes for each in found.values.values())
-    heads = ['value', 'mean of the type', 'one more unit', *(text for _, text in _SPREADS),
-             *(['drift'] if drifts else [])]
-    rows = [[_cell(spoken(each.name)), _estimate(each, each.mean, 0),
-             _estimate(each, each.new_unit, 0),
-             *(_spread(each, each.components.get(name)) for name, _ in _SPREADS),
+def _variance_table(summary: TypeSummary) -> Markup:
+    drifts = any(each.slopes for each in summary.values.values())
+    heads = [
+        'value', 'mean of the type', 'one more unit', *(text for _, text in _COMPONENT_LABELS),
+        *(['drift'] if drifts else [])
+    ]
+    rows = [[_cell(readable_name(each.name)), _interval_cell(each, each.mean, 0),
+             _interval_cell(each, each.new_unit, 0),
+             *(_component_cell(each, each.components.get(name)) for name, _ in _COMPONENT_LABELS),
              *([_cell('; '.join(
-                 in_words(slope, 0, f'{each.unit}/{_PER[name]}', each.name)
+                 format_interval(slope, 0, f'{each.unit}/{_SLOPE_UNITS[name]}', each.name)
                  for name, slope in each.slopes.items()))] if drifts else [])]
-            for each in found.values.values()]
+            for each in summary.values.values()]
     return _table(heads, rows)
 
 
-def _units(found: TypeFound, values: Sequence[Found]) -> Markup:
-    odd = {found.units[outlier.number] for each in found.values.values()
-           for outlier in each.outlying_units}
-    changed = {found.units[change.unit] for each in found.values.values()
-               for change in each.changed}
-    heads = ['unit', 'logs', *(spoken(each.name) for each in values), 'remark']
+def _unit_table(summary: TypeSummary, values: Sequence[ValueSummary]) -> Markup:
+    outlying = {summary.units[outlier.group] for each in summary.values.values()
+                for outlier in each.outlying_units}
+    changed = {summary.units[change.unit] for each in summary.values.values()
+               for change in each.changes}
+    heads = ['unit', 'logs', *(readable_name(each.name) for each in values), 'remark']
     rows = []
-    for place, name in enumerate(found.units):
-        logs = sum(each['unit'] == name for each in found.records)
-        remark = ', '.join([*(['stands out'] if name in odd else []),
+    for place, name in enumerate(summary.units):
+        logs = sum(each['unit'] == name for each in summary.records)
+        remark = ', '.join([*(['stands out'] if name in outlying else []),
                             *(['changed'] if name in changed else [])])
         rows.append([_cell(name), _cell(str(logs), logs),
-                     *(_estimate(each, each.units, place) for each in values), _cell(remark)])
+                     *(_interval_cell(each, each.units, place) for each in values), _cell(remark)])
     return _table(heads, rows)
 
 
-def _logs(records: Sequence[Mapping[str, Any]]) -> Markup:
+def _log_section(records: Sequence[Mapping[str, Any]]) -> Markup:
     names = list(dict.fromkeys(name for each in records for name in each.get('values', ())))
-    heads = ['log', 'type', 'unit', 'drive', 'date', *map(spoken, names), 'diagnosis', 'remark']
+    heads = [
+        'log', 'type', 'unit', 'drive', 'date', *map(readable_name, names), 'diagnosis', 'remark'
+    ]
     rows = []
     for each in records:
         file = each['log'].rpartition('/')[2]
         link = element('a', file, href=each['page']) if each.get('page') else file
         values = each.get('values', {})
-        shown = [_of_log(values[name], name) if name in values else _cell('')
+        shown = [_value_cell(values[name], name) if name in values else _cell('')
                  for name in names]
         rows.append([element('td', link, data_key=file),
                      *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *shown,
@@ -170,9 +194,9 @@ def _logs(records: Sequence[Mapping[str, Any]]) -> Markup:
     return element('section', element('h2', 'Logs'), _table(heads, rows))
 
 
-def _of_log(value: Mapping[str, Any], name: str) -> Markup:
-    size = NORMAL_95 * value['deviation']
-    return _cell(str(quantity(Estimate(value['value'], (
+def _value_cell(value: Mapping[str, Any], name: str) -> Markup:
+    size = NORMAL_QUANTILE_975 * value['deviation']
+    return _cell(str(format_quantity(Estimate(value['value'], (
         value['value'] - size, value['value'] + size), value['unit']), name)), value['value'])
 
 
@@ -180,7 +204,8 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
     head = element('tr', *(element('th', each, scope='col') for each in heads))
     table = element('table', element('thead', head),
                     element('tbody', *(element('tr', *row) for row in rows)), class_='sortable')
-    return element('div', table, class_=f'scroll fold{" tall" * (len(rows) > _LONG)}',
+    return element('div', table,
+                   class_=f'scroll fold{" tall" * (len(rows) > _MAX_UNSCROLLED_ROWS)}',
                    tabindex='0')
 
 
@@ -189,51 +214,58 @@ def _cell(text: str, key: float | None = None) -> Markup:
     return element('td', text, data_key=text if key is None else f'{key:.9g}')
 
 
-def _estimate(each: Found, of: Interval, place: int) -> Markup:
-    return _cell(in_words(of, place, each.unit, each.name), float(of.value[place]))
+def _interval_cell(value: ValueSummary, interval: Interval, index: int) -> Markup:
+    return _cell(format_interval(interval, index, value.unit, value.name),
+                 float(interval.value[index]))
 
 
-def _spread(each: Found, of: Component | None) -> Markup:
-    if of is None:
+def _component_cell(value: ValueSummary, component: Component | None) -> Markup:
+    if component is None:
         return _cell('not shown', -1.0)
-    low, high = (amount(end, each.unit, each.name) for end in (of.low, of.high))
-    text = (f'{amount(of.estimate, each.unit, each.name)} ({low} to {high})' if of.low > 0.0
+    low, high = (format_amount(end, value.unit, value.name)
+                 for end in (component.low, component.high))
+    text = (f'{format_amount(component.estimate, value.unit, value.name)} ({low} to '
+            f'{high})' if component.low > 0.0
             else f'less than {high}')
-    return _cell(text, of.estimate)
+    return _cell(text, component.estimate)
 
 
-def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval,
-           style: str) -> Chart:
-    unit, factor = for_people(each.unit, each.name)
-    middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / NORMAL_95
-    return Chart(name, f'{spoken(each.name)} by {kind}',
-                 f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
-                 f'across zero is not determined. {kind.capitalize()}s: {", ".join(names)}.',
-                 kind, '',
-                 np.arange(1.0, len(names) + 1.0), spoken(each.name), unit,
-                 [Line(kind, style, factor * middle, factor * half, dots=True)], names=names)
+def _interval_chart(value: ValueSummary, name: str, kind: str, names: Sequence[str],
+                    interval: Interval, style: str) -> Chart:
+    unit, factor = display_unit(value.unit, value.name)
+    middle, half = (0.5 * (interval.high + interval.low), 0.5 *
+                    (interval.high - interval.low) / NORMAL_QUANTILE_975)
+    return Chart(
+        name, f'{readable_name(value.name)} by {kind}',
+        f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
+        f'across zero is not determined. {kind.capitalize()}s: {", ".join(names)}.', kind, '',
+        np.arange(1.0,
+                  len(names) + 1.0), readable_name(value.name), unit,
+        [Line(kind, style, factor * middle, factor * half, draw_dots=True)], x_names=names)
 
 
-def _dates_chart(found: TypeFound, each: Found, name: str) -> Chart:
+def _dates_chart(found: TypeSummary, each: ValueSummary, name: str) -> Chart:
     """Return the values of logs, less those of their units, over their dates."""
-    unit, factor = for_people(each.unit, each.name)
+    unit, factor = display_unit(each.unit, each.name)
     dated = [record for record in each.records if record['date']]
     place = np.array([found.dates.index(record['date']) + 1.0 for record in dated])
     value: Array = np.array([
-        record['slow' if each.slow else 'values'][each.name]['value']
+        record['slow' if each.is_slow else 'values'][each.name]['value']
         - float(each.units.value[found.units.index(record['unit'])]) for record in dated])
-    return Chart(name, f'{spoken(each.name)} less that of the unit',
-                 f'dates: {", ".join(found.dates)}', 'date', '', place, spoken(each.name), unit,
-                 [Line('log', 'measured', factor * value, dots=True)], names=found.dates)
+    return Chart(name, f'{readable_name(each.name)} less that of the unit',
+                 f'dates: {", ".join(found.dates)}', 'date', '', place, readable_name(each.name),
+                 unit, [Line('log', 'measured', factor * value, draw_dots=True)],
+                 x_names=found.dates)
 
 
-def tables(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
+def table_files(types: Sequence[TypeSummary],
+                records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
     """
     Return the content of files by name: values of logs, and of units, one row each, in SI.
 
     Parameters
     ----------
-    types : as `summary.summarized` returns them
+    types : as `summary.summarize_types` returns them
     records : of all logs
 
     """
@@ -247,7 +279,7 @@ def tables(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> 
         writer.writeheader()
         writer.writerows(rows)
         found[f'{name}.csv'] = text.getvalue().encode()
-        packed = _parquet(columns, rows)
+        packed = _parquet_content(columns, rows)
         if packed is not None:
             found[f'{name}.parquet'] = packed
     return found
@@ -261,25 +293,25 @@ def _log_row(record: Mapping[str, Any]) -> dict[str, Any]:
     return row
 
 
-def _unit_rows(types: Sequence[TypeFound]) -> Iterator[dict[str, Any]]:
+def _unit_rows(types: Sequence[TypeSummary]) -> Iterator[dict[str, Any]]:
     for found in types:
         for place, unit in enumerate(found.units):
             for name, each in found.values.items():
-                outlying = {one.number for one in each.outlying_units}
+                outlying = {one.group for one in each.outlying_units}
                 yield {'type': found.name, 'unit': unit, 'value': name, 'si_unit': each.unit,
                        'estimate': float(each.units.value[place]),
                        'standard_deviation': float(each.units.deviation[place]),
                        'low': float(each.units.low[place]), 'high': float(each.units.high[place]),
-                       'from_type': float(each.from_type.value[place]),
-                       'next_low': float(each.next_log.low[place]),
-                       'next_high': float(each.next_log.high[place]),
+                       'from_type': float(each.type_deviation.value[place]),
+                       'next_low': float(each.next_power_on.low[place]),
+                       'next_high': float(each.next_power_on.high[place]),
                        'stands_out': place in outlying,
                        **{f'{over}_slope{end}': float(value[place])
                           for over, slope in each.unit_slopes.items() for end, value in (
                               ('', slope.value), ('_low', slope.low), ('_high', slope.high))}}
 
 
-def _parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> bytes | None:
+def _parquet_content(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> bytes | None:
     """Return a table in Parquet; None where pyarrow is not installed."""
     try:
         import pyarrow

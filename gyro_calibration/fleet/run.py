@@ -39,18 +39,18 @@ from typing import Any, TypeVar
 
 Task = TypeVar('Task')
 Found = TypeVar('Found')
-_Work = Callable[[Task], Found]
+_WorkFunction = Callable[[Task], Found]
 #: Tasks submitted for each worker.
-_AHEAD = 2
+_TASKS_PER_WORKER = 2
 
 
-class Lost(Exception):
+class WorkerLost(Exception):
     """A task has no result, since its worker was killed; the message states the reason."""
 
 
 @contextmanager
-def processes(workers: int, memory: float | None = None, preload: Sequence[str] = ()
-              ) -> Iterator[Callable[[int], Executor]]:
+def process_executors(workers: int, memory: float | None = None,
+                      preload: Sequence[str] = ()) -> Iterator[Callable[[int], Executor]]:
     """
     Give a function that makes executors of processes on this machine; shut all down at the end.
 
@@ -63,19 +63,20 @@ def processes(workers: int, memory: float | None = None, preload: Sequence[str] 
     """
     context = get_context('forkserver')
     context.set_forkserver_preload(list(preload))
-    made: list[ProcessPoolExecutor] = []
+    executors: list[ProcessPoolExecutor] = []
 
     def create(wanted: int) -> Executor:
-        made.append(ProcessPoolExecutor(min(wanted, workers), context, _begin, (memory,)))
-        return made[-1]
+        executors.append(
+            ProcessPoolExecutor(min(wanted, workers), context, _initialize_worker, (memory, )))
+        return executors[-1]
     try:
         yield create
     finally:
-        for each in made:
+        for each in executors:
             each.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin(memory: float | None) -> None:
+def _initialize_worker(memory: float | None) -> None:
     """Limit the memory of a worker, and end it when the program that started it ends."""
     parent = parent_process()
     assert parent is not None
@@ -90,7 +91,7 @@ def _begin(memory: float | None) -> None:
 
 
 @contextmanager
-def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
+def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
     """
     Give a function that makes executors of a Dask cluster.
 
@@ -107,10 +108,12 @@ def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
 
 
-def finished(work: _Work[Task, Found], tasks: Iterable[Task], workers: int,
-             create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | Lost]]:
+def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: int,
+              create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | WorkerLost]]:
     """
-    Give each task with its result as it is finished, or with `Lost` where its worker was killed.
+    Yield each task with its result when it is finished.
+
+    The result is `WorkerLost` where the worker of a task was killed.
 
     Parameters
     ----------
@@ -120,55 +123,56 @@ def finished(work: _Work[Task, Found], tasks: Iterable[Task], workers: int,
     create : makes an executor of so many workers, of `processes` or `cluster`
 
     """
-    rest = iter(tasks)
+    remaining = iter(tasks)
     executor = create(workers)
-    handed: dict[Future[Any], Any] = {}
+    pending: dict[Future[Any], Any] = {}
     while True:
-        while len(handed) < _AHEAD * workers and (new := list(islice(rest, 1))):
+        while len(pending) < _TASKS_PER_WORKER * workers and (new := list(islice(remaining, 1))):
             try:
-                handed[executor.submit(work, new[0])] = new[0]
+                pending[executor.submit(work, new[0])] = new[0]
             except BrokenExecutor:
                 executor = create(workers)
-                handed[executor.submit(work, new[0])] = new[0]
-        if not handed:
+                pending[executor.submit(work, new[0])] = new[0]
+        if not pending:
             return
-        ready, suspects = wait(handed, return_when=FIRST_COMPLETED)[0], []
+        ready, suspects = wait(pending, return_when=FIRST_COMPLETED)[0], []
         if any(isinstance(each.exception(), BrokenExecutor) for each in ready):
-            ready = wait(handed)[0]
+            ready = wait(pending)[0]
         for each in ready:
-            task = handed.pop(each)
+            task = pending.pop(each)
             try:
                 yield task, each.result()
             except BrokenExecutor:
                 suspects.append(task)
             except Exception as error:  # of a cluster whose workers were killed by the task
-                yield task, Lost(_killed(error))
+                yield task, WorkerLost(_describe_failure(error))
         if suspects:
             executor.shutdown(wait=True, cancel_futures=True)
-            yield from _one_by_one(work, suspects, create)
+            yield from _run_one_by_one(work, suspects, create)
             executor = create(workers)
 
 
-def _one_by_one(work: _Work[Task, Found], tasks: Iterable[Task],
-                create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | Lost]]:
+def _run_one_by_one(
+        work: _WorkFunction[Task, Found], tasks: Iterable[Task],
+        create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | WorkerLost]]:
     executor = create(1)
     for task in tasks:
         try:
             yield task, executor.submit(work, task).result()
         except BrokenExecutor as error:
-            yield task, Lost(_killed(error))
+            yield task, WorkerLost(_describe_failure(error))
             executor.shutdown(wait=True, cancel_futures=True)
             executor = create(1)
     executor.shutdown(wait=True)
 
 
-def _killed(error: Exception) -> str:
+def _describe_failure(error: Exception) -> str:
     if isinstance(error, BrokenExecutor) or type(error).__name__ == 'KilledWorker':
         return ('its worker was killed, perhaps since memory ran out; check the log, '
                 'or give --workers 1')
     return f'its worker failed ({type(error).__name__}: {str(error)[:200]})'
 
 
-def usual_workers() -> int:
+def count_cores() -> int:
     """Return the number of cores that this process may use."""
     return max(len(os.sched_getaffinity(0)), 1)

@@ -25,26 +25,30 @@ from pathlib import Path
 import re
 from typing import Any
 
-from gyro_calibration.files import InputError, opened, plain, read_bytes
-from gyro_calibration.logs.ros_bag import metadata_of
+from gyro_calibration.files import InputError, open_regular_file, read_bytes, to_printable
+from gyro_calibration.logs.ros_bag import read_metadata
 from gyro_calibration.model.settings_file import read_settings
 
 #: Fields of a log in a table, in addition to its path.
-KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
+ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
-LOGS = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
+LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 #: Largest numbers of bytes that are read of a table, and of the notes of a log.
-_MOST, _NOTES = 50_000_000, 4096
+_MAX_TABLE_BYTES, _MAX_NOTE_BYTES = 50_000_000, 4096
 #: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
-_KEYED = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)', re.IGNORECASE)
-_SPOKEN = re.compile(r'\b(unit|drive) (\w*\d\w*|[a-z](?=[,;.)]|$))', re.IGNORECASE | re.MULTILINE)
-_NAMED = {'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
-          'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
-          'drive': re.compile(r'(?:^|[_.-])drive[_-]?([A-Za-z0-9]+)', re.IGNORECASE)}
+_KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
+                         re.IGNORECASE)
+_WORDED_NOTE = re.compile(r'\b(unit|drive) (\w*\d\w*|[a-z](?=[,;.)]|$))',
+                          re.IGNORECASE | re.MULTILINE)
+_FILE_NAME_PATTERNS = {
+    'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
+    'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
+    'drive': re.compile(r'(?:^|[_.-])drive[_-]?([A-Za-z0-9]+)', re.IGNORECASE)
+}
 
 
 @dataclass(frozen=True)
-class Entry:
+class FleetLog:
     """
     A log of a fleet.
 
@@ -67,13 +71,13 @@ class Entry:
     date: str = ''
     temperature: float | None = None
 
-    def with_missing(self, stated: Mapping[str, str]) -> Entry:
+    def fill_missing(self, stated: Mapping[str, str]) -> FleetLog:
         """Return the entry with its empty fields filled."""
-        new: dict[str, Any] = {name: plain(text.strip()) for name, text in stated.items()
-                               if name in KEYS and text.strip()
+        new: dict[str, Any] = {name: to_printable(text.strip()) for name, text in stated.items()
+                               if name in ENTRY_KEYS and text.strip()
                                and getattr(self, name) in ('', None)}
         if 'temperature' in new:
-            new['temperature'] = _temperature(self.log, new['temperature'])
+            new['temperature'] = _parse_temperature(self.log, new['temperature'])
         if 'date' in new:
             try:
                 new['date'] = date.fromisoformat(new['date'][:10]).isoformat()
@@ -82,9 +86,9 @@ class Entry:
                                  'as 2026-03-01') from None
         return replace(self, **new)
 
-    def merged(self, other: Entry) -> Entry:
+    def merge(self, other: FleetLog) -> FleetLog:
         """Return the fields of one log by two tables; raise `InputError` where they differ."""
-        new = {name: getattr(other, name) for name in KEYS
+        new = {name: getattr(other, name) for name in ENTRY_KEYS
                if getattr(other, name) not in ('', None)}
         for name, value in new.items():
             if getattr(self, name) not in ('', None, value):
@@ -93,7 +97,7 @@ class Entry:
         return replace(self, **new)
 
 
-def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
+def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[FleetLog]:
     """
     Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
 
@@ -103,7 +107,7 @@ def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
     Parameters
     ----------
     paths : as a user gives them
-    without : a folder that is not searched, such as that of the results
+    excluded_folder : a folder that is not searched, such as that of the results
 
     Raises
     ------
@@ -111,86 +115,89 @@ def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
     OSError : a table cannot be read
 
     """
-    found: dict[str, Entry] = {}
-    visited = {os.path.realpath(without)} if without else set()
+    found: dict[str, FleetLog] = {}
+    visited = {os.path.realpath(excluded_folder)} if excluded_folder else set()
     for path in paths:
-        for entry in _of(path, visited):
-            known = os.path.abspath(entry.log)
-            found[known] = found[known].merged(entry) if known in found else entry
+        for entry in _expand_path(path, visited):
+            absolute_path = os.path.abspath(entry.log)
+            found[absolute_path] = (found[absolute_path].merge(entry)
+                                    if absolute_path in found else entry)
     if not found:
         raise InputError(f'{", ".join(map(str, paths))}: holds no log; logs end in '
-                         f'{", ".join(LOGS)}, or are the folder of a ROS 2 recording')
+                         f'{", ".join(LOG_SUFFIXES)}, or are the folder of a ROS 2 recording')
     return list(found.values())
 
 
-def _of(path: str, visited: set[str]) -> Iterator[Entry]:
+def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
     """Give the logs of a path; a folder that was visited before has none."""
     if os.path.isdir(path):
-        yield from _inside(Path(path), visited)
+        yield from _search_folder(Path(path), visited)
     elif not os.path.exists(path) and glob(path, recursive=True):
         for each in sorted(glob(path, recursive=True)):
-            yield from _of(each, visited)
+            yield from _expand_path(each, visited)
     elif path.endswith('.txt'):
-        lines = (line.strip() for line in _text(path).splitlines())
-        yield from (Entry(_resolved(path, line)) for line in lines if line and line[0] != '#')
-    elif path.endswith('.csv') and os.path.exists(path) and (columns := _header(path)):
-        yield from _rows(path, columns)
+        lines = (line.strip() for line in _read_text(path).splitlines())
+        yield from (FleetLog(_resolve_log_path(path, line)) for line in lines
+                    if line and line[0] != '#')
+    elif path.endswith('.csv') and os.path.exists(path) and (columns := _read_header(path)):
+        yield from _read_rows(path, columns)
     else:
-        yield Entry(path)
+        yield FleetLog(path)
 
 
-def _inside(folder: Path, visited: set[str]) -> Iterator[Entry]:
+def _search_folder(folder: Path, visited: set[str]) -> Iterator[FleetLog]:
     """Give the logs in a folder and in those inside it; one with metadata.yaml is a recording."""
     if os.path.realpath(folder) in visited or (folder / 'fleet.json').is_file():
         return
     visited.add(os.path.realpath(folder))
     if (folder / 'metadata.yaml').is_file():
-        yield Entry(str(folder))
+        yield FleetLog(str(folder))
         return
     for path in sorted(folder.iterdir()):
-        if path.is_dir() or path.name.lower().endswith(LOGS) and not path.name.startswith('.'):
-            yield from _of(str(path), visited)
+        if (path.is_dir() or path.name.lower().endswith(LOG_SUFFIXES)
+                and not path.name.startswith('.')):
+            yield from _expand_path(str(path), visited)
 
 
-def _text(path: str) -> str:
+def _read_text(path: str) -> str:
     try:
-        return read_bytes(path, _MOST).decode('utf-8-sig')
+        return read_bytes(path, _MAX_TABLE_BYTES).decode('utf-8-sig')
     except OSError:
         raise
     except ValueError as error:
-        raise InputError(f'{path}: {plain(error)}; give a text file in UTF-8') from error
+        raise InputError(f'{path}: {to_printable(error)}; give a text file in UTF-8') from error
 
 
-def _header(path: str) -> list[str]:
+def _read_header(path: str) -> list[str]:
     """Return the columns of a table of logs; none of another file, such as a log."""
     try:
-        with opened(path) as file:
-            line = file.readline(_NOTES).decode('utf-8-sig', 'replace')
+        with open_regular_file(path) as file:
+            line = file.readline(_MAX_NOTE_BYTES).decode('utf-8-sig', 'replace')
     except OSError:  # reported where the log is read
         return []
-    columns = [name.strip().strip('"').lower() for name in line.split(_separator(line))]
+    columns = [name.strip().strip('"').lower() for name in line.split(_find_separator(line))]
     is_log = any(name.startswith(('time', 'gyro')) for name in columns)
-    return columns if 'log' in columns or set(KEYS) & set(columns) and not is_log else []
+    return columns if 'log' in columns or set(ENTRY_KEYS) & set(columns) and not is_log else []
 
 
-def _separator(line: str) -> str:
+def _find_separator(line: str) -> str:
     """Return the separator of values, as in a log: comma, semicolon or tab."""
     return max(',;\t', key=line.count)
 
 
-def _resolved(path: str, log: str) -> str:
+def _resolve_log_path(path: str, log: str) -> str:
     """Return the path of a log in a table: relative to the table, or to the working folder."""
-    seen = Path(path).parent / log
-    return str(seen) if seen.exists() or not Path(log).exists() else log
+    beside_table = Path(path).parent / log
+    return str(beside_table) if beside_table.exists() or not Path(log).exists() else log
 
 
-def _rows(path: str, columns: Sequence[str]) -> Iterator[Entry]:
-    if not set(columns) <= {'log', *KEYS} or 'log' not in columns or len(
+def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
+    if not set(columns) <= {'log', *ENTRY_KEYS} or 'log' not in columns or len(
             set(columns)) < len(columns):
         raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
-                         f'{", ".join(KEYS)}, each once')
-    lines = _text(path).splitlines()
-    rows = csv.reader(lines, delimiter=_separator(lines[0]))
+                         f'{", ".join(ENTRY_KEYS)}, each once')
+    lines = _read_text(path).splitlines()
+    rows = csv.reader(lines, delimiter=_find_separator(lines[0]))
     next(rows)
     for number, row in enumerate(rows, 2):
         if not any(map(str.strip, row)):
@@ -202,10 +209,10 @@ def _rows(path: str, columns: Sequence[str]) -> Iterator[Entry]:
         log = stated.pop('log').strip()
         if not log:
             raise InputError(f'{path}, line {number}: names no log')
-        yield Entry(_resolved(path, log)).with_missing(stated)
+        yield FleetLog(_resolve_log_path(path, log)).fill_missing(stated)
 
 
-def pattern(text: str) -> re.Pattern[str]:
+def compile_file_pattern(text: str) -> re.Pattern[str]:
     """
     Return the regular expression of a file name such as ``rc_car_{drive}_unit{unit}``.
 
@@ -215,15 +222,15 @@ def pattern(text: str) -> re.Pattern[str]:
 
     """
     parts = re.split(r'\{(\w*)\}', text)
-    unknown = [name for name in parts[1::2] if name not in KEYS]
+    unknown = [name for name in parts[1::2] if name not in ENTRY_KEYS]
     if unknown or len(parts) < 3 or len(set(parts[1::2])) < len(parts[1::2]):
         raise ValueError(f'{text}: wanted a file name with {{unit}}, and perhaps '
-                         f'{", ".join(f"{{{name}}}" for name in KEYS[1:])}, each once')
+                         f'{", ".join(f"{{{name}}}" for name in ENTRY_KEYS[1:])}, each once')
     return re.compile(''.join(f'(?P<{part}>.+?)' if place % 2 else re.escape(part)
                               for place, part in enumerate(parts)))
 
 
-def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
+def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -> FleetLog:
     """
     Return an entry with its empty fields filled from file name, notes or metadata.
 
@@ -232,20 +239,21 @@ def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
     Parameters
     ----------
     entry : with a log that exists
-    named : pattern of the file names, by `pattern`
+    file_pattern : pattern of the file names, by `pattern`
 
     """
-    stem = re.sub(f'({"|".join(map(re.escape, sorted(LOGS, key=len, reverse=True)))})$', '',
+    stem = re.sub(f'({"|".join(map(re.escape, sorted(LOG_SUFFIXES, key=len, reverse=True)))})$',
+                  '',
                   Path(entry.log).name, flags=re.IGNORECASE)
-    if named is not None and (found := named.fullmatch(stem)):
-        entry = entry.with_missing(found.groupdict())
-    return entry.with_missing(_notes(entry.log)).with_missing(_usual(stem))
+    if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
+        entry = entry.fill_missing(found.groupdict())
+    return entry.fill_missing(_read_notes(entry.log)).fill_missing(_parse_file_name(stem))
 
 
-def _usual(stem: str) -> dict[str, str]:
+def _parse_file_name(stem: str) -> dict[str, str]:
     """Return the fields in a file name; the rest apart from unit and date is the drive."""
     stated, rest = {}, stem
-    for name, shape in _NAMED.items():
+    for name, shape in _FILE_NAME_PATTERNS.items():
         if found := shape.search(rest):
             stated[name] = found[1]
             rest = rest.replace(found[0], '')
@@ -254,18 +262,21 @@ def _usual(stem: str) -> dict[str, str]:
     return stated
 
 
-def _notes(path: str) -> dict[str, str]:
+def _read_notes(path: str) -> dict[str, str]:
     """Return the fields in the notes of a log, or in the metadata of a recording."""
     if os.path.isdir(path):
-        return {**_custom(Path(path)), **_of_recordings(sorted(Path(path).glob('*.mcap')))}
+        return {
+            **_read_custom_data(Path(path)),
+            **_read_recording_metadata(sorted(Path(path).glob('*.mcap')))
+        }
     if path.endswith('.mcap'):
-        return _of_recordings([Path(path)])
+        return _read_recording_metadata([Path(path)])
     if not path.lower().endswith(('.csv', '.csv.gz')):
         return {}
-    with opened(path) as file:
+    with open_regular_file(path) as file:
         try:
-            data = (gzip.GzipFile(fileobj=file).read(_NOTES) if path.endswith('.gz')
-                    else file.read(_NOTES))
+            data = (gzip.GzipFile(fileobj=file).read(_MAX_NOTE_BYTES) if path.endswith('.gz')
+                    else file.read(_MAX_NOTE_BYTES))
         except (OSError, EOFError):  # read again, and reported, where the log is read
             return {}
     lines = []
@@ -274,11 +285,16 @@ def _notes(path: str) -> dict[str, str]:
             break
         lines.append(line)
     text = '\n'.join(lines)  # such as "unit: 7" or "unit 7, drive h"
-    found = {name.lower(): value for name, value in reversed(_SPOKEN.findall(text))}
-    return {**found, **{name.lower(): value for name, value in reversed(_KEYED.findall(text))}}
+    found = {name.lower(): value for name, value in reversed(_WORDED_NOTE.findall(text))}
+    return {
+        **found,
+        **{
+            name.lower(): value for name, value in reversed(_KEYED_NOTE.findall(text))
+        }
+    }
 
 
-def _custom(folder: Path) -> dict[str, str]:
+def _read_custom_data(folder: Path) -> dict[str, str]:
     """Return the custom data in metadata.yaml of a rosbag2 folder."""
     try:
         content = read_settings(folder / 'metadata.yaml')
@@ -288,15 +304,15 @@ def _custom(folder: Path) -> dict[str, str]:
         return {}
 
 
-def _of_recordings(paths: Sequence[Path]) -> dict[str, str]:
+def _read_recording_metadata(paths: Sequence[Path]) -> dict[str, str]:
     stated: dict[str, str] = {}
     for path in paths:
         with suppress(OSError):  # reported where the log is read
-            stated |= {name.lower(): value for name, value in metadata_of(path).items()}
+            stated |= {name.lower(): value for name, value in read_metadata(path).items()}
     return stated
 
 
-def _temperature(log: str, text: str) -> float:
+def _parse_temperature(log: str, text: str) -> float:
     try:
         value = float(re.sub(r'\s*(deg)?[°cC]*$', '', text))
     except ValueError:

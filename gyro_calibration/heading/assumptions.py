@@ -25,12 +25,12 @@ import math
 
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.logs.log import Array, DEGREE, Number
-from gyro_calibration.model.compensation import covariance
+from gyro_calibration.model.compensation import uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
 import numpy as np
 
 #: Step of the temperatures for which the change of the bias is computed, K; linear between them.
-_STEP = 0.5
+_TEMPERATURE_STEP = 0.5
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Assumptions:
         return (self.scale_factor_error ** 2, 0.0), (0.0, self.bias ** 2)
 
 
-def assumed(model: GyroModel, assumptions: Assumptions) -> GyroModel:
+def with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroModel:
     """Return the model with an assumed covariance in its self-calibration if it has none."""
     calibration = model.self_calibration
     if calibration is None:
@@ -67,40 +67,42 @@ def assumed(model: GyroModel, assumptions: Assumptions) -> GyroModel:
     return with_self_calibration(model, replace(calibration, covariance=assumptions.covariance))
 
 
-def uncertain(model: GyroModel, assumptions: Assumptions) -> Array:
+def uncertain_covariance(model: GyroModel, assumptions: Assumptions) -> Array:
     """
     Return the covariance of all uncertain values of an `assumed` model, shape (m, m).
 
     With a self-calibration, the temperature coefficient is before its s and b, which are the last
-    two; without one, it is the last. `sensitive` has the same order.
+    two; without one, it is the last. `uncertain_sensitivity` has the same order.
 
     """
-    values = covariance(model)
-    place = _place(model, len(values))
+    values = uncertainty_covariance(model)
+    place = _coefficient_index(model, len(values))
     whole = np.insert(np.insert(values, place, 0.0, axis=0), place, 0.0, axis=1)
     whole[place, place] = assumptions.bias_temperature_coefficient ** 2
     return whole
 
 
-def sensitive(model: GyroModel, sensitivity: Array, distance: Number) -> Array:
+def uncertain_sensitivity(model: GyroModel, sensitivity: Array,
+                          temperature_distance: Number) -> Array:
     """
     Return the sensitivity of the rate to each value of `uncertain`, shape (m, ...).
 
     Parameters
     ----------
     sensitivity : `compensation.rate_sensitivity` of the `assumed` model, shape (m - 1, ...)
-    distance : of the temperature from that at which the bias is known, K, a number or shape (...)
+    temperature_distance : of the temperature from that at which the bias is known, K, a number or
+        shape (...)
 
     """
-    place = _place(model, len(sensitivity))
+    place = _coefficient_index(model, len(sensitivity))
     whole = np.empty((len(sensitivity) + 1, *sensitivity.shape[1:]))
     whole[:place], whole[place], whole[place + 1:] = (
-        sensitivity[:place], -distance, sensitivity[place:])
+        sensitivity[:place], -temperature_distance, sensitivity[place:])
     return whole
 
 
-def _place(model: GyroModel, values: int) -> int:
-    return values if model.self_calibration is None else values - 2
+def _coefficient_index(model: GyroModel, value_count: int) -> int:
+    return value_count if model.self_calibration is None else value_count - 2
 
 
 class TemperatureCorrection:
@@ -122,32 +124,33 @@ class TemperatureCorrection:
         coefficient : standard deviation in which distances are counted, rad/s/K; above 0
 
         """
-        self._table, self.begin, self._now, self._coefficient = (
+        self._table, self.start_temperature, self._now, self._coefficient = (
             deepcopy(table), begin, now, coefficient)
-        self._known: dict[int, tuple[float, float]] = {0: (0.0, 0.0)}
+        self._known_steps: dict[int, tuple[float, float]] = {0: (0.0, 0.0)}
 
-    def at(self, temperature: float) -> tuple[float, float]:
+    def change_at(self, temperature: float) -> tuple[float, float]:
         """Return the change of the bias, rad/s, and the signed distance, K of the coefficient."""
-        steps = (temperature - self.begin) / _STEP
+        steps = (temperature - self.start_temperature) / _TEMPERATURE_STEP
         below = math.floor(steps)
         (first, near), (last, far), part = (
-            self._computed(below), self._computed(below + 1), steps - below)
+            self._change_at_step(below), self._change_at_step(below + 1), steps - below)
         return first + part * (last - first), near + part * (far - near)
 
-    def along(self, temperature: Array) -> tuple[Array, Array]:
-        """Return the same as `at` for several temperatures, shape (n,) each."""
-        steps = (temperature - self.begin) / _STEP
+    def changes_at(self, temperature: Array) -> tuple[Array, Array]:
+        """Return the same as `change_at` for several temperatures, shape (n,) each."""
+        steps = (temperature - self.start_temperature) / _TEMPERATURE_STEP
         below = np.floor(steps).astype(int)
         known, places = np.unique(below, return_inverse=True)
-        near, far = (np.array([self._computed(int(step) + ahead) for step in known])[places]
+        near, far = (np.array([self._change_at_step(int(step) + ahead) for step in known])[places]
                      for ahead in (0, 1))
         change, distance = (near + (steps - below)[:, None] * (far - near)).T
         return change, distance
 
-    def _computed(self, step: int) -> tuple[float, float]:
-        if step not in self._known:
-            change, variance = self._table.difference(
-                self.begin, self.begin + step * _STEP, self._now)
-            self._known[step] = (
+    def _change_at_step(self, step: int) -> tuple[float, float]:
+        if step not in self._known_steps:
+            change, variance = self._table.bias_difference(
+                self.start_temperature, self.start_temperature + step * _TEMPERATURE_STEP,
+                self._now)
+            self._known_steps[step] = (
                 change, math.copysign(math.sqrt(variance), step) / self._coefficient)
-        return self._known[step]
+        return self._known_steps[step]

@@ -40,36 +40,37 @@ import math
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gyro_calibration.files import plain, reason, write_atomically
+from gyro_calibration.files import describe_error, to_printable, write_atomically
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
-from gyro_calibration.model.settings_file import read_settings, settings_text
+from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
 
 #: Width of a temperature bin, K; a run has one entry in each.
-BIN = 1.5
+BIN_WIDTH = 1.5
 #: Largest number of entries.
-ENTRIES = 80
+MAX_ENTRIES = 80
 #: Averaging time of a rest, s, for its variance by flicker.
-DURATION = 10.0
+REST_DURATION = 10.0
 #: Standard deviations from which on an estimate is an outlier.
-_FAR = 4.5
+_OUTLIER_SIGMAS = 4.5
 #: Consecutive outliers that agree with each other and are taken for a jump.
-_IN_A_ROW = 3
+_JUMP_ESTIMATES = 3
 #: Shortest time between two writes, s.
-INTERVAL = 600.0
+MIN_WRITE_INTERVAL = 600.0
 _YEAR = 365.25 * 86400.0
 #: Largest time between a calibration and an entry of the same run, s.
-_SAME_RUN = 3600.0
+_SAME_RUN_DURATION = 3600.0
 #: Least variance of a bias, (rad/s)².
-_LEAST = 1e-18
+_MIN_VARIANCE = 1e-18
 #: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probabilities.
 #: `benchmarks/bias_table.py --sizes` compares them with more, and with fewer sizes.
-_COEFFICIENTS = {0.1: 0.4, 1.0: 0.6}
-_TURN_ONS = {0.3: 0.3, 1.0: 0.5, 4.0: 0.2}
+_COEFFICIENT_SIZES = {0.1: 0.4, 1.0: 0.6}
+_TURN_ON_SIZES = {0.3: 0.3, 1.0: 0.5, 4.0: 0.2}
 _SIZES = np.array([(coefficient, turn_on)
-                   for coefficient in _COEFFICIENTS for turn_on in _TURN_ONS])
-_MET = np.array([often * also for often in _COEFFICIENTS.values() for also in _TURN_ONS.values()])
+                   for coefficient in _COEFFICIENT_SIZES for turn_on in _TURN_ON_SIZES])
+_SIZE_PROBABILITIES = np.array(
+    [often * also for often in _COEFFICIENT_SIZES.values() for also in _TURN_ON_SIZES.values()])
 
 
 @dataclass(frozen=True)
@@ -81,22 +82,22 @@ class Prior:
     ----------
     coefficient : standard deviation of the temperature coefficient of the bias, rad/s/K (L3G4200D
         data sheet: 0.03 deg/s/K)
-    length : correlation length of the coefficient, K
-    compensated : share of the coefficient that remains inside the range of a model with
+    correlation_length : correlation length of the coefficient, K
+    compensated_share : share of the coefficient that remains inside the range of a model with
         temperature effects, 1
     turn_on : standard deviation of the bias from one run to the next, rad/s
     ageing : standard deviation of the bias at one temperature in a year, beyond the model's noise,
         rad/s
-    unknown : assumed distance of an unknown temperature, K
+    unknown_distance : assumed distance of an unknown temperature, K
 
     """
 
     coefficient: float = 0.03 * DEGREE
-    length: float = 15.0
-    compensated: float = 0.1
+    correlation_length: float = 15.0
+    compensated_share: float = 0.1
     turn_on: float = 0.05 * DEGREE
     ageing: float = 0.02 * DEGREE
-    unknown: float = 15.0
+    unknown_distance: float = 15.0
 
 
 @dataclass(frozen=True)
@@ -134,24 +135,24 @@ _Dated = TypeVar('_Dated', Entry, Jump)
 
 
 @dataclass(frozen=True)
-class Propagated:
+class PropagatedCalibration:
     """
     A stored calibration propagated to the present.
 
     Attributes
     ----------
     calibration : with the present bias and covariance; to be used, and not to be stored
-    change : its bias less the stored one, rad/s
-    variance : increase of the variance of the bias, (rad/s)²; negative if the table is more
+    bias_change : its bias less the stored one, rad/s
+    variance_growth : increase of the variance of the bias, (rad/s)²; negative if the table is more
         precise; nan if it was not known
-    sentence : for diagnostics, if age or temperature matters; else ''
+    message : for diagnostics, if age or temperature matters; else ''
 
     """
 
     calibration: SelfCalibration
-    change: float
-    variance: float
-    sentence: str
+    bias_change: float
+    variance_growth: float
+    message: str
 
 
 class BiasTable:
@@ -163,7 +164,7 @@ class BiasTable:
     digest : of the model that it belongs to
     entries, jumps : of all runs
     run : number of the present run
-    held_back : number of estimates that were not used so far
+    held_back_count : number of estimates that were not used so far
 
     """
 
@@ -174,27 +175,27 @@ class BiasTable:
         self.entries, self.jumps = list(entries), list(jumps)
         self.run = 1 + max([-1, *(math.floor(each.run) for each in entries),
                             *(each.run for each in jumps)])
-        self._first, self._dated_anew = self.run, False
-        self.held_back = 0
+        self._first_run, self._dates_changed = self.run, False
+        self.held_back_count = 0
         self._model, self._prior = model, prior or Prior()
-        self._held: list[Entry] = []
-        self._kept, self._kept_at = tuple(self.entries), -math.inf
+        self._held_entries: list[Entry] = []
+        self._written_entries, self._write_time = tuple(self.entries), -math.inf
 
     def begin_run(self) -> None:
         """Expect another turn-on bias, as after the gyro was without power."""
-        self._held.clear()
+        self._held_entries.clear()
         self.run += any(each.run == self.run for each in self.entries)
 
-    def clock_was_set(self, step: float) -> None:
+    def shift_clock(self, step: float) -> None:
         """Correct the dates since this table began for a clock that was set by a step, s."""
-        self.entries, self._held = ([self._moved(each, step) for each in rows]
-                                    for rows in (self.entries, self._held))
-        self.jumps = [self._moved(each, step) for each in self.jumps]
-        self._dated_anew = (self._dated_anew
-                            or any(each.run >= self._first for each in self.entries))
+        self.entries, self._held_entries = ([self._shift_time(each, step) for each in rows]
+                                            for rows in (self.entries, self._held_entries))
+        self.jumps = [self._shift_time(each, step) for each in self.jumps]
+        self._dates_changed = (self._dates_changed
+                               or any(each.run >= self._first_run for each in self.entries))
 
-    def _moved(self, row: _Dated, step: float) -> _Dated:
-        return replace(row, time=max(row.time + step, 0.0)) if row.run >= self._first else row
+    def _shift_time(self, row: _Dated, step: float) -> _Dated:
+        return replace(row, time=max(row.time + step, 0.0)) if row.run >= self._first_run else row
 
     def add(self, temperature: float, bias: float, variance: float, time: float) -> str:
         """
@@ -213,155 +214,163 @@ class BiasTable:
 
         """
         given = Entry(float(temperature), float(bias), float(variance), float(time), self.run)
-        if not _possible(given):
+        if not _is_possible(given):
             return (f'a bias of {bias:g} rad/s at {temperature:g} degC with a variance of '
                     f'{variance:g} at {time:g} s is not used: it is not plausible for a gyro')
         before, known = self.predict(temperature, time)
-        if abs(bias - before) <= _FAR * math.sqrt(known + variance):
-            self._held.clear()
-            self._take(given)
+        if abs(bias - before) <= _OUTLIER_SIGMAS * math.sqrt(known + variance):
+            self._held_entries.clear()
+            self._add_entry(given)
             return ''
-        self._held = [*(each for each in self._held if self._agree(each, given)), given]
+        self._held_entries = [
+            *(each for each in self._held_entries if self._is_consistent(each, given)), given
+        ]
         off = (f'{(bias - before) / DEGREE:.4f} deg/s off what is known at '
                f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
-        if len(self._held) < _IN_A_ROW:
-            self.held_back += 1
+        if len(self._held_entries) < _JUMP_ESTIMATES:
+            self.held_back_count += 1
             return f'a bias that is {off} is not used: check whether the robot turned slowly'
-        self._jump((bias - before) ** 2)
-        return (f'the bias jumped: {_IN_A_ROW} rests in a row are {off}; earlier entries are '
+        self._add_jump((bias - before) ** 2)
+        return (f'the bias jumped: {_JUMP_ESTIMATES} rests in a row are {off}; earlier entries '
+                'are '
                 'shifted')
 
-    def _agree(self, held: Entry, given: Entry) -> bool:
-        variance = (held.variance + given.variance + self._wander(given.time - held.time)
-                    + self._prior.coefficient ** 2
-                    * _spread(given.temperature - held.temperature, self._prior.length))
-        return abs(given.bias - held.bias) <= _FAR * math.sqrt(variance)
+    def _is_consistent(self, held: Entry, given: Entry) -> bool:
+        variance = (held.variance + given.variance + self._wander_variance(given.time - held.time)
+                    + self._prior.coefficient ** 2 * _mean_square_change(
+                        given.temperature - held.temperature, self._prior.correlation_length))
+        return abs(given.bias - held.bias) <= _OUTLIER_SIGMAS * math.sqrt(variance)
 
-    def _jump(self, variance: float) -> None:
+    def _add_jump(self, variance: float) -> None:
         """Add a jump at all temperatures, and the estimates held back for it."""
-        self.held_back -= _IN_A_ROW - 1
+        self.held_back_count -= _JUMP_ESTIMATES - 1
         self.run += 1
-        self.jumps.append(Jump(self.run, variance, self._held[0].time))
-        if len(self.jumps) > ENTRIES:
+        self.jumps.append(Jump(self.run, variance, self._held_entries[0].time))
+        if len(self.jumps) > MAX_ENTRIES:
             first, second, *others = self.jumps
             self.jumps = [replace(second, variance=first.variance + second.variance), *others]
-        for each in self._held:
-            self._take(replace(each, run=self.run))
-        self._held.clear()
+        for each in self._held_entries:
+            self._add_entry(replace(each, run=self.run))
+        self._held_entries.clear()
 
-    def _take(self, given: Entry) -> None:
+    def _add_entry(self, given: Entry) -> None:
         for place, entry in enumerate(self.entries):
-            if entry.run == given.run and _bin(entry) == _bin(given):
-                self.entries[place] = self._merged(entry, given)
+            if entry.run == given.run and _bin_number(entry) == _bin_number(given):
+                self.entries[place] = self._merge_entries(entry, given)
                 return
         self.entries.append(given)
-        if len(self.entries) > ENTRIES:
-            self._forget()
+        if len(self.entries) > MAX_ENTRIES:
+            self._drop_oldest_entry()
 
-    def _merged(self, entry: Entry, given: Entry) -> Entry:
+    def _merge_entries(self, entry: Entry, given: Entry) -> Entry:
         """Return both as one entry at the time of the newer, with the older aged until then."""
-        older = entry.variance + self._wander(given.time - entry.time)
+        older = entry.variance + self._wander_variance(given.time - entry.time)
         weight = float(older / (older + given.variance))
         return replace(given, bias=entry.bias + weight * (given.bias - entry.bias),
-                       variance=max(weight * given.variance, 2.0 * _LEAST),
+                       variance=max(weight * given.variance, 2.0 * _MIN_VARIANCE),
                        temperature=entry.temperature
                        + weight * (given.temperature - entry.temperature))
 
-    def _forget(self) -> None:
+    def _drop_oldest_entry(self) -> None:
         """Drop the oldest entry of the fullest bin, and the jumps that no entry precedes."""
-        (fullest, _), = Counter(map(_bin, self.entries)).most_common(1)
-        self.entries.remove(min((each for each in self.entries if _bin(each) == fullest),
+        (fullest, _), = Counter(map(_bin_number, self.entries)).most_common(1)
+        self.entries.remove(min((each for each in self.entries if _bin_number(each) == fullest),
                                 key=lambda each: (each.run, each.time)))
         first = min(each.run for each in self.entries)
         self.jumps = [each for each in self.jumps if each.run > first]
 
     def predict(self, temperature: float, time: float) -> tuple[float, float]:
         """Return the bias in this run, rad/s, and its variance, (rad/s)²; 0 and inf if unknown."""
-        return self._predicted(self.entries, temperature, time)[:2]
+        return self._predict_with_weight(self.entries, temperature, time)[:2]
 
-    def _predicted(self, entries: Sequence[Entry], temperature: float,
-                   time: float) -> tuple[float, float, float]:
+    def _predict_with_weight(self, entries: Sequence[Entry], temperature: float,
+                             time: float) -> tuple[float, float, float]:
         """Return the bias, its variance, and the weight of the last entry in it."""
         if not entries:
             return 0.0, math.inf, 0.0
-        temperature, time = _bounded(temperature, time)
-        seen = self._seen(entries, temperature, time)
-        bias, variance = _mixture(seen.likely, seen.mean, 1.0 / seen.information)
+        temperature, time = _clip_to_range(temperature, time)
+        seen = self._posterior_at(entries, temperature, time)
+        bias, variance = _mixture_moments(seen.probability, seen.mean, 1.0 / seen.information)
         return (bias + entries[0].bias, variance,
-                float(seen.likely @ (seen.of_ones[:, -1] / seen.information)))
+                float(seen.probability @ (seen.inverse_times_ones[:, -1] / seen.information)))
 
-    def difference(self, from_temperature: float, to_temperature: float,
-                   time: float) -> tuple[float, float]:
+    def bias_difference(self, from_temperature: float, to_temperature: float,
+                        time: float) -> tuple[float, float]:
         """Return the change of bias between temperatures, rad/s, and its variance, (rad/s)²."""
-        (from_temperature, time), (to_temperature, _) = (_bounded(from_temperature, time),
-                                                         _bounded(to_temperature, time))
-        own = self._by_temperature(from_temperature, np.array([to_temperature]))[:, 0]
+        (from_temperature, time), (to_temperature, _) = (_clip_to_range(from_temperature, time),
+                                                         _clip_to_range(to_temperature, time))
+        own = self._temperature_variance(from_temperature, np.array([to_temperature]))[:, 0]
         if not self.entries:
-            return 0.0, float(_MET @ own)
-        seen = self._seen(self.entries, from_temperature, time)
+            return 0.0, float(_SIZE_PROBABILITIES @ own)
+        seen = self._posterior_at(self.entries, from_temperature, time)
         temperatures = np.array([each.temperature for each in self.entries])
-        near, far = (self._by_temperature(end, temperatures)
+        near, far = (self._temperature_variance(end, temperatures)
                      for end in (from_temperature, to_temperature))
         shared = 0.5 * (near + own[:, None] - far)
         change, of_shared = (np.einsum('mi,mi->m', shared, values)
-                             for values in (seen.of_rests, seen.of_ones))
+                             for values in (seen.inverse_times_residual, seen.inverse_times_ones))
         explained = np.einsum('mi,mij,mj->m', shared, seen.inverse, shared)
-        return _mixture(seen.likely, change,
-                        np.maximum(own - explained + of_shared ** 2 / seen.information, 0.0))
+        return _mixture_moments(
+            seen.probability, change,
+            np.maximum(own - explained + of_shared ** 2 / seen.information, 0.0))
 
-    def joined(self, calibration: SelfCalibration, age: float, time: float,
-               temperature: float | None, this_run: bool) -> tuple[float, float, float]:
+    def combine_with_calibration(self, calibration: SelfCalibration, age: float, time: float,
+                                 temperature: float | None,
+                                 this_run: bool) -> tuple[float, float, float]:
         """Return bias and variance now, and the weight of the calibration in the bias."""
         here = (self._model.reference_temperature if calibration.temperature is None
                 else calibration.temperature)
         now = here if temperature is None else temperature
         own = calibration.standard_deviations[1] ** 2
         if calibration.temperature is None:
-            here, own = now, own + self._unknown()
+            here, own = now, own + self._unknown_variance()
         made = time - age
         jumped = any(each.time > made for each in self.jumps)
         entry = Entry(here, calibration.bias, own, made,
                       self.run if this_run and not jumped else self._run_at(made))
-        bias, variance, weight = self._predicted([*self.entries, entry], now, time)
-        return bias, variance + (self._unknown() if temperature is None else 0.0), weight
+        bias, variance, weight = self._predict_with_weight([*self.entries, entry], now, time)
+        return bias, variance + (self._unknown_variance() if temperature is None else 0.0), weight
 
     def _run_at(self, time: float) -> float:
         """Return the run of a time, or a number between the jumps before and after it."""
         after = max([-1, *(each.run for each in self.jumps if each.time <= time)])
         until = min([self.run, *(each.run for each in self.jumps if each.time > time)])
         near = {abs(each.time - time): each.run for each in self.entries
-                if after <= each.run < until and abs(each.time - time) < _SAME_RUN}
+                if after <= each.run < until and abs(each.time - time) < _SAME_RUN_DURATION}
         return near[min(near)] if near else after + 0.5
 
-    def _unknown(self) -> float:
+    def _unknown_variance(self) -> float:
         """Return the variance of the bias, (rad/s)², where the temperature is unknown."""
-        return float(_MET @ (self._usual() ** 2 * _SIZES[:, 0] ** 2)) * self._prior.unknown ** 2
+        return (float(_SIZE_PROBABILITIES @ (self._prior_coefficient() ** 2 * _SIZES[:, 0] ** 2))
+                * self._prior.unknown_distance ** 2)
 
-    def _usual(self) -> float:
+    def _prior_coefficient(self) -> float:
         """Return the prior temperature coefficient within the range of the model, rad/s/K."""
         return self._prior.coefficient * (
-            self._prior.compensated if self._model.looks_at('temperature') else 1.0)
+            self._prior.compensated_share if self._model.uses_channel('temperature') else 1.0)
 
-    def _by_temperature(self, here: Array | float, there: Array) -> Array:
+    def _temperature_variance(self, here: Array | float, there: Array) -> Array:
         """Return the variance of the bias between temperatures, (rad/s)², shape (sizes, ...)."""
-        inside = self._usual() ** 2 * _spread(there - here, self._prior.length)
+        inside = (self._prior_coefficient() ** 2
+                  * _mean_square_change(there - here, self._prior.correlation_length))
         return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, inside)
-                          + self._outside(here, there))
+                          + self._out_of_range_variance(here, there))
 
-    def _outside(self, here: Array | float, there: Array) -> Array | float:
+    def _out_of_range_variance(self, here: Array | float, there: Array) -> Array | float:
         """Return the part of that variance from outside the temperature range of the model."""
-        if not self._model.looks_at('temperature'):
+        if not self._model.uses_channel('temperature'):
             return 0.0
         low, high = self._model.temperature_range
         below = np.minimum(there - low, 0.0) - np.minimum(here - low, 0.0)
         above = np.maximum(there - high, 0.0) - np.maximum(here - high, 0.0)
         return self._prior.coefficient ** 2 * (below ** 2 + above ** 2)
 
-    def _wander(self, age: Array | float) -> Any:
+    def _wander_variance(self, age: Array | float) -> Any:
         """Return the variance of the wander of the bias by the noise of the gyro, (rad/s)²."""
-        return self._model.noise.wander(np.abs(age) + DURATION, DURATION)
+        return self._model.noise.mean_change_variance(np.abs(age) + REST_DURATION, REST_DURATION)
 
-    def _seen(self, entries: Sequence[Entry], temperature: float, time: float) -> _Seen:
+    def _posterior_at(self, entries: Sequence[Entry], temperature: float,
+                      time: float) -> _Posterior:
         """Return the estimates of the bias in this run, now, at a temperature."""
         covariance = self._covariance(entries, temperature, time)
         rests = np.array([each.bias - entries[0].bias for each in entries])
@@ -371,27 +380,31 @@ class BiasTable:
         mean = of_rests.sum(axis=1) / information
         misfit = of_rests @ rests - mean ** 2 * information
         logarithms = -0.5 * (np.linalg.slogdet(covariance)[1] + np.log(information) + misfit)
-        likely = _MET * np.exp(logarithms - logarithms.max())
-        return _Seen(likely / likely.sum(), mean, information, of_ones,
-                     of_rests - mean[:, None] * of_ones, inverse)
+        likely = _SIZE_PROBABILITIES * np.exp(logarithms - logarithms.max())
+        return _Posterior(likely / likely.sum(), mean, information, of_ones,
+                          of_rests - mean[:, None] * of_ones, inverse)
 
     def _covariance(self, entries: Sequence[Entry], temperature: float, time: float) -> Array:
         """Return the covariance of the errors of entries now, (rad/s)², shape (sizes, n, n)."""
         temperatures, variances, times, runs = (
             np.array([getattr(each, name) for each in entries])
             for name in ('temperature', 'variance', 'time', 'run'))
-        age, runs_apart = np.abs(time - times), _between(runs) != 0.0
-        by_temperature = _shared(self._by_temperature(temperature, temperatures),
-                                 self._by_temperature(temperatures[:, None], temperatures))
-        wander = self._wander(_between(times)) * (1.0 - np.eye(len(times)))
-        alike = np.exp(-np.abs(_between(temperatures)) / self._prior.length)
-        fixed = (_shared(self._wander(age), wander) + np.diag(variances)
+        age, runs_apart = np.abs(time - times), _pairwise_differences(runs) != 0.0
+        by_temperature = _covariance_of_differences(
+            self._temperature_variance(temperature, temperatures),
+            self._temperature_variance(temperatures[:, None], temperatures))
+        wander = self._wander_variance(_pairwise_differences(times)) * (1.0 - np.eye(len(times)))
+        alike = np.exp(
+            -np.abs(_pairwise_differences(temperatures)) / self._prior.correlation_length)
+        fixed = (_covariance_of_differences(self._wander_variance(age), wander)
+                 + np.diag(variances)
                  + self._prior.ageing ** 2 / _YEAR * alike * np.minimum(age[:, None], age)
-                 + self._jumped(runs))
-        by_run = self._prior.turn_on ** 2 * _shared(2.0 * (runs != self.run), 2.0 * runs_apart)
+                 + self._jump_covariance(runs))
+        by_run = (self._prior.turn_on ** 2
+                  * _covariance_of_differences(2.0 * (runs != self.run), 2.0 * runs_apart))
         return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
 
-    def _jumped(self, runs: Array) -> Array:
+    def _jump_covariance(self, runs: Array) -> Array:
         """Return the covariance by jumps, (rad/s)², shape (n, n), shared by all before a jump."""
         total = np.zeros((len(runs), len(runs)))
         for each in self.jumps:
@@ -399,60 +412,61 @@ class BiasTable:
             total += each.variance * np.outer(before, before)
         return total
 
-    def changed(self) -> bool:
-        """Tell whether entries changed significantly since `kept`, or dates were corrected."""
-        if self._dated_anew:
+    def has_changed(self) -> bool:
+        """Tell whether entries changed since `mark_written`, or dates were corrected."""
+        if self._dates_changed:
             return True
-        kept = {(each.run, _bin(each)): each for each in self._kept}
+        kept = {(each.run, _bin_number(each)): each for each in self._written_entries}
         # by half a standard deviation, or a fifth of the variance
         return any(old is None or (each.bias - old.bias) ** 2 > 0.25 * old.variance
                    or each.variance < 0.8 * old.variance
-                   for each in self.entries for old in [kept.get((each.run, _bin(each)))])
+                   for each in self.entries for old in [kept.get((each.run, _bin_number(each)))])
 
-    def due(self, now: float, ending: bool = False) -> bool:
+    def is_write_due(self, now: float, ending: bool = False) -> bool:
         """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
-        return self.changed() and (ending or abs(now - self._kept_at) >= INTERVAL)
+        return self.has_changed() and (ending or abs(now - self._write_time) >= MIN_WRITE_INTERVAL)
 
-    def kept(self, now: float) -> None:
+    def mark_written(self, now: float) -> None:
         """Record that the table was written."""
-        self._kept, self._kept_at, self._dated_anew = tuple(self.entries), now, False
+        self._written_entries, self._write_time, self._dates_changed = (
+            tuple(self.entries), now, False)
 
-    def not_kept(self, now: float) -> None:
+    def mark_write_failed(self, now: float) -> None:
         """Record that it could not be written; it is tried again later, and at the end."""
-        self._kept_at = now
+        self._write_time = now
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Posterior:
     """
     Estimates of the bias at one temperature, for each of the sizes.
 
     Attributes
     ----------
-    likely : probability of each size, shape (sizes,)
+    probability : probability of each size, shape (sizes,)
     mean : of the biases less that of the first entry, rad/s, shape (sizes,)
     information : 1 over the variance of the mean, shape (sizes,)
-    of_ones, of_rests : the inverse covariance times ones, and times the deviations of the entries
-        from the mean, shape (sizes, n)
+    inverse_times_ones, inverse_times_residual : the inverse covariance times ones, and times the
+        deviations of the entries from the mean, shape (sizes, n)
     inverse : of the covariance, shape (sizes, n, n)
 
     """
 
-    likely: Array
+    probability: Array
     mean: Array
     information: Array
-    of_ones: Array
-    of_rests: Array
+    inverse_times_ones: Array
+    inverse_times_residual: Array
     inverse: Array
 
 
-def _mixture(likely: Array, means: Array, variances: Array) -> tuple[float, float]:
+def _mixture_moments(probability: Array, means: Array, variances: Array) -> tuple[float, float]:
     """Return mean and variance of a mixture."""
-    mean = float(likely @ means)
-    return mean, float(likely @ (variances + (means - mean) ** 2))
+    mean = float(probability @ means)
+    return mean, float(probability @ (variances + (means - mean) ** 2))
 
 
-def _spread(distance: Array | float, length: float) -> Any:
+def _mean_square_change(distance: Array | float, length: float) -> Any:
     """
     Return the mean square, K², of the integral of a process of variance 1 over a distance.
 
@@ -464,34 +478,35 @@ def _spread(distance: Array | float, length: float) -> Any:
     return 2.0 * length ** 2 * (2.0 * lengths - 3.0 + (3.0 + lengths) * np.exp(-lengths))
 
 
-def _between(values: Array) -> Array:
+def _pairwise_differences(values: Array) -> Array:
     return values[:, None] - values
 
 
-def _shared(apart: Array, between: Array) -> Array:
+def _covariance_of_differences(from_origin: Array, pairwise: Array) -> Array:
     """Return the covariance of members, from the mean squares off a point and between them."""
-    return np.asarray(0.5 * (apart[..., :, None] + apart[..., None, :] - between))
+    return np.asarray(0.5 * (from_origin[..., :, None] + from_origin[..., None, :] - pairwise))
 
 
-def _bin(entry: Entry) -> int:
-    return round(entry.temperature / BIN)
+def _bin_number(entry: Entry) -> int:
+    return round(entry.temperature / BIN_WIDTH)
 
 
-def _possible(entry: Entry) -> bool:
+def _is_possible(entry: Entry) -> bool:
     """Tell whether this may be a bias of a gyro; nan never is."""
-    temperature, time = _bounded(entry.temperature, entry.time)
+    temperature, time = _clip_to_range(entry.temperature, entry.time)
     return (entry.temperature == temperature and entry.time == time
-            and abs(entry.bias) <= 1e4 and _LEAST <= entry.variance <= 1e8
+            and abs(entry.bias) <= 1e4 and _MIN_VARIANCE <= entry.variance <= 1e8
             and 0 <= entry.run <= 1e9)
 
 
-def _bounded(temperature: float, time: float) -> tuple[float, float]:
+def _clip_to_range(temperature: float, time: float) -> tuple[float, float]:
     """Return temperature, degC, and time, s since 1970, limited to their possible ranges."""
     return min(max(temperature, -273.15), 1e4), min(max(time, 0.0), 1e11)
 
 
-def propagated(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
-               temperature: float | None = None, this_run: bool = False) -> Propagated:
+def propagate_calibration(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
+                          temperature: float | None = None,
+                          this_run: bool = False) -> PropagatedCalibration:
     """
     Return a stored calibration propagated to the present by the table.
 
@@ -511,25 +526,28 @@ def propagated(calibration: SelfCalibration, table: BiasTable, age: float, time:
 
     """
     if calibration.covariance is None:
-        return _moved(calibration, table, time, temperature)
+        return _move_calibration(calibration, table, time, temperature)
     (a, c), (_, own) = calibration.covariance
-    bias, variance, weight = table.joined(calibration, age, time, temperature, this_run)
+    bias, variance, weight = table.combine_with_calibration(calibration, age, time, temperature,
+                                                            this_run)
     moved = replace(calibration, bias=bias, covariance=((a, weight * c), (weight * c, variance)))
-    return Propagated(moved, bias - calibration.bias, variance - own,
-                      _sentence(calibration, table, age, temperature, variance))
+    return PropagatedCalibration(
+        moved, bias - calibration.bias, variance - own,
+        _propagation_message(calibration, table, age, temperature, variance))
 
 
-def _moved(calibration: SelfCalibration, table: BiasTable, time: float,
-           temperature: float | None) -> Propagated:
+def _move_calibration(calibration: SelfCalibration, table: BiasTable, time: float,
+                      temperature: float | None) -> PropagatedCalibration:
     """Return a calibration without a covariance, at another temperature."""
     here = calibration.temperature
     change = (0.0 if here is None or temperature is None
-              else table.difference(here, temperature, time)[0])
-    return Propagated(replace(calibration, bias=calibration.bias + change), change, math.nan, '')
+              else table.bias_difference(here, temperature, time)[0])
+    return PropagatedCalibration(replace(calibration, bias=calibration.bias + change), change,
+                                 math.nan, '')
 
 
-def _sentence(calibration: SelfCalibration, table: BiasTable, age: float,
-              temperature: float | None, variance: float) -> str:
+def _propagation_message(calibration: SelfCalibration, table: BiasTable, age: float,
+                         temperature: float | None, variance: float) -> str:
     """Return a sentence if the bias of a calibration has become less certain; else ''."""
     own = calibration.standard_deviations[1]
     if variance < 2.0 * own ** 2:
@@ -538,12 +556,13 @@ def _sentence(calibration: SelfCalibration, table: BiasTable, age: float,
         why = 'at a temperature that is not known'
     else:
         why = f'at {calibration.temperature:.1f} degC, and now it is {temperature:.1f} degC'
-    return (f'the calibration was made {_age(age)} ago {why}: the standard deviation of its bias '
+    return (f'the calibration was made {_format_age(age)} ago {why}: the standard deviation of '
+            'its bias '
             f'is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
             f'{own / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
 
 
-def _age(age: float) -> str:
+def _format_age(age: float) -> str:
     for unit, length in (('days', 86400.0), ('hours', 3600.0)):
         if age >= 2.0 * length:
             return f'{age / length:.0f} {unit}'
@@ -552,8 +571,8 @@ def _age(age: float) -> str:
 
 FORMAT = 'gyro_calibration/bias_table'
 VERSION = 1
-#: A table of `ENTRIES` entries has a twentieth of this.
-_BYTES = 200_000
+#: A table of `MAX_ENTRIES` entries has a twentieth of this.
+_MAX_FILE_BYTES = 200_000
 _HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest and before '
            'any self-calibration; times are UTC.\n'
            '# Written by the compensation node. If it is deleted, estimation begins again.\n')
@@ -578,15 +597,15 @@ def read_bias_table(path: str | Path, model: GyroModel,
 
     """
     try:
-        digest, entries, jumps = _read(Path(path))
+        digest, entries, jumps = _read_file(Path(path))
     except FileNotFoundError:
         return BiasTable(model, prior), ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
-        message = (f'{path} cannot be read as a bias table ({reason(error)}): estimation '
+        message = (f'{path} cannot be read as a bias table ({describe_error(error)}): estimation '
                    'begins again, and the file is kept')
-        return BiasTable(model, prior), plain(message)
+        return BiasTable(model, prior), to_printable(message)
     if digest != model_digest(model):
-        return BiasTable(model, prior), plain(
+        return BiasTable(model, prior), to_printable(
             f'the bias table in {path} belongs to another model: estimation begins again, and the '
             'file is kept')
     return BiasTable(model, prior, entries, jumps), ''
@@ -610,18 +629,18 @@ def write_bias_table(path: str | Path, table: BiasTable,
 
     """
     message = _keep_aside(Path(path), table.digest)
-    entries = [{'temperature': round(each.temperature, 3), 'bias': _short(each.bias),
-                **_common(each)} for each in table.entries]
+    entries = [{'temperature': round(each.temperature, 3), 'bias': _round_digits(each.bias),
+                **_common_fields(each)} for each in table.entries]
     content = {'format': FORMAT, 'version': VERSION, 'model': table.digest, 'entries': entries,
-               'jumps': [_common(each) for each in table.jumps]}
-    written = write_atomically(path, (_HEADER + settings_text(content)).encode())
-    table.kept(now)
+               'jumps': [_common_fields(each) for each in table.jumps]}
+    written = write_atomically(path, (_HEADER + format_settings(content)).encode())
+    table.mark_written(now)
     return message, written
 
 
 def _keep_aside(path: Path, digest: str) -> str:
     try:
-        if not path.exists() or _read(path)[0] == digest:
+        if not path.exists() or _read_file(path)[0] == digest:
             return ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError):
         pass  # a file of unknown content is not overwritten
@@ -629,46 +648,46 @@ def _keep_aside(path: Path, digest: str) -> str:
     while (other := path.with_name(f'{path.name}.kept-{number}')).exists():
         number += 1
     path.rename(other)
-    return plain(f'what was in {path} is now in {other}')
+    return to_printable(f'what was in {path} is now in {other}')
 
 
-def _read(path: Path) -> tuple[str, list[Entry], list[Jump]]:
+def _read_file(path: Path) -> tuple[str, list[Entry], list[Jump]]:
     """Return digest, entries and jumps of a file."""
-    content = read_settings(path, _BYTES)
+    content = read_settings(path, _MAX_FILE_BYTES)
     if not isinstance(content, dict) or content.get('format') != FORMAT:
         raise ValueError(f'it has no line format: {FORMAT}')
     if content.get('version') != VERSION:
         raise ValueError(f'its version is {content.get("version")!r:.40}, wanted {VERSION}')
-    entries = [_entry(row, float(row['temperature']), float(row['bias']))
+    entries = [_entry_from_row(row, float(row['temperature']), float(row['bias']))
                for row in _rows(content, 'entries')]
     jumps = [Jump(int(each.run), each.variance, each.time)
-             for each in (_entry(row, 0.0, 0.0) for row in _rows(content, 'jumps'))]
+             for each in (_entry_from_row(row, 0.0, 0.0) for row in _rows(content, 'jumps'))]
     return str(content['model']), entries, jumps
 
 
-def _entry(row: Mapping[str, Any], temperature: float, bias: float) -> Entry:
+def _entry_from_row(row: Mapping[str, Any], temperature: float, bias: float) -> Entry:
     # of a text, or of what YAML takes it for
     text = str(row['time']).removesuffix('Z').removesuffix('+00:00')
     entry = Entry(temperature, bias, float(row['standard_deviation']) ** 2,
                   float(np.datetime64(text, 's').astype('int64')), int(row['run']))
-    if not _possible(entry):
+    if not _is_possible(entry):
         raise ValueError(f'it has implausible values: {entry}')
     return entry
 
 
 def _rows(content: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
     rows = content[name]
-    if (not isinstance(rows, list) or len(rows) > ENTRIES
+    if (not isinstance(rows, list) or len(rows) > MAX_ENTRIES
             or not all(isinstance(row, dict) for row in rows)):
-        raise ValueError(f'{name} is no list of at most {ENTRIES} rows')
+        raise ValueError(f'{name} is no list of at most {MAX_ENTRIES} rows')
     return rows
 
 
-def _common(row: Entry | Jump) -> dict[str, Any]:
+def _common_fields(row: Entry | Jump) -> dict[str, Any]:
     time = str(np.datetime64(round(row.time), 's'))
-    return {'standard_deviation': _short(math.sqrt(row.variance)), 'time': time,
+    return {'standard_deviation': _round_digits(math.sqrt(row.variance)), 'time': time,
             'run': int(row.run)}
 
 
-def _short(value: float) -> float:
+def _round_digits(value: float) -> float:
     return float(f'{value:.9g}')

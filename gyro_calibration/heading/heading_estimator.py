@@ -26,19 +26,19 @@ from datetime import datetime, timedelta, timezone
 import math
 
 from gyro_calibration.heading.assumptions import (
-    assumed,
     Assumptions,
-    sensitive,
     TemperatureCorrection,
-    uncertain,
+    uncertain_covariance,
+    uncertain_sensitivity,
+    with_assumed_covariance,
 )
-from gyro_calibration.heading.bias_table import BiasTable, propagated
-from gyro_calibration.heading.gaps import CLOSE
+from gyro_calibration.heading.bias_table import BiasTable, propagate_calibration
+from gyro_calibration.heading.gaps import TIME_TOLERANCE
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.compensation import (
     compensate,
-    Compensated,
+    CompensatedSamples,
     quadratic_form,
     rate_sensitivity,
 )
@@ -47,58 +47,58 @@ from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_s
 import numpy as np
 
 #: Averaging time of an entry of the table at rest, s.
-STRETCH = 10.0
+STRETCH_DURATION = 10.0
 #: Standard deviations from the final bias of the tracker beyond which a mean was not at rest.
-_FAR = 4.5
+_OUTLIER_SIGMAS = 4.5
 #: Distance from the temperature of the last start, K, at which the tracker is restarted at rest,
 #: with the new entries of the table.
-_AWAY = 5.0
+_RESTART_DISTANCE = 5.0
 #: Assumed drift of the temperature after its last message, K/s, and its limit, K.
-_LOST_RATE, _LOST = 1.0 / 60.0, 15.0
+_LOST_TEMPERATURE_RATE, _MAX_LOST_DISTANCE = 1.0 / 60.0, 15.0
 #: Interval at which the sensitivity at rest is computed, s.
-_STILL = 0.5
+_REST_SENSITIVITY_INTERVAL = 0.5
 #: Interval at which the sensitivity in motion is computed, s, and change of the rate at which it
 #: is computed earlier, rad/s plus a share of the rate.
-_HELD, _NEAR, _ALIKE = 0.1, 0.5 * DEGREE, 0.02
+_SENSITIVITY_INTERVAL, _RATE_TOLERANCE, _RELATIVE_RATE_TOLERANCE = 0.1, 0.5 * DEGREE, 0.02
 #: Age of a temperature, s, from which on it is held with a growing uncertainty.
 TEMPERATURE_TIMEOUT = 10.0
 #: Samples of a log in one chunk.
-_AT_ONCE = 1 << 15
+_CHUNK_SAMPLES = 1 << 15
 #: Step of the clock, s, after which the age of a calibration is computed again, and largest time
 #: that a calibration may be dated in the future.
-_OLDER = 3600.0
+_AGE_TOLERANCE = 3600.0
 #: Largest plausible stamp, s, and specific force, m/s².
-_LATEST, _STRONGEST = 1e12, 1e5
+_MAX_TIME, _MAX_SPECIFIC_FORCE = 1e12, 1e5
 #: Assumed age of a calibration without a date, s.
 _YEAR = 365.25 * 86400.0
 
 
 @dataclass
-class _Stretch:
+class _RestStretch:
     """
     Samples at rest, as sums.
 
     Attributes
     ----------
-    begin : stamp of the first, s
-    seen : sensitivity of the rate to each uncertain value, shape (m,), first at the begin, finally
-        the mean
-    count, modelled, temperature : number, and sums of rates after the model, rad/s, and of
+    start_time : stamp of the first, s
+    sensitivity : sensitivity of the rate to each uncertain value, shape (m,), first at the begin,
+        finally the mean
+    count, rate_sum, temperature_sum : number, and sums of rates after the model, rad/s, and of
         temperatures, degC
-    over : whether the rest has ended
+    has_ended : whether the rest has ended
 
     """
 
-    begin: float
-    seen: Array
+    start_time: float
+    sensitivity: Array
     count: int = 0
-    modelled: float = 0.0
-    temperature: float = 0.0
-    over: bool = False
+    rate_sum: float = 0.0
+    temperature_sum: float = 0.0
+    has_ended: bool = False
 
     def mean(self) -> tuple[float, float]:
         """Return the mean rate after the model, and temperature."""
-        return self.modelled / self.count, self.temperature / self.count
+        return self.rate_sum / self.count, self.temperature_sum / self.count
 
 
 class HeadingEstimator:
@@ -108,16 +108,16 @@ class HeadingEstimator:
     Attributes
     ----------
     model : with the stored calibration
-    used : the model with the present calibration, by which samples are compensated
+    current_model : the model with the present calibration, by which samples are compensated
     tracker : of the heading
     table : of biases at rest
     temperature : last temperature, degC; None before the first
     rate : last rate, rad/s; zero at rest
-    corrected : last rate before the tracker, rad/s
-    last : result of the compensation of the last sample
-    beginnings : number of starts of the tracker
-    refused : number of implausible samples, which are not used and count as lost
-    refused_temperatures : number of implausible temperatures, which are not used
+    corrected_rate : last rate before the tracker, rad/s
+    last_compensated : result of the compensation of the last sample
+    restart_count : number of starts of the tracker
+    refused_count : number of implausible samples, which are not used and count as lost
+    refused_temperature_count : number of implausible temperatures, which are not used
 
     """
 
@@ -133,25 +133,26 @@ class HeadingEstimator:
         settings : of the tracker
         temperature_timeout : an older temperature is held, and counts as less and less known, s
         now : s since 1970
-        keep : the steps of the tracker, for `log_compensation.in_hindsight`
+        keep : the steps of the tracker, for `log_compensation.smooth_track`
 
         """
-        self._assumptions, self._settings, self._timeout, self._keep = (
+        self._assumptions, self._settings, self._temperature_timeout, self._keeps_steps = (
             assumptions, settings, temperature_timeout, keep)
         self.temperature: float | None = None
-        self._temperature_time, self._anchored, self._this_run, self._other_age = (
-            -math.inf, False, False, False)
-        self.rate = self.corrected = 0.0
-        self.last, self.beginnings = Compensated(0.0, 0.0, 0.0, False, False), 0
-        self._time, self._elapsed, self._turned_before = -math.inf, 0.0, 0.0
-        self._refused, self.refused_temperatures = 0, 0
-        self._stretch: _Stretch | None = None
-        self._pending: deque[_Stretch] = deque(maxlen=8)
+        self._temperature_time, self._follows_temperature = -math.inf, False
+        self._calibrated_this_run = self._age_changed = False
+        self.rate = self.corrected_rate = 0.0
+        self.last_compensated, self.restart_count = (CompensatedSamples(
+            0.0, 0.0, 0.0, False, False), 0)
+        self._time, self._elapsed, self._heading_before_resets = -math.inf, 0.0, 0.0
+        self._refused_count, self.refused_temperature_count = 0, 0
+        self._stretch: _RestStretch | None = None
+        self._pending_stretches: deque[_RestStretch] = deque(maxlen=8)
         self._table_message = ''
         self.model, self.table = model, table
         self._tracker: HeadingTracker | None = None
-        self._history = model.history()
-        self._begin(now)
+        self._history = model.start_history()
+        self._restart(now)
 
     @property
     def tracker(self) -> HeadingTracker:
@@ -159,82 +160,86 @@ class HeadingEstimator:
         assert self._tracker is not None
         return self._tracker
 
-    def use(self, model: GyroModel, now: float) -> None:
+    def use_calibration(self, model: GyroModel, now: float) -> None:
         """Use a self-calibration that was made just now; the heading does not jump."""
-        self.model, self._this_run = model, True
-        self._begin(now, fresh=True)
+        self.model, self._calibrated_this_run = model, True
+        self._restart(now, is_fresh=True)
 
     def begin_run(self, now: float) -> None:
         """Expect another bias, as after the gyro was without power; the heading does not jump."""
         self.table.begin_run()
-        self._this_run = False
-        self._begin(now)
+        self._calibrated_this_run = False
+        self._restart(now)
 
-    def set(self, settings: Settings) -> None:  # noqa: A003
+    def configure(self, settings: Settings) -> None:  # noqa: A003
         """Use other settings of the tracker."""
         self._settings = settings
-        self.tracker.set(settings)
+        self.tracker.configure(settings)
 
     def reset(self) -> None:
         """Set the heading to zero."""
-        self._turned_before += self.tracker.heading
+        self._heading_before_resets += self.tracker.heading
         self.tracker.reset()
 
-    def rewind(self, heading: float, variance: float) -> None:
+    def set_heading(self, heading: float, variance: float) -> None:
         """Set the heading, rad, and its variance, rad²."""
-        self._turned_before += self.tracker.heading - heading
-        self.tracker.rewind(heading, variance)
+        self._heading_before_resets += self.tracker.heading - heading
+        self.tracker.set_heading(heading, variance)
 
     @property
-    def calibrated_now(self) -> bool:
+    def is_calibrated_this_run(self) -> bool:
         """Tell whether the calibration was made in this run."""
-        return self._this_run
+        return self._calibrated_this_run
 
-    def clock_was_set(self, step: float) -> None:
+    def shift_clock(self, step: float) -> None:
         """Correct all dates of this run for a clock that was set by a step, s."""
-        self._begun += step
-        self.table.clock_was_set(step)
+        self._start_time += step
+        self.table.shift_clock(step)
         calibration = self.model.self_calibration
-        old = not self._this_run and (calibration is not None or len(self.table.entries) > 0)
-        self._other_age = self._other_age or (old and abs(step) > _OLDER)
-        if self._this_run and calibration is not None and calibration.time:
+        old = (not self._calibrated_this_run
+               and (calibration is not None or len(self.table.entries) > 0))
+        self._age_changed = self._age_changed or (old and abs(step) > _AGE_TOLERANCE)
+        if self._calibrated_this_run and calibration is not None and calibration.time:
             then = datetime.fromisoformat(calibration.time) + timedelta(seconds=step)
             self.model = with_self_calibration(self.model, replace(
                 calibration, time=then.isoformat(timespec='seconds')))
 
     # The calibration at the start
 
-    def _begin(self, now: float, fresh: bool = False) -> None:
+    def _restart(self, now: float, is_fresh: bool = False) -> None:
         """Propagate the calibration to the present, unless it is new, and start the tracker."""
-        self._sentence = ''
-        self.used, age = ((assumed(self.model, self._assumptions), 0.0) if fresh
-                          else self._carried(now))
-        self.covariance = uncertain(self.used, self._assumptions)
+        self._calibration_message = ''
+        self.current_model, age = ((with_assumed_covariance(self.model, self._assumptions),
+                                    0.0) if is_fresh else self._propagated_model(now))
+        self.covariance = uncertain_covariance(self.current_model, self._assumptions)
         temperature = self.model.reference_temperature
-        per_rate = None if self.used.looks_around else np.subtract(*(
-            self._sensitive(rate, rate, temperature, None, 0.0)
+        sensitivity_slope = None if self.current_model.needs_history else np.subtract(*(
+            self._uncertain_sensitivity(rate, rate, temperature, None, 0.0)
             for rate in (DEGREE, 0.0))) / DEGREE
         if self._tracker is None:
-            self._tracker = HeadingTracker(self.used.noise, self.covariance, self._settings, age,
-                                           self._keep, per_rate)
+            self._tracker = HeadingTracker(self.current_model.noise, self.covariance,
+                                           self._settings, age, self._keeps_steps,
+                                           sensitivity_slope)
         else:
-            self._tracker.use(self.used.noise, self.covariance, age, per_rate)
-        self._begun = now
-        self._anchor(now)
-        self._unknown_since = self._time if fresh and not self._anchored else math.inf
-        self._shift, self._unseen_distance, self._other_age = 0.0, 0.0, False
+            self._tracker.use_calibration(self.current_model.noise, self.covariance, age,
+                                          sensitivity_slope)
+        self._start_time = now
+        self._start_correction(now)
+        self._unknown_since = (self._time
+                               if is_fresh and not self._follows_temperature else math.inf)
+        self._bias_shift, self._unobserved_distance, self._age_changed = 0.0, 0.0, False
         self._sensitivity: Array = np.zeros(len(self.covariance))
-        self._still: Array = self._sensitivity
-        self._still_at, self._looked = -math.inf, (-math.inf, 0.0)
-        self._held: Array | None = None
+        self._rest_sensitivity: Array = self._sensitivity
+        self._rest_sensitivity_time, self._held_time_and_rate = -math.inf, (-math.inf, 0.0)
+        self._held_sensitivity: Array | None = None
         self._stretch = None
-        self._pending.clear()
-        self.beginnings += 1
+        self._pending_stretches.clear()
+        self.restart_count += 1
 
-    def _anchor(self, now: float) -> None:
+    def _start_correction(self, now: float) -> None:
         """Start the temperature correction of the bias at the present temperature, if known."""
         here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
-        self._anchored = here is not None
+        self._follows_temperature = here is not None
         self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
                             if here is not None and coefficient else None)
 
@@ -246,16 +251,18 @@ class HeadingEstimator:
         different output of the model at the present temperature is not a change of the rate.
 
         """
-        here = compensate(self.used, 0.0, self.temperature, around).modelled
-        before = None if around is None else replace(around, temperature=self.last.temperature)
-        held = compensate(self.used, 0.0, self.last.temperature, before).modelled
-        self._shift = float(here) - float(held)
-        self._unseen_distance = _drifted_unseen(self._time - self._unknown_since)
-        self._anchor(now)
+        here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
+        before = (None if around is None else replace(
+            around, temperature=self.last_compensated.temperature))
+        held = (compensate(self.current_model, 0.0, self.last_compensated.temperature,
+                           before).model_rate)
+        self._bias_shift = float(here) - float(held)
+        self._unobserved_distance = _lost_temperature_distance(self._time - self._unknown_since)
+        self._start_correction(now)
 
-    def _carried(self, now: float) -> tuple[GyroModel, float | None]:
+    def _propagated_model(self, now: float) -> tuple[GyroModel, float | None]:
         """Return the model to compensate with, and the age of its self-calibration, s, or None."""
-        model = assumed(self.model, self._assumptions)
+        model = with_assumed_covariance(self.model, self._assumptions)
         calibration = model.self_calibration
         if calibration is None:
             here = self._known_temperature
@@ -267,27 +274,29 @@ class HeadingEstimator:
                 model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
-        worth = propagated(calibration, self.table, self.age(now), now, self._known_temperature,
-                           self._this_run)
-        self._sentence = worth.sentence
-        if (self._dated(now) or 0.0) < -_OLDER:
-            self._sentence = (f'the calibration is dated {calibration.time}, which is later than '
-                              'the clock of this computer: its age is not known and taken for a '
-                              'year; set the clock, or calibrate again')
+        worth = propagate_calibration(calibration, self.table, self.age(now), now,
+                                      self._known_temperature, self._calibrated_this_run)
+        self._calibration_message = worth.message
+        if (self._dated_age(now) or 0.0) < -_AGE_TOLERANCE:
+            self._calibration_message = (f'the calibration is dated {calibration.time}, which is '
+                                         'later than '
+                                         'the clock of this computer: its age is not known and '
+                                         'taken for a '
+                                         'year; set the clock, or calibrate again')
         return with_self_calibration(model, worth.calibration), 0.0
 
     @property
-    def sentence(self) -> str:
+    def calibration_message(self) -> str:
         """Return the message on age and temperature of the calibration; '' if negligible."""
-        return (self._sentence
+        return (self._calibration_message
                 if self.tracker.bias[1] > 0.5 * math.sqrt(self.covariance[-1, -1]) else '')
 
     def age(self, now: float) -> float:
         """Return the age of the calibration of the bias, s; a year if it is unknown."""
-        age = self._dated(now)
-        return _YEAR if age is None or age < -_OLDER else max(age, 0.0)
+        age = self._dated_age(now)
+        return _YEAR if age is None or age < -_AGE_TOLERANCE else max(age, 0.0)
 
-    def _dated(self, now: float) -> float | None:
+    def _dated_age(self, now: float) -> float | None:
         """Return the age, s, by date and clock; None without a date."""
         calibration = self.model.self_calibration
         written = calibration.time if calibration else str(self.model.origin.get('date', ''))
@@ -297,14 +306,15 @@ class HeadingEstimator:
             return None
         return now - (when if when.tzinfo else when.replace(tzinfo=timezone.utc)).timestamp()
 
-    def known_for(self, now: float) -> float:
+    def bias_age(self, now: float) -> float:
         """Return the age of the variance of the bias, s, which a propagated one includes."""
-        return self.age(now) if self.used.self_calibration is None else max(now - self._begun, 0.0)
+        return (self.age(now) if self.current_model.self_calibration is None else max(
+            now - self._start_time, 0.0))
 
     @property
-    def claimed(self) -> SelfCalibration:
+    def current_calibration(self) -> SelfCalibration:
         """Return the calibration at this temperature; an unknown scale has infinite variance."""
-        used = (self.used.self_calibration
+        used = (self.current_model.self_calibration
                 or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0))))
         assert used.covariance is not None  # an unknown one is assumed
         variance = self.bias_variance / used.scale ** 2
@@ -314,32 +324,32 @@ class HeadingEstimator:
     @property
     def bias_variance(self) -> float:
         """Return the variance of the corrected rate at rest by the calibration, (rad/s)²."""
-        return float(quadratic_form(self.covariance, self._still))
+        return float(quadratic_form(self.covariance, self._rest_sensitivity))
 
     # Samples
 
-    def take_temperature(self, time: float, temperature: float) -> None:
+    def add_temperature(self, time: float, temperature: float) -> None:
         """Take a temperature, degC, with its stamp, s; an implausible one is refused."""
         coldest, hottest = self.model.temperature_limits
-        if coldest <= temperature <= hottest and abs(time) <= _LATEST:
+        if coldest <= temperature <= hottest and abs(time) <= _MAX_TIME:
             self.temperature, self._temperature_time = temperature, time
         else:
-            self.refused_temperatures += 1
+            self.refused_temperature_count += 1
 
     @property
-    def refused(self) -> int:
+    def refused_count(self) -> int:
         """Return how many samples were not used."""
-        return self._refused + self.tracker.refused
+        return self._refused_count + self.tracker.refused_count
 
     @property
-    def temperature_is_lost(self) -> bool:
+    def is_temperature_lost(self) -> bool:
         """Tell whether the last temperature is too old at the last sample."""
-        return abs(self._time - self._temperature_time) > self._timeout
+        return abs(self._time - self._temperature_time) > self._temperature_timeout
 
     @property
     def _known_temperature(self) -> float | None:
         """Return the present temperature, degC; None before the first or if it is too old."""
-        return None if self.temperature_is_lost else self.temperature
+        return None if self.is_temperature_lost else self.temperature
 
     def add(self, time: float, output: float, now: float, force: float | None = None,
             wheels: bool | None = None, supply: float | None = None) -> str:
@@ -358,81 +368,86 @@ class HeadingEstimator:
         Returns
         -------
         '', or why the integration began anew with this sample; where the sample is refused, only
-        `refused` grows
+        `refused_count` grows
 
         """
-        if not self.plausible(time, output, force):
-            self._refused += 1
+        if not self.is_plausible(time, output, force):
+            self._refused_count += 1
             return ''
         last, self._time = self._time, time
-        known_again, goes_on = (not self._anchored and self._known_temperature is not None,
-                                self._this_run and last > -math.inf)
-        if self._other_age or known_again and not goes_on:
-            self._begin(now)
-        around = (self._look_around(time - last, force, supply)
-                  if self.used.looks_around else None)
+        known_again, goes_on = (not self._follows_temperature
+                                and self._known_temperature is not None, self._calibrated_this_run
+                                and last > -math.inf)
+        if self._age_changed or known_again and not goes_on:
+            self._restart(now)
+        around = (self._follow_channels(time - last, force, supply)
+                  if self.current_model.needs_history else None)
         if known_again and goes_on:
             self._resume_temperature(now, around)
-        self.last = result = compensate(self.used, output, self.temperature, around)
+        self.last_compensated = result = compensate(self.current_model, output, self.temperature,
+                                                    around)
         change, distance = self._bias_change(time)
-        calibration, tracker = self.used.self_calibration, self.tracker
+        calibration, tracker = self.current_model.self_calibration, self.tracker
         rate = float(result.rate)
         if change:
             rate -= change * (1.0 if calibration is None else calibration.scale)
-        if abs(time - self._still_at) > _STILL + CLOSE:
-            self._still, self._still_at = self._sensitive(
-                output, 0.0, self.last.temperature, around, distance), time
-        self._look_at(time, output, float(result.rate), around, distance)
-        message = tracker.add(time, rate, self._sensitivity, wheels, self._still)
-        self.corrected, self.rate = rate, tracker.rate
-        if message or not tracker.resting:
+        if abs(time - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
+            self._rest_sensitivity, self._rest_sensitivity_time = self._uncertain_sensitivity(
+                output, 0.0, self.last_compensated.temperature, around, distance), time
+        self._update_sensitivity(time, output, float(result.rate), around, distance)
+        message = tracker.add(time, rate, self._sensitivity, wheels, self._rest_sensitivity)
+        self.corrected_rate, self.rate = rate, tracker.rate
+        if message or not tracker.is_resting:
             self._end_rest()
-        elif self.temperature is None or self.temperature_is_lost:
+        elif self.temperature is None or self.is_temperature_lost:
             self._stretch = None
         else:
-            self._gather(time, time, 1, float(result.modelled), self.temperature, [self._still])
-        self._learn_at_rest(now)
+            self._extend_stretch(time, time, 1, float(result.model_rate), self.temperature,
+                                 [self._rest_sensitivity])
+        self._update_table_at_rest(now)
         return message
 
-    def plausible(self, time: float, output: float, force: float | None = None) -> bool:
+    def is_plausible(self, time: float, output: float, force: float | None = None) -> bool:
         """Tell whether a sample is plausible for the gyro; `add` refuses others, and any nan."""
-        limit = self.used.rate_limit
-        return (-limit <= output <= limit and -_LATEST <= time <= _LATEST
-                and (force is None or -_STRONGEST <= force <= _STRONGEST))
+        limit = self.current_model.rate_limit
+        return (-limit <= output <= limit and -_MAX_TIME <= time <= _MAX_TIME
+                and (force is None or -_MAX_SPECIFIC_FORCE <= force <= _MAX_SPECIFIC_FORCE))
 
-    def _look_at(self, time: float, output: float, rate: float, around: Channels | None,
-                 distance: float) -> None:
+    def _update_sensitivity(self, time: float, output: float, rate: float, around: Channels | None,
+                            distance: float) -> None:
         """Update the sensitivity, which is held at rest and for a short time at similar rates."""
-        at, looked = self._looked
-        if abs(time - at) > _HELD + CLOSE or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
-            self._held, self._looked = None, (time, rate)
-            self._held_at = output, rate, self.last.temperature, around, distance
-        if self.tracker.resting:
-            self._sensitivity = self._still
+        at, looked = self._held_time_and_rate
+        if (abs(time - at) > _SENSITIVITY_INTERVAL + TIME_TOLERANCE
+                or abs(rate - looked) > _RATE_TOLERANCE + _RELATIVE_RATE_TOLERANCE * abs(rate)):
+            self._held_sensitivity, self._held_time_and_rate = None, (time, rate)
+            self._held_arguments = (output, rate, self.last_compensated.temperature, around,
+                                    distance)
+        if self.tracker.is_resting:
+            self._sensitivity = self._rest_sensitivity
             return
-        if self._held is None:
-            self._held = self._sensitive(*self._held_at)
-        self._sensitivity = self._held
+        if self._held_sensitivity is None:
+            self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
+        self._sensitivity = self._held_sensitivity
 
-    def _sensitive(self, output: float, rate: float, temperature: Number, around: Channels | None,
-                   distance: float) -> Array:
+    def _uncertain_sensitivity(self, output: float, rate: float, temperature: Number,
+                               around: Channels | None, distance: float) -> Array:
         """Return the sensitivity of the rate to each uncertain value, shape (m,)."""
-        return sensitive(self.used, rate_sensitivity(
-            self.used, output, rate, temperature, around), distance)
+        return uncertain_sensitivity(self.current_model, rate_sensitivity(
+            self.current_model, output, rate, temperature, around), distance)
 
     def _bias_change(self, time: float) -> tuple[float, float]:
         """Return the change of the bias with temperature, rad/s, and the distance, K."""
         if self.temperature is None:
             return 0.0, 0.0
         if self._correction is None:
-            return self._shift, _drifted_unseen(time - self._unknown_since)
-        change, distance = self._correction.at(self.temperature)
-        late = abs(time - self._temperature_time) - self._timeout
-        return (self._shift + change,
-                self._unseen_distance + distance + math.copysign(_drifted_unseen(late), distance))
+            return self._bias_shift, _lost_temperature_distance(time - self._unknown_since)
+        change, distance = self._correction.change_at(self.temperature)
+        late = abs(time - self._temperature_time) - self._temperature_timeout
+        return (self._bias_shift + change, self._unobserved_distance + distance
+                + math.copysign(_lost_temperature_distance(late), distance))
 
-    def _look_around(self, interval: float, force: float | None,
-                     supply: float | None) -> Channels:
+    def _follow_channels(self, interval: float, force: float | None,
+                         supply: float | None) -> Channels:
         """
         Return the channels of effects other than rate, output and temperature.
 
@@ -443,22 +458,22 @@ class HeadingEstimator:
         interval = max(interval, 0.0) if interval < math.inf else 0.0
         self._elapsed += interval
         ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
-        return self._history.follow(
+        return self._history.update(
             self._elapsed, self.temperature, force, supply,
-            heading=self._turned_before + self.tracker.heading + ahead)
+            heading=self._heading_before_resets + self.tracker.heading + ahead)
 
     # A whole log
 
-    def follow(self, time: Array, output: Array, begun: float, temperature: Array | None = None,
-               wheels: Sequence[bool | None] | None = None, force: Array | None = None,
-               supply: Array | None = None) -> Array:
+    def follow(self, time: Array, output: Array, start_time: float,
+               temperature: Array | None = None, wheels: Sequence[bool | None] | None = None,
+               force: Array | None = None, supply: Array | None = None) -> Array:
         """
         Take the samples of a log, with the same result as one by one.
 
         Parameters
         ----------
         time, output : s and rad/s, shape (n,)
-        begun : date of time 0, s since 1970
+        start_time : date of time 0, s since 1970
         temperature : degC; nan where none came, and None for none at all
         wheels, force, supply : as in `add`, n of them, or None
 
@@ -471,74 +486,78 @@ class HeadingEstimator:
         """
         found, place = np.empty((len(time), 8)), 0
         while place < len(time):
-            end = self._even(time, output, temperature, place)
+            end = self._end_of_even_part(time, output, temperature, place)
             if end > place:
                 rows = slice(place, end)
-                self._follow_even(time[rows], output[rows],
-                                  None if temperature is None else temperature[rows],
-                                  None if wheels is None else wheels[rows], found[rows])
+                self._follow_even_samples(time[rows], output[rows],
+                                          None if temperature is None else temperature[rows],
+                                          None if wheels is None else wheels[rows], found[rows])
             else:
                 end = place + 1
                 if temperature is not None and temperature[place] == temperature[place]:
-                    self.take_temperature(float(time[place]), float(temperature[place]))
-                self.add(float(time[place]), float(output[place]), begun + float(time[place]),
+                    self.add_temperature(float(time[place]), float(temperature[place]))
+                self.add(float(time[place]), float(output[place]), start_time + float(time[place]),
                          None if force is None else float(force[place]),
                          None if wheels is None else wheels[place],
                          None if supply is None else float(supply[place]))
                 tracker = self.tracker
                 found[place] = (tracker.heading, tracker.variance, self.rate,
-                                tracker.rate_variance, tracker.resting, self.corrected,
-                                self.last.temperature_clipped, self.last.beyond_range)
-            place, beginnings = end, self.beginnings
-            self._learn_at_rest(begun + float(time[place - 1]))
-            if self.beginnings > beginnings:
+                                tracker.rate_variance, tracker.is_resting, self.corrected_rate,
+                                self.last_compensated.temperature_clipped,
+                                self.last_compensated.beyond_range)
+            place, beginnings = end, self.restart_count
+            self._update_table_at_rest(start_time + float(time[place - 1]))
+            if self.restart_count > beginnings:
                 found[place - 1, [1, 3]] = self.tracker.variance, self.tracker.rate_variance
         return found
 
-    def _even(self, time: Array, output: Array, temperature: Array | None, place: int) -> int:
+    def _end_of_even_part(self, time: Array, output: Array, temperature: Array | None,
+                          place: int) -> int:
         """Return the end of the samples with the same model, table and temperature correction."""
-        if (self.used.looks_around or self._time == -math.inf or self._other_age
-                or self._anchored == (temperature is None)
+        if (self.current_model.needs_history or self._time == -math.inf or self._age_changed
+                or self._follows_temperature == (temperature is None)
                 or temperature is None and self.temperature is not None):
             return place
         # a complete stretch of rest may restart the tracker
-        begin = self._stretch.begin if self._stretch else float(time[place])
-        end = int(np.searchsorted(time[place:], begin + STRETCH - CLOSE)) + place
-        end = min(end + (self._stretch is not None), len(time), place + _AT_ONCE)
-        rows, limit = slice(place, end), self.used.rate_limit
-        known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= _LATEST)
+        begin = self._stretch.start_time if self._stretch else float(time[place])
+        end = int(np.searchsorted(time[place:], begin + STRETCH_DURATION - TIME_TOLERANCE)) + place
+        end = min(end + (self._stretch is not None), len(time), place + _CHUNK_SAMPLES)
+        rows, limit = slice(place, end), self.current_model.rate_limit
+        known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= _MAX_TIME)
         if temperature is not None:
             coldest, hottest = self.model.temperature_limits
             known &= (coldest <= temperature[rows]) & (temperature[rows] <= hottest)
         return end if known.all() else place + int(np.argmin(known))
 
-    def _follow_even(self, time: Array, output: Array, temperature: Array | None,
-                     wheels: Sequence[bool | None] | None, found: Array) -> None:
+    def _follow_even_samples(self, time: Array, output: Array, temperature: Array | None,
+                             wheels: Sequence[bool | None] | None, found: Array) -> None:
         """Take plausible samples, at most up to the end of a stretch of rest."""
-        used, tracker, last = self.used, self.tracker, self._time
+        used, tracker, last = self.current_model, self.tracker, self._time
         self._time = float(time[-1])
         result = compensate(used, output, temperature)
         change, distance = np.zeros(len(time)), np.zeros(len(time))
         if temperature is not None:
             self.temperature, self._temperature_time = float(temperature[-1]), self._time
-            change += self._shift
-            distance += self._unseen_distance
+            change += self._bias_shift
+            distance += self._unobserved_distance
             if self._correction is not None:
-                changed, far = self._correction.along(temperature)
+                changed, far = self._correction.changes_at(temperature)
                 change, distance = change + changed, distance + far
             else:
                 change[:], distance[:] = self._bias_change(self._time)
         calibration = used.self_calibration
         rate = np.asarray(result.rate) - change * (
             1.0 if calibration is None else calibration.scale)
-        still = self._stills(time, output, result, distance)
-        found[:, :5] = tracker.follow(
-            time, rate, self._looks(time, output, result, distance), wheels, still, still)
+        still = self._rest_sensitivities(time, output, result, distance)
+        found[:, :5] = tracker.follow(time, rate,
+                                      self._motion_sensitivities(time, output, result, distance),
+                                      wheels, still, still)
         found[:, 5], found[:, 6], found[:, 7] = (
             rate, result.temperature_clipped, result.beyond_range)
-        self.last = Compensated(*(float(np.asarray(values)[-1]) if np.ndim(values) else values
-                                  for values in vars(result).values()))
-        self.corrected, self.rate = float(rate[-1]), float(found[-1, 2])
+        self.last_compensated = CompensatedSamples(
+            *(float(np.asarray(values)[-1]) if np.ndim(values) else values
+              for values in vars(result).values()))
+        self.corrected_rate, self.rate = float(rate[-1]), float(found[-1, 2])
         self._sensitivity = tracker.sensitivity
         interval = np.diff(time, prepend=last)
         moving = np.flatnonzero((found[:, 4] < 0.5) | (interval < 0.0)
@@ -547,77 +566,81 @@ class HeadingEstimator:
         if first:
             self._end_rest()
         if first < len(time) and temperature is not None:
-            self._gather(float(time[first]), self._time, len(time) - first,
-                         float(np.sum(result.modelled[first:])),
-                         float(temperature[first:].sum()), (still[first], still[-1]))
+            self._extend_stretch(float(time[first]), self._time, len(time) - first,
+                                 float(np.sum(result.model_rate[first:])),
+                                 float(temperature[first:].sum()), (still[first], still[-1]))
 
-    def _stills(self, time: Array, output: Array, result: Compensated, distance: Array) -> Array:
+    def _rest_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
+                            distance: Array) -> Array:
         """Return the sensitivities at rest, computed every `_STILL` s, shape (n, m)."""
         places = list[int]()
         for place, at in enumerate(time.tolist()):
-            if abs(at - self._still_at) > _STILL + CLOSE:
+            if abs(at - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
                 places.append(place)
-                self._still_at = at
-        rows = self._rows(places, output, np.zeros(len(output)), result, distance)
+                self._rest_sensitivity_time = at
+        rows = self._sensitivity_rows(places, output, np.zeros(len(output)), result, distance)
         counts = np.diff([0, *places, len(time)])
-        whole = np.repeat(np.vstack([self._still, rows]), counts, axis=0)
-        self._still = whole[-1]
+        whole = np.repeat(np.vstack([self._rest_sensitivity, rows]), counts, axis=0)
+        self._rest_sensitivity = whole[-1]
         return whole
 
-    def _looks(self, time: Array, output: Array, result: Compensated, distance: Array) -> Array:
+    def _motion_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
+                              distance: Array) -> Array:
         """Return the sensitivities in motion, which are held for a short time, shape (n, m)."""
-        places, (at, looked) = list[int](), self._looked
+        places, (at, looked) = list[int](), self._held_time_and_rate
         rates = np.asarray(result.rate)
         for place, (now, rate) in enumerate(zip(time.tolist(), rates.tolist())):
-            if abs(now - at) > _HELD + CLOSE or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
+            if (abs(now - at) > _SENSITIVITY_INTERVAL + TIME_TOLERANCE or abs(rate - looked)
+                    > _RATE_TOLERANCE + _RELATIVE_RATE_TOLERANCE * abs(rate)):
                 places.append(place)
                 at, looked = now, rate
-        if self._held is None and (not places or places[0]) and self._looked[0] > -math.inf:
-            self._held = self._sensitive(*self._held_at)
-        held = self._still if self._held is None else self._held
-        rows = self._rows(places, output, rates, result, distance)
-        self._looked = at, looked
+        if (self._held_sensitivity is None and (not places or places[0])
+                and self._held_time_and_rate[0] > -math.inf):
+            self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
+        held = self._rest_sensitivity if self._held_sensitivity is None else self._held_sensitivity
+        rows = self._sensitivity_rows(places, output, rates, result, distance)
+        self._held_time_and_rate = at, looked
         whole = np.repeat(np.vstack([held, rows]), np.diff([0, *places, len(time)]), axis=0)
-        self._held = whole[-1]
+        self._held_sensitivity = whole[-1]
         return whole
 
-    def _rows(self, places: list[int], output: Array, rate: Array, result: Compensated,
-              distance: Array) -> Array:
+    def _sensitivity_rows(self, places: list[int], output: Array, rate: Array,
+                          result: CompensatedSamples, distance: Array) -> Array:
         """Return the sensitivities of some samples, shape (k, m)."""
         if not places:
             return np.empty((0, len(self.covariance)))
         temperature = result.temperature
-        return sensitive(self.used, rate_sensitivity(
-            self.used, output[places], rate[places],
+        return uncertain_sensitivity(self.current_model, rate_sensitivity(
+            self.current_model, output[places], rate[places],
             temperature[places] if isinstance(temperature, np.ndarray) else temperature),
             distance[places]).T
 
     # The bias at rest for the next run
 
-    def _gather(self, begin: float, end: float, count: int, modelled: float, temperature: float,
-                seen: Sequence[Array]) -> None:
+    def _extend_stretch(self, begin: float, end: float, count: int, modelled: float,
+                        temperature: float, seen: Sequence[Array]) -> None:
         """
         Add samples at rest to a stretch.
 
         Parameters
         ----------
         begin, end : stamps of the first and the last, s
-        count, modelled, temperature : their number, and sums as in `_Stretch`
+        count, modelled, temperature : their number, and sums as in `_RestStretch`
         seen : sensitivities at rest, of which the first and the last count
 
         """
         if self._stretch is None:
-            self._stretch = _Stretch(begin, seen[0])
+            self._stretch = _RestStretch(begin, seen[0])
         stretch = self._stretch
         stretch.count += count
-        stretch.modelled += modelled
-        stretch.temperature += temperature
-        if end - stretch.begin >= STRETCH - CLOSE:
-            stretch.seen = 0.5 * (stretch.seen + seen[-1])
-            self._pending.append(stretch)
+        stretch.rate_sum += modelled
+        stretch.temperature_sum += temperature
+        if end - stretch.start_time >= STRETCH_DURATION - TIME_TOLERANCE:
+            stretch.sensitivity = 0.5 * (stretch.sensitivity + seen[-1])
+            self._pending_stretches.append(stretch)
             self._stretch = None
 
-    def learn(self, now: float, ending: bool = False) -> str:
+    def update_table(self, now: float, ending: bool = False) -> str:
         """
         Add the bias of complete stretches of rest to the table; to be called regularly.
 
@@ -630,34 +653,34 @@ class HeadingEstimator:
 
         """
         message, self._table_message = self._table_message, ''
-        while len(self._pending) > (self.tracker.resting and not ending):
-            message = self._add_to_table(self._pending.popleft(), now) or message
+        while len(self._pending_stretches) > (self.tracker.is_resting and not ending):
+            message = self._add_to_table(self._pending_stretches.popleft(), now) or message
         return message
 
     def _end_rest(self) -> None:
         self._stretch = None
-        for each in self._pending:
-            each.over = True
+        for each in self._pending_stretches:
+            each.has_ended = True
 
-    def _learn_at_rest(self, now: float) -> None:
+    def _update_table_at_rest(self, now: float) -> None:
         """Add a stretch to the table as soon as the next one is complete."""
-        while len(self._pending) > 1 and self.tracker.resting:
-            message = self._add_to_table(self._pending.popleft(), now)
+        while len(self._pending_stretches) > 1 and self.tracker.is_resting:
+            message = self._add_to_table(self._pending_stretches.popleft(), now)
             self._table_message = message or self._table_message
 
-    def _add_to_table(self, stretch: _Stretch, now: float) -> str:
+    def _add_to_table(self, stretch: _RestStretch, now: float) -> str:
         bias, temperature = stretch.mean()
-        variance = self.used.noise.angle_random_walk ** 2 / STRETCH
-        expected, deviation = self._believed(temperature, stretch.seen)
-        if abs(bias - expected) > _FAR * math.sqrt(deviation ** 2 + variance):
+        variance = self.current_model.noise.angle_random_walk ** 2 / STRETCH_DURATION
+        expected, deviation = self._expected_bias(temperature, stretch.sensitivity)
+        if abs(bias - expected) > _OUTLIER_SIGMAS * math.sqrt(deviation ** 2 + variance):
             return ''
         message = self.table.add(temperature, bias, variance, now)
-        if (self._correction is not None and self.tracker.resting and not stretch.over
-                and abs(temperature - self._correction.begin) > _AWAY):
-            self._begin(now)
+        if (self._correction is not None and self.tracker.is_resting and not stretch.has_ended
+                and abs(temperature - self._correction.start_temperature) > _RESTART_DISTANCE):
+            self._restart(now)
         return message
 
-    def _believed(self, temperature: float, seen: Array) -> tuple[float, float]:
+    def _expected_bias(self, temperature: float, seen: Array) -> tuple[float, float]:
         """
         Return bias at a temperature and its standard deviation by the tracker at present, rad/s.
 
@@ -665,19 +688,19 @@ class HeadingEstimator:
         its rest may be over, and the temperature may have changed.
 
         """
-        calibration = self.used.self_calibration or SelfCalibration()
-        change = self._shift
+        calibration = self.current_model.self_calibration or SelfCalibration()
+        change = self._bias_shift
         if self._correction is not None:
-            change += self._correction.at(temperature)[0]
-        off, deviation = self.tracker.bias_by(seen)
+            change += self._correction.change_at(temperature)[0]
+        off, deviation = self.tracker.bias_for(seen)
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 
-    def missing(self, brought: Collection[str]) -> list[str]:
+    def missing_channels(self, available: Collection[str]) -> list[str]:
         """Return the channels that the model needs and that no message contains."""
         return [channel for channel in ('supply', 'specific_force')
-                if self.used.looks_at(channel) and channel not in brought]
+                if self.current_model.uses_channel(channel) and channel not in available]
 
 
-def _drifted_unseen(late: float) -> float:
+def _lost_temperature_distance(delay: float) -> float:
     """Return the assumed drift of the temperature, K, some time, s, after its last message."""
-    return min(max(late, 0.0) * _LOST_RATE, _LOST)
+    return min(max(delay, 0.0) * _LOST_TEMPERATURE_RATE, _MAX_LOST_DISTANCE)

@@ -23,8 +23,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from gyro_calibration.heading.gaps import FASTEST, Gaps
-from gyro_calibration.logs.log import Array, CACHED, DEGREE
+from gyro_calibration.heading.gaps import GapModel, MAX_RATE
+from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -68,15 +68,15 @@ class ThresholdFilter:
         """Forget the window, as after a gap."""
         self._window.clear()
 
-    def filter(self, time: float, rate: float) -> float:  # noqa: A003
+    def apply(self, time: float, rate: float) -> float:  # noqa: A003
         """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
         if not self.settings.rate:
             return rate
-        return 0.0 if self._stands(time, rate) else rate
+        return 0.0 if self._is_standing(time, rate) else rate
 
-    def _stands(self, time: float, rate: float) -> bool:
+    def _is_standing(self, time: float, rate: float) -> bool:
         window = self._window
-        window.append((time, min(max(rate, -FASTEST), FASTEST)))
+        window.append((time, min(max(rate, -MAX_RATE), MAX_RATE)))
         while window[0][0] <= time - self.settings.window and len(window) > 1:
             window.popleft()
         # not a running sum, which would accumulate rounding errors
@@ -95,8 +95,8 @@ def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
     heading = np.empty(len(time))
     heading[:1] = begin
-    for first in range(1, len(time), CACHED):
-        end = min(first + CACHED, len(time))
+    for first in range(1, len(time), CACHE_BLOCK_SAMPLES):
+        end = min(first + CACHE_BLOCK_SAMPLES, len(time))
         turned = np.add(rate[first:end], rate[first - 1:end - 1], out=heading[first:end])
         turned *= time[first:end] - time[first - 1:end - 1]
         turned *= 0.5
@@ -112,7 +112,7 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     end = np.arange(1, len(rate) + 1)
     begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
     # each window is summed by itself: one large value would ruin a running sum from there on
-    bounded, count, windows = (np.clip(rate, -FASTEST, FASTEST), end - begin,
+    bounded, count, windows = (np.clip(rate, -MAX_RATE, MAX_RATE), end - begin,
                                np.stack([begin, end], axis=1).ravel())
     sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2]
                      for values in (bounded, bounded * bounded))
@@ -139,10 +139,10 @@ class BlockIntegrator:
     def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
         """Begin at heading zero; `covariance` is that of the calibration, shape (m, m)."""
         self._settings, self._noise, self._covariance = settings, noise, covariance
-        self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
-        self._last: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
-        self._grown: Array = np.zeros(2 + len(covariance))
-        self._gaps, self._unseen, self._last_rate = Gaps(noise), 0.0, 0.0
+        self._window_samples: tuple[Array, Array] = np.zeros(0), np.zeros(0)
+        self._last_sample: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
+        self._integrals: Array = np.zeros(2 + len(covariance))
+        self._gaps, self._gap_variance, self._last_rate = GapModel(noise), 0.0, 0.0
         self.intervals = self._gaps.intervals
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
@@ -161,40 +161,43 @@ class BlockIntegrator:
         """
         if not len(time):
             return rate, rate, rate
-        filtered = self._filtered(time, rate)
+        filtered = self._filter_block(time, rate)
         kept = (filtered == rate).astype(float)
-        unseen = self._unseen_at(time, rate, kept)
-        heading, moving_time, *grown = self._integrated(
+        unseen = self._gap_variances(time, rate, kept)
+        heading, moving_time, *grown = self._integrate_rows(
             time, np.vstack([filtered, kept, kept * sensitivity]))
         calibration = quadratic_form(self._covariance,
                                      np.reshape(grown, (len(self._covariance), len(time))))
         return (filtered, heading,
                 np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen))
 
-    def _unseen_at(self, time: Array, rate: Array, kept: Array) -> Array:
+    def _gap_variances(self, time: Array, rate: Array, is_kept: Array) -> Array:
         """Return the variance by the gaps so far, rad², shape (n,)."""
-        unseen, (last_time, last_rows) = np.zeros(len(time)), self._last
+        unseen, (last_time, last_rows) = np.zeros(len(time)), self._last_sample
         before = ((float(last_time[0]), self._last_rate, bool(last_rows[1, 0]))
                   if len(last_time) else None)
-        for index, sample in enumerate(zip(time.tolist(), rate.tolist(), (kept > 0.0).tolist())):
+        for index, sample in enumerate(zip(time.tolist(), rate.tolist(), (is_kept
+                                                                          > 0.0).tolist())):
             gap = self._gaps.add(sample[0] - before[0], sample[1], before[1]) if before else None
             if gap is not None and before is not None and (sample[2] or before[2]):
-                self._unseen += gap.variance
-            unseen[index], before = self._unseen, sample
+                self._gap_variance += gap.variance
+            unseen[index], before = self._gap_variance, sample
         self._last_rate = float(rate[-1])
         return unseen
 
-    def _filtered(self, time: Array, rate: Array) -> Array:
-        carried = len(self._window[0])
-        time, rate = (np.concatenate([self._window[0], time]),
-                      np.concatenate([self._window[1], rate]))
+    def _filter_block(self, time: Array, rate: Array) -> Array:
+        carried = len(self._window_samples[0])
+        time, rate = (np.concatenate([self._window_samples[0], time]),
+                      np.concatenate([self._window_samples[1], rate]))
         begin = np.searchsorted(time, time[-1] - self._settings.window, side='right')
-        self._window = time[begin:], rate[begin:]
+        self._window_samples = time[begin:], rate[begin:]
         return filter_rates(self._settings, time, rate)[carried:]
 
-    def _integrated(self, time: Array, grows: Array) -> Array:
-        carried = len(self._last[0])
-        time, grows = np.concatenate([self._last[0], time]), np.hstack([self._last[1], grows])
-        grown = np.array([integrate(time, row, begin) for row, begin in zip(grows, self._grown)])
-        self._last, self._grown = (time[-1:], grows[:, -1:]), grown[:, -1]
+    def _integrate_rows(self, time: Array, rows: Array) -> Array:
+        carried = len(self._last_sample[0])
+        time, rows = (np.concatenate([self._last_sample[0],
+                                      time]), np.hstack([self._last_sample[1], rows]))
+        grown = np.array(
+            [integrate(time, row, begin) for row, begin in zip(rows, self._integrals)])
+        self._last_sample, self._integrals = (time[-1:], rows[:, -1:]), grown[:, -1]
         return grown[:, carried:]

@@ -29,12 +29,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 from gyro_calibration.logs.log import Array
-from gyro_calibration.model.noise import CALIBRATED, known_mean, Noise
+from gyro_calibration.model.noise import averaged_process_moments, BIAS_AVERAGING_TIME, Noise
 import numpy as np
 from scipy.linalg import pinvh
 
 #: Indices of heading, random walk and first flicker component in the state.
-HEADING, WALK, _FLICKER = 0, 1, 2
+HEADING_INDEX, WALK_INDEX, _FLICKER_INDEX = 0, 1, 2
 
 
 @dataclass(slots=True)
@@ -45,58 +45,62 @@ class RateIntegral:
     Attributes
     ----------
     duration : s
-    turned : integral of the compensated rate, rad
+    angle : integral of the compensated rate, rad
     sensitivity : integral of the sensitivity of the rate to the calibration, shape (m,)
-    lost : variance of rotation that was not measured, rad²
-    noise : additional variance of the noise by lost samples, rad²
-    wander : variance of the rotation during a detected rest that may be a straight drive, rad²
-    unseen : there were no rates: the heading is constant, and errors of rates do not affect it;
-        not to be added to others
+    lost_variance : variance of rotation that was not measured, rad²
+    extra_noise_variance : additional variance of the noise by lost samples, rad²
+    wander_variance : variance of the rotation during a detected rest that may be a straight drive,
+        rad²
+    is_unobserved : there were no rates: the heading is constant, and errors of rates do not affect
+        it; not to be added to others
 
     """
 
     duration: float
-    turned: float
+    angle: float
     sensitivity: Array
-    lost: float = 0.0
-    noise: float = 0.0
-    wander: float = 0.0
-    unseen: bool = False
+    lost_variance: float = 0.0
+    extra_noise_variance: float = 0.0
+    wander_variance: float = 0.0
+    is_unobserved: bool = False
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
         """Return the integral over both, one after the other."""
-        return RateIntegral(self.duration + other.duration, self.turned + other.turned,
+        return RateIntegral(self.duration + other.duration, self.angle + other.angle,
                             self.sensitivity + other.sensitivity,
-                            self.lost + other.lost, self.noise + other.noise)
+                            self.lost_variance + other.lost_variance,
+                            self.extra_noise_variance + other.extra_noise_variance)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
         """Return the rest of this integral after another with which it begins."""
-        return RateIntegral(self.duration - other.duration, self.turned - other.turned,
+        return RateIntegral(self.duration - other.duration, self.angle - other.angle,
                             self.sensitivity - other.sensitivity,
-                            self.lost - other.lost, self.noise - other.noise)
+                            self.lost_variance - other.lost_variance,
+                            self.extra_noise_variance - other.extra_noise_variance)
 
 
 @dataclass(frozen=True)
-class Step:
+class Transition:
     """
     Transition of the state over some time, without the rotation itself.
 
     Attributes
     ----------
-    seen : contribution of each component to the integral of the compensated rate, shape (n,)
-    kept : decay factor of each component, shape (n,)
-    grown : covariance of the process noise, shape (n, n); the first row and column are those of
-        the integral of the rate, negated
+    observation : contribution of each component to the integral of the compensated rate, shape
+        (n,)
+    retention : decay factor of each component, shape (n,)
+    process_noise : covariance of the process noise, shape (n, n); the first row and column are
+        those of the integral of the rate, negated
 
     """
 
-    seen: Array
-    kept: Array
-    grown: Array
+    observation: Array
+    retention: Array
+    process_noise: Array
 
 
 @dataclass(frozen=True)
-class Drift:
+class HeadingState:
     """
     Mean and covariance of the state, shape (n,) and (n, n).
 
@@ -109,50 +113,55 @@ class Drift:
     covariance: Array
 
     @property
-    def calibrated(self) -> int:
+    def first_value_index(self) -> int:
         """Return the index of the first value of the calibration in the state."""
-        return _FLICKER + len(self.noise.flicker()[0])
+        return _FLICKER_INDEX + len(self.noise.flicker_processes()[0])
 
-    def step(self, turn: RateIntegral) -> Step:
+    def transition(self, rate_integral: RateIntegral) -> Transition:
         """Return the transition of the state over an integral of rates."""
-        seen, variance = self._seen(turn)
-        _, kept, grown = self._wandered(turn)
+        seen, variance = self._observation_row(rate_integral)
+        _, kept, grown = self._padded_transition(rate_integral)
         grown = grown.copy()
-        grown[HEADING, HEADING] = variance
-        return Step(seen, kept, grown)
+        grown[HEADING_INDEX, HEADING_INDEX] = variance
+        return Transition(seen, kept, grown)
 
-    def _wandered(self, turn: RateIntegral) -> tuple[Array, Array, Array]:
-        return _step(self.noise, round(turn.duration, 6), turn.unseen, len(turn.sensitivity))
+    def _padded_transition(self, rate_integral: RateIntegral) -> tuple[Array, Array, Array]:
+        return _padded_transition(self.noise, round(rate_integral.duration, 6),
+                                  rate_integral.is_unobserved, len(rate_integral.sensitivity))
 
-    def _seen(self, turn: RateIntegral) -> tuple[Array, float]:
+    def _observation_row(self, rate_integral: RateIntegral) -> tuple[Array, float]:
         """Return `Step.seen`, and the variance of the noise of the integral, rad²."""
-        seen, _, grown = self._wandered(turn)
+        seen, _, grown = self._padded_transition(rate_integral)
         seen = seen.copy()
-        seen[len(seen) - len(turn.sensitivity):] = -turn.sensitivity
-        white = 0.0 if turn.unseen else self.noise.angle_random_walk ** 2 * turn.duration
-        return seen, float(grown[HEADING, HEADING]) + white + turn.lost + turn.noise
+        seen[len(seen) - len(rate_integral.sensitivity):] = -rate_integral.sensitivity
+        white = (0.0 if rate_integral.is_unobserved else self.noise.angle_random_walk ** 2
+                 * rate_integral.duration)
+        return (seen, float(grown[HEADING_INDEX, HEADING_INDEX]) + white
+                + rate_integral.lost_variance + rate_integral.extra_noise_variance)
 
-    def moved(self, turn: RateIntegral) -> Drift:
+    def propagate(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time in motion."""
-        step = self.step(turn)
-        transition = np.diag(step.kept)
-        transition[HEADING] -= step.seen
-        mean = step.kept * self.mean
-        mean[HEADING] += turn.turned - step.seen @ self.mean
-        return Drift(self.noise, mean, transition @ self.covariance @ transition.T + step.grown)
+        step = self.transition(rate_integral)
+        matrix = np.diag(step.retention)
+        matrix[HEADING_INDEX] -= step.observation
+        mean = step.retention * self.mean
+        mean[HEADING_INDEX] += rate_integral.angle - step.observation @ self.mean
+        return HeadingState(self.noise, mean,
+                            matrix @ self.covariance @ matrix.T + step.process_noise)
 
-    def heading_variance(self, turn: RateIntegral) -> float:
+    def heading_variance(self, rate_integral: RateIntegral) -> float:
         """Return the variance of the heading after a time in motion, rad²."""
-        row, variance = self._seen(turn)
-        row[HEADING] -= 1.0
+        row, variance = self._observation_row(rate_integral)
+        row[HEADING_INDEX] -= 1.0
         return float(row @ self.covariance @ row) + variance
 
-    def rested(self, turn: RateIntegral) -> Drift:
+    def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time at rest, with its measurement."""
-        step = self.step(turn)
-        return self.measured(turn, step).carried(turn, step)
+        step = self.transition(rate_integral)
+        return self.update_at_rest(rate_integral, step).propagate_at_rest(rate_integral, step)
 
-    def measured(self, turn: RateIntegral, step: Step | None = None) -> Drift:
+    def update_at_rest(self, rate_integral: RateIntegral,
+                       step: Transition | None = None) -> HeadingState:
         """
         Return the state at the begin of a time at rest, updated by its measurement.
 
@@ -160,76 +169,81 @@ class Drift:
         heading, which is then the heading at the end.
 
         """
-        step = step or self.step(turn)
-        along = self.covariance @ step.seen
-        variance = float(step.seen @ along + step.grown[HEADING, HEADING]) + turn.wander
-        off = turn.turned - float(step.seen @ self.mean)
+        step = step or self.transition(rate_integral)
+        gain_direction = self.covariance @ step.observation
+        variance = (float(step.observation @ gain_direction
+                          + step.process_noise[HEADING_INDEX, HEADING_INDEX])
+                    + rate_integral.wander_variance)
+        innovation = rate_integral.angle - float(step.observation @ self.mean)
         covariance = self.covariance
-        if turn.wander:
-            along[HEADING] += turn.wander
+        if rate_integral.wander_variance:
+            gain_direction[HEADING_INDEX] += rate_integral.wander_variance
             covariance = covariance.copy()
-            covariance[HEADING, HEADING] += turn.wander
-        return Drift(self.noise, self.mean + along * (off / variance),
-                     covariance - along[:, None] * along / variance)
+            covariance[HEADING_INDEX, HEADING_INDEX] += rate_integral.wander_variance
+        return HeadingState(self.noise, self.mean + gain_direction * (innovation / variance),
+                            covariance - gain_direction[:, None] * gain_direction / variance)
 
-    def carried(self, turn: RateIntegral, step: Step | None = None) -> Drift:
+    def propagate_at_rest(self, rate_integral: RateIntegral,
+                          step: Transition | None = None) -> HeadingState:
         """Return the state after a time of constant heading without a measurement."""
-        step = step or self.step(turn)
-        grown = step.grown.copy()
-        grown[HEADING] = grown[:, HEADING] = 0.0
-        grown[HEADING, HEADING] = turn.lost
-        return Drift(self.noise, step.kept * self.mean,
-                     step.kept[:, None] * self.covariance * step.kept + grown)
+        step = step or self.transition(rate_integral)
+        grown = step.process_noise.copy()
+        grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
+        grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance
+        return HeadingState(self.noise, step.retention * self.mean,
+                            step.retention[:, None] * self.covariance * step.retention + grown)
 
-    def expected(self, turn: RateIntegral) -> tuple[float, float]:
+    def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
-        seen, variance = self._seen(turn)
+        seen, variance = self._observation_row(rate_integral)
         return float(seen @ self.mean), float(seen @ self.covariance @ seen) + variance
 
     @cached_property
-    def offset(self) -> tuple[float, float]:
+    def wander_rate(self) -> tuple[float, float]:
         """Return the sum of random walk and flicker, rad/s, and its variance."""
-        parts = slice(WALK, self.calibrated)
+        parts = slice(WALK_INDEX, self.first_value_index)
         return float(self.mean[parts].sum()), float(self.covariance[parts, parts].sum())
 
     @cached_property
-    def values(self) -> tuple[Array, Array, Array]:
-        """Return the errors of the calibration, their covariance, and that with the `offset`."""
-        first = self.calibrated
+    def calibration_errors(self) -> tuple[Array, Array, Array]:
+        """Return the calibration errors, their covariance, and that with `wander_rate`."""
+        first = self.first_value_index
         return (self.mean[first:], self.covariance[first:, first:],
-                self.covariance[WALK:first, first:].sum(axis=0))
+                self.covariance[WALK_INDEX:first, first:].sum(axis=0))
 
-    def bias(self, sensitivity: Array) -> tuple[float, float]:
+    def rate_error(self, sensitivity: Array) -> tuple[float, float]:
         """Return the error of the compensated rate, rad/s, and its variance; sensitivity (m,)."""
-        (offset, variance), (values, covariance, shared) = self.offset, self.values
+        (offset, variance), (values, covariance, shared) = (
+            self.wander_rate, self.calibration_errors)
         return (offset - float(sensitivity @ values),
                 variance + float(sensitivity @ (covariance @ sensitivity - 2.0 * shared)))
 
-    def uncertain(self, place: int, variance: float) -> Drift:
+    def with_added_variance(self, index: int, variance: float) -> HeadingState:
         """Return the state with a variance added to one component."""
         covariance = self.covariance.copy()
-        covariance[place, place] += variance
+        covariance[index, index] += variance
         return replace(self, covariance=covariance)
 
-    def known_to_head(self, heading: float, variance: float) -> Drift:
+    def condition_on_heading(self, heading: float, variance: float) -> HeadingState:
         """Return the state given a later estimate of its heading, rad, and variance, rad²."""
-        own = self.covariance[HEADING, HEADING]
-        gain = self.covariance[HEADING] / own if own > 0.0 else 0.0 * self.covariance[HEADING]
+        own = self.covariance[HEADING_INDEX, HEADING_INDEX]
+        gain = (self.covariance[HEADING_INDEX] / own if own > 0.0 else 0.0
+                * self.covariance[HEADING_INDEX])
         return replace(
-            self, mean=self.mean + gain * (heading - self.mean[HEADING]),
+            self, mean=self.mean + gain * (heading - self.mean[HEADING_INDEX]),
             covariance=self.covariance + (variance - own) * np.outer(gain, gain))
 
-    def turned_to(self, heading: float, variance: float = 0.0) -> Drift:
+    def with_heading(self, heading: float, variance: float = 0.0) -> HeadingState:
         """Return the state with another heading, rad, and its variance, rad²."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
-        mean[HEADING] = heading
-        covariance[HEADING] = covariance[:, HEADING] = 0.0
-        covariance[HEADING, HEADING] = variance
+        mean[HEADING_INDEX] = heading
+        covariance[HEADING_INDEX] = covariance[:, HEADING_INDEX] = 0.0
+        covariance[HEADING_INDEX, HEADING_INDEX] = variance
         return replace(self, mean=mean, covariance=covariance)
 
 
-def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,
-          age: float | None = None) -> Drift:
+def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,
+                  age: float | None = None) -> HeadingState:
     """
     Return the state some time after a calibration.
 
@@ -243,120 +257,130 @@ def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float
         is replaced here by that of the flicker components
 
     """
-    constants, of_each = noise.flicker()
-    first = _FLICKER + len(constants)
+    constants, flicker_variances = noise.flicker_processes()
+    first = _FLICKER_INDEX + len(constants)
     mean, whole = np.zeros(first + len(covariance)), np.zeros((first + len(covariance),) * 2)
-    mean[HEADING], whole[HEADING, HEADING] = heading, variance
+    mean[HEADING_INDEX], whole[HEADING_INDEX, HEADING_INDEX] = heading, variance
     whole[first:, first:] = covariance
-    flicker = np.arange(_FLICKER, first)
-    whole[flicker, flicker] = of_each
+    flicker = np.arange(_FLICKER_INDEX, first)
+    whole[flicker, flicker] = flicker_variances
     if age is not None:
-        within, shared = known_mean(constants)
-        whole[WALK, WALK] = noise.rate_random_walk ** 2 * (age + CALIBRATED / 3.0)
-        whole[-1, -1] = max(whole[-1, -1] - noise.floor ** 2, 0.0) + of_each * np.sum(within)
-        whole[-1, flicker] = whole[flicker, -1] = -of_each * shared * np.exp(-age / constants)
-    return Drift(noise, mean, whole)
+        within, shared = averaged_process_moments(constants)
+        whole[WALK_INDEX, WALK_INDEX] = (noise.rate_random_walk ** 2 *
+                                         (age + BIAS_AVERAGING_TIME / 3.0))
+        whole[-1, -1] = (max(whole[-1, -1] - noise.allan_floor ** 2, 0.0)
+                         + flicker_variances * np.sum(within))
+        whole[-1, flicker] = whole[flicker,
+                                   -1] = (-flicker_variances * shared * np.exp(-age / constants))
+    return HeadingState(noise, mean, whole)
 
 
-def heading_variances(drifts: list[Drift], turns: list[RateIntegral]) -> Array:
+def heading_variances(states: list[HeadingState], rate_integrals: list[RateIntegral]) -> Array:
     """Return the variance of the heading after each turn from its state, rad², shape (k,)."""
-    figures = np.array([(turn.duration, turn.lost + turn.noise
+    figures = np.array([(turn.duration, turn.lost_variance + turn.extra_noise_variance
                          + drift.noise.angle_random_walk ** 2 * turn.duration)
-                        for drift, turn in zip(drifts, turns)])
+                        for drift, turn in zip(states, rate_integrals)])
     # flicker and random walk have the same parameters in all states
-    seen, variances = _integrated(drifts[0].noise, np.round(figures[:, 0], 6))
-    rows = np.concatenate([-seen, [turn.sensitivity for turn in turns]], axis=1)
-    rows[:, HEADING] += 1.0
-    spread = np.matmul([drift.covariance for drift in drifts], rows[:, :, None])[:, :, 0]
+    seen, variances = _integrated_wander(states[0].noise, np.round(figures[:, 0], 6))
+    rows = np.concatenate([-seen, [turn.sensitivity for turn in rate_integrals]], axis=1)
+    rows[:, HEADING_INDEX] += 1.0
+    spread = np.matmul([drift.covariance for drift in states], rows[:, :, None])[:, :, 0]
     return np.asarray((spread * rows).sum(axis=1) + variances + figures[:, 1])
 
 
-def _integrated(noise: Noise, durations: Array) -> tuple[Array, Array]:
+def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:
     """Return contributions of heading, walk and flicker to integrals, (k, parts), and variance."""
-    constants, variance = noise.flicker()
+    constants, variance = noise.flicker_processes()
     ratio = durations[:, None] / constants
     left = np.exp(-ratio)
-    seen = np.zeros((len(durations), _FLICKER + len(constants)))
-    seen[:, WALK], seen[:, _FLICKER:] = durations, constants * (1.0 - left)
+    seen = np.zeros((len(durations), _FLICKER_INDEX + len(constants)))
+    seen[:, WALK_INDEX], seen[:, _FLICKER_INDEX:] = durations, constants * (1.0 - left)
     return seen, (noise.rate_random_walk ** 2 * durations ** 3 / 3.0 + variance * (
         constants ** 2 * np.maximum(2.0 * ratio - 3.0 + 4.0 * left - left ** 2, 0.0)).sum(axis=1))
 
 
 @lru_cache(maxsize=4096)
-def _step(noise: Noise, duration: float, unseen: bool,
-          values: int) -> tuple[Array, Array, Array]:
+def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
+                       value_count: int) -> tuple[Array, Array, Array]:
     """Return `_wander` or `_unseen` with room for the values of a calibration."""
-    seen, kept, grown = (_unseen if unseen else _wander)(noise, duration)
-    whole = np.zeros((len(kept) + values, len(kept) + values))
+    seen, kept, grown = (_unobserved_transition if is_unobserved else _wander_transition)(noise,
+                                                                                          duration)
+    whole = np.zeros((len(kept) + value_count, len(kept) + value_count))
     whole[:len(kept), :len(kept)] = grown
-    return (np.concatenate([seen, np.zeros(values)]), np.concatenate([kept, np.ones(values)]),
-            whole)
+    return (np.concatenate([seen,
+                            np.zeros(value_count)]), np.concatenate([kept,
+                                                                     np.ones(value_count)]), whole)
 
 
-def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
+def _wander_transition(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
     """
     Return contributions of heading, walk and flicker to the integral, decay, and process noise.
 
     White noise is not included.
 
     """
-    constants, variance = noise.flicker()
+    constants, variance = noise.flicker_processes()
     left, walk = np.exp(-duration / constants), noise.rate_random_walk ** 2
     kept = np.concatenate([[1.0, 1.0], left])
-    (seen,), (integral,) = _integrated(noise, np.array([duration]))
+    (seen,), (integral,) = _integrated_wander(noise, np.array([duration]))
     grown = np.diag(np.concatenate([[0.0, walk * duration], variance * (1.0 - left ** 2)]))
-    grown[HEADING, WALK] = -0.5 * walk * duration ** 2
-    grown[HEADING, _FLICKER:] = -variance * constants * (1.0 - left) ** 2
-    grown[:, HEADING] = grown[HEADING]
-    grown[HEADING, HEADING] = integral
+    grown[HEADING_INDEX, WALK_INDEX] = -0.5 * walk * duration ** 2
+    grown[HEADING_INDEX, _FLICKER_INDEX:] = -variance * constants * (1.0 - left) ** 2
+    grown[:, HEADING_INDEX] = grown[HEADING_INDEX]
+    grown[HEADING_INDEX, HEADING_INDEX] = integral
     return seen, kept, grown
 
 
-def _unseen(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
+def _unobserved_transition(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
     """Return the same without rates: walk and flicker go on, and contribute nothing."""
-    seen, kept, grown = (values.copy() for values in _wander(noise, duration))
-    seen[:] = grown[HEADING] = grown[:, HEADING] = 0.0
+    seen, kept, grown = (values.copy() for values in _wander_transition(noise, duration))
+    seen[:] = grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
     return seen, kept, grown
 
 
-def smoothed(states: list[Drift], turns: list[RateIntegral], resting: list[bool]) -> list[Drift]:
+def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral],
+                  resting: list[bool]) -> list[HeadingState]:
     """
     Return the states smoothed by all later data (Rauch, Tung and Striebel).
 
     Parameters
     ----------
     states : before each turn, and after the last; n + 1 of them
-    turns, resting : n each
+    rate_integrals, resting : n each
 
     """
     later = [states[-1]]
-    for state, turn, rest in zip(states[-2::-1], turns[::-1], resting[::-1]):
-        later.append(_with_hindsight(state, turn, rest, later[-1]))
+    for state, turn, rest in zip(states[-2::-1], rate_integrals[::-1], resting[::-1]):
+        later.append(_smooth_state(state, turn, rest, later[-1]))
     return later[::-1]
 
 
-def _with_hindsight(state: Drift, turn: RateIntegral, rest: bool, later: Drift) -> Drift:
+def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: bool,
+                  later: HeadingState) -> HeadingState:
     """Return a state updated by the smoothed state after it."""
-    step, start = state.step(turn), state
-    if rest:
-        after = state.measured(turn).carried(turn)
-        expected, variance = state.expected(turn)
-        along, variance = state.covariance @ step.seen, variance + turn.wander
-        start = replace(state, mean=state.mean + along / variance * (turn.turned - expected),
-                        covariance=state.covariance - np.outer(along, along) / variance)
-        shared = start.covariance * step.kept
-        shared[:, HEADING] -= along * turn.wander / variance
+    step, start = state.transition(rate_integral), state
+    if is_resting:
+        after = state.update_at_rest(rate_integral).propagate_at_rest(rate_integral)
+        expected, variance = state.expected_rest_angle(rate_integral)
+        gain_direction, variance = (state.covariance @ step.observation,
+                                    variance + rate_integral.wander_variance)
+        start = replace(
+            state, mean=state.mean + gain_direction / variance * (rate_integral.angle - expected),
+            covariance=state.covariance - np.outer(gain_direction, gain_direction) / variance)
+        shared = start.covariance * step.retention
+        shared[:, HEADING_INDEX] -= gain_direction * rate_integral.wander_variance / variance
     else:
-        after, transition = state.moved(turn), np.diag(step.kept)
-        transition[HEADING] -= step.seen
+        after, transition = state.propagate(rate_integral), np.diag(step.retention)
+        transition[HEADING_INDEX] -= step.observation
         shared = state.covariance @ transition.T
-    back = shared @ _inverse(after.covariance)
+    smoother_gain = shared @ _pseudo_inverse(after.covariance)
     return replace(
-        start, mean=start.mean + back @ (later.mean - after.mean),
-        covariance=start.covariance + back @ (later.covariance - after.covariance) @ back.T)
+        start, mean=start.mean + smoother_gain @ (later.mean - after.mean),
+        covariance=start.covariance
+        + smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T)
 
 
-def _inverse(covariance: Array) -> Array:
+def _pseudo_inverse(covariance: Array) -> Array:
     """Return the pseudo-inverse of a covariance that may have zero variances."""
     size = np.sqrt(np.diagonal(covariance))
     size = np.where(size > 0.0, size, 1.0)

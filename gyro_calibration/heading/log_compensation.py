@@ -23,10 +23,15 @@ from typing import Any
 
 from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.heading.kalman import Drift, HEADING, smoothed
-from gyro_calibration.heading.tracker import ACCELERATION, HeadingTracker, JUMP, Settings
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, part
-from gyro_calibration.model.compensation import compensate, Compensated, rate_sensitivity
+from gyro_calibration.heading.kalman import HEADING_INDEX, HeadingState, smooth_states
+from gyro_calibration.heading.tracker import (
+    HeadingTracker,
+    MAX_ACCELERATION,
+    MAX_RATE_STEP,
+    Settings,
+)
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, select_rows
+from gyro_calibration.model.compensation import compensate, CompensatedSamples, rate_sensitivity
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
@@ -35,11 +40,11 @@ from numpy.typing import NDArray
 
 #: Length of the parts for which the heading of effects is iterated without a reference, s; longer
 #: parts need more passes.
-_AT_ONCE = 60.0
+_PART_DURATION = 60.0
 #: Longest gap of a reference heading that is interpolated, s.
-_BRIDGED = 1.0
+_MAX_INTERPOLATED_GAP = 1.0
 #: Change of the heading at which the iteration ends, rad, and largest number of passes.
-_SETTLED, _PASSES = 1e-10, 50
+_HEADING_TOLERANCE, _MAX_PASSES = 1e-10, 50
 
 
 class LogCompensation:
@@ -50,95 +55,96 @@ class LogCompensation:
     compensated rates from 0 on.
 
     In a gap of the reference, the heading is its last value plus the integral of the compensated
-    rates. Gaps up to `_BRIDGED` s inside a block are interpolated instead; across the border of
-    blocks the next value is not known, and the result differs slightly. Before the first value of
-    a reference the heading is that value; in earlier blocks it is integrated from 0 on.
+    rates. Gaps up to `_MAX_INTERPOLATED_GAP` s inside a block are interpolated instead; across the
+    border of blocks the next value is not known, and the result differs slightly. Before the first
+    value of a reference the heading is that value; in earlier blocks it is integrated from 0 on.
 
     """
 
     def __init__(self, model: GyroModel):
         """Begin with an empty history."""
-        self._model, self._history = model, model.history()
-        self._begin: float | None = None
-        self._referred = False
-        self._turned: tuple[Array, Array, float] = np.zeros(0), np.zeros(0), 0.0
+        self._model, self._history = model, model.start_history()
+        self._start_time: float | None = None
+        self._has_had_reference = False
+        self._last_integration: tuple[Array, Array, float] = np.zeros(0), np.zeros(0), 0.0
 
-    def add(self, log: Log) -> tuple[Compensated, Array]:
+    def add(self, log: Log) -> tuple[CompensatedSamples, Array]:
         """Take the next rows, with known outputs; return them with their `rate_sensitivity`."""
-        if not self._model.looks_around or not len(log):
-            return self._compensated(log, None)
-        compensated, sensitivities = zip(*(self._around(part) for part in self._parts(log)))
+        if not self._model.needs_history or not len(log):
+            return self._compensate(log, None)
+        compensated, sensitivities = zip(*(self._compensate_part(part)
+                                           for part in self._split_by_reference(log)))
         joined = {each.name: np.concatenate([
             np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
-            for each in fields(Compensated)}
-        return Compensated(**joined), np.concatenate(sensitivities, axis=1)
+            for each in fields(CompensatedSamples)}
+        return CompensatedSamples(**joined), np.concatenate(sensitivities, axis=1)
 
     def true_time(self, time: Array) -> Array:
         """Return when the samples with the next stamps, s, were taken."""
-        if self._begin is None and len(time):
-            self._begin = float(time[0])
-        begin = self._begin or 0.0
+        if self._start_time is None and len(time):
+            self._start_time = float(time[0])
+        begin = self._start_time or 0.0
         return np.asarray(begin + self._model.true_time(time - begin))
 
-    def _compensated(self, log: Log, around: Channels | None) -> tuple[Compensated, Array]:
+    def _compensate(self, log: Log, channels: Channels | None) -> tuple[CompensatedSamples, Array]:
         assert log.output is not None
-        result = compensate(self._model, log.output, log.temperature, around)
+        result = compensate(self._model, log.output, log.temperature, channels)
         return result, rate_sensitivity(self._model, log.output, result.rate, result.temperature,
-                                        around)
+                                        channels)
 
-    def _parts(self, log: Log) -> Iterator[Log]:
+    def _split_by_reference(self, log: Log) -> Iterator[Log]:
         """Give the rows in parts with a reference, and in short parts without one."""
-        if log.time is None or not self._model.looks_at('heading'):
+        if log.time is None or not self._model.uses_channel('heading'):
             yield log
             return
-        part = np.where(self._referenced(log.time, log.reference_heading), -1,
-                        (log.time - log.time[0]) // _AT_ONCE)
+        part = np.where(self._referenced_rows(log.time, log.reference_heading), -1,
+                        (log.time - log.time[0]) // _PART_DURATION)
         for rows in np.split(np.arange(len(log)), np.flatnonzero(np.diff(part)) + 1):
             yield rows_of(log, rows)
 
-    def _referenced(self, time: Array, heading: Array | None) -> Mask:
+    def _referenced_rows(self, time: Array, heading: Array | None) -> Mask:
         """Return which rows have a reference heading, or one to interpolate, shape (n,)."""
         known = np.flatnonzero(np.isfinite(heading)) if heading is not None else np.zeros(0, int)
         if not len(known):
             return np.zeros(len(time), bool)
-        rows, earlier = np.arange(len(time)), self._referred
+        rows, earlier = np.arange(len(time)), self._has_had_reference
         before, after = (np.searchsorted(known, rows, 'right') - 1,
                          np.searchsorted(known, rows, 'left'))
-        self._referred, inside = True, (before >= 0) & (after < len(known))
+        self._has_had_reference, inside = True, (before >= 0) & (after < len(known))
         lost = time[known[np.minimum(after, len(known) - 1)]] - time[known[np.maximum(before, 0)]]
-        return (inside & (lost <= _BRIDGED)) | ((before < 0) & (not earlier))
+        return (inside & (lost <= _MAX_INTERPOLATED_GAP)) | ((before < 0) & (not earlier))
 
-    def _around(self, log: Log) -> tuple[Compensated, Array]:
+    def _compensate_part(self, log: Log) -> tuple[CompensatedSamples, Array]:
         time = np.zeros(len(log)) if log.time is None else log.time
-        around = self._history.follow(time, log.temperature, log.specific_force, log.supply,
-                                      _bridged(time, log.reference_heading))
-        if not self._model.looks_at('heading') or log.time is None:
-            return self._compensated(log, around)
+        channels = self._history.update(time, log.temperature, log.specific_force, log.supply,
+                                        _interpolate_heading(time, log.reference_heading))
+        if not self._model.uses_channel('heading') or log.time is None:
+            return self._compensate(log, channels)
         if log.reference_heading is None or not np.isfinite(log.reference_heading).any():
-            return self._compensated(log, self._found_heading(log, around))
-        result, sensitivity = self._compensated(log, around)
-        self._turned = (self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:],
-                        float(np.asarray(around.heading)[-1]))
+            return self._compensate(log, self._iterate_heading(log, channels))
+        result, sensitivity = self._compensate(log, channels)
+        self._last_integration = (self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:],
+                                  float(np.asarray(channels.heading)[-1]))
         return result, sensitivity
 
-    def _found_heading(self, log: Log, around: Channels) -> Channels:
+    def _iterate_heading(self, log: Log, channels: Channels) -> Channels:
         """Iterate: compensate with a heading, and integrate the rates to the next heading."""
         assert log.time is not None
-        last_time, last_rate, begin = self._turned
+        last_time, last_rate, begin = self._last_integration
         carried, time = len(last_time), np.concatenate([last_time, self.true_time(log.time)])
         heading = np.full(len(log), begin)
-        for _ in range(_PASSES):
-            around = replace(around, heading=heading)
+        for _ in range(_MAX_PASSES):
+            channels = replace(channels, heading=heading)
             rate = np.concatenate([last_rate, compensate(
-                self._model, np.asarray(log.output), log.temperature, around).rate])
+                self._model, np.asarray(log.output), log.temperature, channels).rate])
             before, heading = heading, integrate(time, rate, begin)[carried:]
-            if np.abs(heading - before).max() < _SETTLED:
+            if np.abs(heading - before).max() < _HEADING_TOLERANCE:
                 break
-        self._turned = time[-1:], rate[-1:], float(heading[-1])
-        return replace(around, heading=heading)
+        self._last_integration = time[-1:], rate[-1:], float(heading[-1])
+        return replace(channels, heading=heading)
 
 
-def plausible(model: GyroModel, log: Log) -> Mask:
+def plausible_rows(model: GyroModel, log: Log) -> Mask:
     """Return which rows have a plausible output and temperature, shape (n,); no nan is one."""
     assert log.output is not None
     found = np.abs(log.output) <= model.rate_limit
@@ -148,7 +154,7 @@ def plausible(model: GyroModel, log: Log) -> Mask:
     return np.asarray(found)
 
 
-def none_plausible(model: GyroModel) -> str:
+def no_plausible_row_message(model: GyroModel) -> str:
     """Return the message for a log without a plausible row."""
     coldest, hottest = model.temperature_limits
     return ('no row is plausible, with an output within '
@@ -158,7 +164,7 @@ def none_plausible(model: GyroModel) -> str:
 
 def compensate_log(model: GyroModel, log: Log) -> Array:
     """Return the rates of a log with output, rad/s, shape (n,); nan where not `plausible`."""
-    known = plausible(model, log)
+    known = plausible_rows(model, log)
     rate = np.full(len(log), np.nan)
     rate[known] = LogCompensation(model).add(rows_of(log, known))[0].rate
     return rate
@@ -166,10 +172,10 @@ def compensate_log(model: GyroModel, log: Log) -> Array:
 
 def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
     """Return some rows of a log, by their numbers or by a mask, without unknown columns."""
-    return part(replace(log, others={}), rows)
+    return select_rows(replace(log, others={}), rows)
 
 
-def _bridged(time: Array, heading: Array | None) -> Array | float:
+def _interpolate_heading(time: Array, heading: Array | None) -> Array | float:
     """Return a heading with its gaps interpolated."""
     if heading is None or not (known := np.isfinite(heading)).any():
         return 0.0
@@ -185,7 +191,8 @@ class Track:
     ----------
     heading, variance, rate, rate_variance : rad, rad², rad/s and (rad/s)², shape (n,)
     resting : shape (n,)
-    deleted : heading attributed to bias or noise at rest, or deleted by the threshold filter, rad
+    deleted_heading : heading attributed to bias or noise at rest, or deleted by the threshold
+        filter, rad
     intervals : of the samples, with the number of lost ones
 
     """
@@ -195,7 +202,7 @@ class Track:
     rate: Array
     rate_variance: Array
     resting: Mask
-    deleted: float
+    deleted_heading: float
     intervals: Intervals
 
 
@@ -222,20 +229,21 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
     found = tracker.follow(time, rate, np.ascontiguousarray(sensitivity.T), wheels, still)
     heading, variance, shown, rate_variance, resting = found.T
-    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted,
+    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted_heading,
                  tracker.intervals)
     if not hindsight:
         return live
     if not np.isfinite(found).all():
         raise OverflowError('the variance of the heading is not finite')
-    later, with_hindsight, rested = in_hindsight(tracker, time, rate)
+    later, with_hindsight, rested = smooth_track(tracker, time, rate)
     return replace(live, heading=later, variance=with_hindsight, resting=rested)
 
 
-def _without_spikes(time: Array, rate: Array) -> Array:
+def _remove_spikes(time: Array, rate: Array) -> Array:
     """Return rates with the outliers of the tracker interpolated, shape (n,)."""
-    jumps = np.abs(np.diff(rate)) > JUMP + ACCELERATION * np.diff(time)
-    back = np.abs(rate[2:] - rate[:-2]) <= JUMP + ACCELERATION * (time[2:] - time[:-2])
+    jumps = np.abs(np.diff(rate)) > MAX_RATE_STEP + MAX_ACCELERATION * np.diff(time)
+    back = (np.abs(rate[2:] - rate[:-2]) <= MAX_RATE_STEP + MAX_ACCELERATION *
+            (time[2:] - time[:-2]))
     spikes = np.flatnonzero(jumps[:-1] & back) + 1
     if not len(spikes):
         return rate
@@ -243,7 +251,7 @@ def _without_spikes(time: Array, rate: Array) -> Array:
     return np.interp(time, time[kept], rate[kept])
 
 
-def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
+def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
     """
     Return smoothed heading, rad, its variance, rad², and rest, shape (n,) each.
 
@@ -255,23 +263,25 @@ def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
     time, rate : of the samples, s and rad/s, shape (n,)
 
     """
-    last, steps, states = tracker.finish(), tracker.steps, list[Drift]()
+    last, steps, states = tracker.finish(), tracker.steps, list[HeadingState]()
     end, later = len(steps), None
     # of the data before another calibration, only the heading is in its state
-    for first, before in [*tracker.renewed[::-1], (0, None)]:
+    for first, before in [*tracker.recalibrations[::-1], (0, None)]:
         part = steps[first:end]
-        states = smoothed(
-            [*(step.before for step in part), last if later is None else later],
-            [step.turn for step in part], [step.resting for step in part]) + states[1:]
+        states = smooth_states(
+            [*(step.state_before for step in part), last if later is None else later],
+            [step.rate_integral for step in part], [step.is_resting for step in part]) + states[1:]
         if before is not None:
             here, end = states[0], first
-            later = last = before.known_to_head(
-                float(here.mean[HEADING]), float(here.covariance[HEADING, HEADING]))
-    ends = np.array([time[0], *(step.end for step in steps)])
-    heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING])
+            later = last = before.condition_on_heading(
+                float(here.mean[HEADING_INDEX]),
+                float(here.covariance[HEADING_INDEX, HEADING_INDEX]))
+    ends = np.array([time[0], *(step.end_time for step in steps)])
+    heading, variance = np.array([(state.mean[HEADING_INDEX], state.covariance[HEADING_INDEX,
+                                                                               HEADING_INDEX])
                                   for state in states]).T
-    turned = integrate(time, _without_spikes(time, rate))
-    rested = np.array([step.resting for step in steps] or [False])
+    turned = integrate(time, _remove_spikes(time, rate))
+    rested = np.array([step.is_resting for step in steps] or [False])
     resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]
     moved = turned + np.interp(time, ends, heading - np.interp(ends, time, turned))
     return (np.where(resting, np.interp(time, ends, heading), moved),

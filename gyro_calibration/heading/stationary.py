@@ -26,32 +26,37 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 import math
 
-from gyro_calibration.heading.gaps import block_ends, CLOSE
-from gyro_calibration.heading.kalman import Drift, HEADING, heading_variances, RateIntegral
-from gyro_calibration.logs.log import Array, SHORTEST
+from gyro_calibration.heading.gaps import block_ends, TIME_TOLERANCE
+from gyro_calibration.heading.kalman import (
+    HEADING_INDEX,
+    heading_variances,
+    HeadingState,
+    RateIntegral,
+)
+from gyro_calibration.logs.log import Array, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtri, ndtri
 
 #: Length of a block of samples, and of the window whose energy is tested, s.
-BLOCK, WINDOW = 0.1, 0.5
+BLOCK_DURATION, WINDOW_DURATION = 0.1, 0.5
 #: Durations, s, over which the mean of the rate is compared with the bias known before them.
-LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+MEAN_LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 #: Durations, s, over which the scatter of means over 1 s is compared with the noise.
-SCATTERED = (4.0, 8.0, 16.0, 32.0, 64.0)
+SCATTER_LAGS = (4.0, 8.0, 16.0, 32.0, 64.0)
 #: Least number of samples in a window.
-_SAMPLES = 8
+_MIN_WINDOW_SAMPLES = 8
 #: Windows in the memory of the noise, least number for its use, and largest ratio to the noise of
 #: the model.
-_REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
+_MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
 #: to it; the first is that of a rest, the others are those of straight drives.
-SCATTERS = np.append(0.0, 4.0 ** np.arange(7))
+SCATTER_RATIOS = np.append(0.0, 4.0 ** np.arange(7))
 #: Prior numbers of rests, and of straight drives that pass for rests; largest total of both.
-_RESTS, _STRAIGHT, _STRETCHES = 3.0, 1.0, 20.0
+_PRIOR_RESTS, _PRIOR_STRAIGHT_DRIVES, _MAX_STRETCHES = 3.0, 1.0, 20.0
 #: Threshold per mean for the onset of scatter: the maximum likelihood for a variance of three
 #: times that of the noise.
-BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
+SCATTER_ONSET_THRESHOLD = math.log(3.0) / (1.0 - 1.0 / 3.0)
 
 
 @dataclass(slots=True)
@@ -63,54 +68,55 @@ class Block:
     ----------
     duration : of its samples, s, without gaps
     count : of samples
-    total, squares : of the compensated rate, rad/s and (rad/s)²
-    differences : sum of the squared differences of neighbours, (rad/s)²
+    rate_sum, square_sum : of the compensated rate, rad/s and (rad/s)²
+    difference_square_sum : sum of the squared differences of neighbours, (rad/s)²
 
     """
 
     duration: float = 0.0
     count: int = 0
-    total: float = 0.0
-    squares: float = 0.0
-    differences: float = 0.0
+    rate_sum: float = 0.0
+    square_sum: float = 0.0
+    difference_square_sum: float = 0.0
 
-    def add(self, duration: float, rate: float, before: float) -> None:
+    def add(self, duration: float, rate: float, rate_before: float) -> None:
         """Add a sample with a duration, s."""
         self.duration += duration
         self.count += 1
-        self.total += rate
-        self.squares += rate * rate
-        self.differences += (rate - before) ** 2
+        self.rate_sum += rate
+        self.square_sum += rate * rate
+        self.difference_square_sum += (rate - rate_before) ** 2
 
 
 @lru_cache(maxsize=1024)
-def sigmas(lag: float, false_alarms: float) -> float:
+def mean_threshold_sigmas(lag: float, false_alarms: float) -> float:
     """Return the sigmas of a mean over `lag` s that give `false_alarms` per hour at rest."""
-    chances = 3600.0 / lag * _OVERLAPPING
-    return -float(ndtri(min(0.5 * false_alarms / (_TESTS * chances), 0.25)))
+    chances = 3600.0 / lag * _OVERLAP_FACTOR
+    return -float(ndtri(min(0.5 * false_alarms / (_TEST_COUNT * chances), 0.25)))
 
 
 @lru_cache(maxsize=1024)
-def _exceeded(freedom: int, chance: float) -> float:
+def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
     """Return the value that chi squared exceeds with a probability."""
-    return float(chdtri(freedom, chance))
+    return float(chdtri(degrees_of_freedom, chance))
 
 
-def most_scatter(lag: float, freedom: int, false_alarms: float) -> float:
+def scatter_threshold(lag: float, degrees_of_freedom: int, false_alarms: float) -> float:
     """Return the sum of squares of means over `lag` s that gives `false_alarms` per hour."""
-    chances = 3600.0 / lag * _OVERLAPPING
-    return _exceeded(freedom, min(false_alarms / (_TESTS * chances), 0.5))
+    chances = 3600.0 / lag * _OVERLAP_FACTOR
+    return _chi_squared_quantile(degrees_of_freedom,
+                                 min(false_alarms / (_TEST_COUNT * chances), 0.5))
 
 
 #: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
-_TESTS, _OVERLAPPING = len(LAGS) + 2, 3.0
+_TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
 
 
-class _Quietest:
+class _LowestDecile:
     """The 10 % quantile of the last values."""
 
     def __init__(self) -> None:
-        self._seen: deque[float] = deque()
+        self._history: deque[float] = deque()
         self._sorted: list[float] = []
 
     @property
@@ -119,9 +125,9 @@ class _Quietest:
 
     def add(self, value: float) -> float:
         """Take the next value; return the quantile of 10 %."""
-        if len(self._seen) == _REMEMBERED:
-            self._sorted.pop(bisect_left(self._sorted, self._seen.popleft()))
-        self._seen.append(value)
+        if len(self._history) == _MAX_WINDOWS:
+            self._sorted.pop(bisect_left(self._sorted, self._history.popleft()))
+        self._history.append(value)
         insort(self._sorted, value)
         place = 0.1 * (len(self._sorted) - 1)
         below = int(place)
@@ -129,27 +135,28 @@ class _Quietest:
         return low + (place - below) * (high - low)
 
 
-class Energy:
+class EnergyDetector:
     """
     The energy of the last `WINDOW` s.
 
     Attributes
     ----------
-    factor : ratio of the noise of the samples to that of the model, by the quietest windows; 1
-        until there are enough windows
+    noise_factor : ratio of the noise of the samples to that of the model, by the quietest windows;
+        1 until there are enough windows
 
     """
 
     def __init__(self, noise: Noise, false_alarms: float):
         """Begin with an empty window."""
-        self.factor = 1.0
+        self.noise_factor = 1.0
         self._noise = noise
-        self._level = false_alarms / (_TESTS * 3600.0 / WINDOW * _OVERLAPPING)
-        self._alarms = false_alarms / _OVERLAPPING
+        self._false_alarm_chance = (false_alarms /
+                                    (_TEST_COUNT * 3600.0 / WINDOW_DURATION * _OVERLAP_FACTOR))
+        self._sample_false_alarms = false_alarms / _OVERLAP_FACTOR
         self._blocks: deque[Block] = deque()
-        self._energies, self._roughnesses = _Quietest(), _Quietest()
-        self._since, self._interval = 0.0, BLOCK
-        self._sudden: float | None = None
+        self._energy_decile, self._difference_decile = _LowestDecile(), _LowestDecile()
+        self._since_last_window, self._interval = 0.0, BLOCK_DURATION
+        self._sudden_limit: float | None = None
 
     def clear(self) -> None:
         """Clear the window, as before rates of another calibration."""
@@ -163,31 +170,35 @@ class Energy:
         for each in blocks:
             duration += each.duration
             count += each.count
-        while (duration - blocks[0].duration >= WINDOW + BLOCK - CLOSE
-               and count - blocks[0].count >= _SAMPLES):
+        while (duration - blocks[0].duration >= WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
+               and count - blocks[0].count >= _MIN_WINDOW_SAMPLES):
             duration -= blocks[0].duration
             count -= blocks.popleft().count
         total = squares = differences = means = 0.0
         for each in blocks:
-            total += each.total
-            squares += each.squares
-            differences += each.differences
-            means += each.total * each.total / each.count
-        if duration < WINDOW + BLOCK - CLOSE or count < _SAMPLES:
+            total += each.rate_sum
+            squares += each.square_sum
+            differences += each.difference_square_sum
+            means += each.rate_sum * each.rate_sum / each.count
+        if (duration < WINDOW_DURATION + BLOCK_DURATION - TIME_TOLERANCE
+                or count < _MIN_WINDOW_SAMPLES):
             return None
-        self._interval, self._sudden = duration / count, None
-        claimed = self._noise.rate_variance(self._interval)
+        self._interval, self._sudden_limit = duration / count, None
+        model_variance = self._noise.rate_variance(self._interval)
         energy = (squares - total * total / count) / (count - 1)
-        self._learn(block.duration, count, energy / claimed, 0.5 * differences / count / claimed)
-        claimed *= self.factor ** 2
-        if energy >= claimed * _exceeded(count - 1, self._level) / (count - 1):
+        self._update_noise_factor(block.duration, count, energy / model_variance,
+                                  0.5 * differences / count / model_variance)
+        model_variance *= self.noise_factor ** 2
+        if energy >= model_variance * _chi_squared_quantile(
+                count - 1, self._false_alarm_chance) / (count - 1):
             return False
         # motion is slower than the samples, so that means over blocks show it far better
         freedom = len(blocks) - 1
         return bool(freedom < 2 or means - total * total / count
-                    < claimed * _exceeded(freedom, self._level))
+                    < model_variance * _chi_squared_quantile(freedom, self._false_alarm_chance))
 
-    def _learn(self, duration: float, count: int, energy: float, differences: float) -> None:
+    def _update_noise_factor(self, duration: float, count: int, energy: float,
+                             differences: float) -> None:
         """
         Update the noise of the samples by the quietest tenth of the windows.
 
@@ -195,27 +206,27 @@ class Energy:
         neighbours.
 
         """
-        self._since += duration
-        if self._since < WINDOW - CLOSE:
+        self._since_last_window += duration
+        if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return
-        self._since = 0.0
-        quietest, rough = self._energies.add(energy), self._roughnesses.add(differences)
-        if self._energies.count >= _NEEDED:
-            quietest = min(quietest, rough) * (count - 1) / _exceeded(count - 1, 0.9)
-            self.factor = math.sqrt(min(max(quietest, 1.0), _TRUSTED ** 2))
+        self._since_last_window = 0.0
+        quietest, rough = self._energy_decile.add(energy), self._difference_decile.add(differences)
+        if self._energy_decile.count >= _MIN_WINDOWS:
+            quietest = min(quietest, rough) * (count - 1) / _chi_squared_quantile(count - 1, 0.9)
+            self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
-    def sudden(self) -> float:
+    def sudden_limit(self) -> float:
         """
         Return the largest deviation of a single sample at rest, rad/s.
 
         Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
 
         """
-        if self._sudden is None:
-            limit = sigmas(round(self._interval, 9), self._alarms)
-            self._sudden = limit * self.factor * math.sqrt(
+        if self._sudden_limit is None:
+            limit = mean_threshold_sigmas(round(self._interval, 9), self._sample_false_alarms)
+            self._sudden_limit = limit * self.noise_factor * math.sqrt(
                 self._noise.rate_variance(self._interval))
-        return self._sudden
+        return self._sudden_limit
 
 
 @dataclass(frozen=True)
@@ -225,24 +236,26 @@ class Snapshot:
 
     Attributes
     ----------
-    drift, deleted, steps : the state, the heading deleted until then, rad, and number of steps
-    turn : integral of the rates since the rest began
-    squares, means : sum of the squared normalized innovations since it began, and their number
-    likelihood : log-likelihood of their scatter for each of `SCATTERS`, shape (k,)
+    state, deleted_heading, step_count : the state, the heading deleted until then, rad, and number
+        of steps
+    rate_integral : integral of the rates since the rest began
+    innovation_square_sum, innovation_count : sum of the squared normalized innovations since it
+        began, and their number
+    log_likelihood : log-likelihood of their scatter for each of `SCATTERS`, shape (k,)
 
     """
 
-    drift: Drift
-    turn: RateIntegral
-    deleted: float
-    steps: int
-    squares: float = 0.0
-    means: int = 0
-    likelihood: Array = field(default_factory=lambda: np.zeros(len(SCATTERS)))
+    state: HeadingState
+    rate_integral: RateIntegral
+    deleted_heading: float
+    step_count: int
+    innovation_square_sum: float = 0.0
+    innovation_count: int = 0
+    log_likelihood: Array = field(default_factory=lambda: np.zeros(len(SCATTER_RATIOS)))
 
 
 @dataclass
-class StraightDrives:
+class RestScatter:
     """
     Distribution of the scatter of the rates in detected rests.
 
@@ -253,17 +266,18 @@ class StraightDrives:
     """
 
     counts: Array = field(default_factory=lambda: np.append(
-        _RESTS, np.full(len(SCATTERS) - 1, _STRAIGHT / (len(SCATTERS) - 1))))
+        _PRIOR_RESTS,
+        np.full(len(SCATTER_RATIOS) - 1, _PRIOR_STRAIGHT_DRIVES / (len(SCATTER_RATIOS) - 1))))
 
-    def chances(self, likelihood: Array) -> Array:
+    def probabilities(self, likelihood: Array) -> Array:
         """Return the probability of each scatter, shape (k,)."""
         chances = self.counts * np.exp(likelihood - likelihood.max())
         return np.asarray(chances / chances.sum())
 
     def learn(self, last: Snapshot) -> None:
         """Add a detected rest that has ended."""
-        kept = _STRETCHES / max(_STRETCHES, float(self.counts.sum()))
-        self.counts = kept * self.counts + self.chances(last.likelihood)
+        retention = _MAX_STRETCHES / max(_MAX_STRETCHES, float(self.counts.sum()))
+        self.counts = retention * self.counts + self.probabilities(last.log_likelihood)
 
 
 @dataclass
@@ -273,21 +287,21 @@ class SlowTurn:
 
     Attributes
     ----------
-    before : the state when it began
+    snapshot : the state when it began
     rate : of the turn, rad/s
-    turn : integral of the rates since then
+    rate_integral : integral of the rates since then
 
     """
 
-    before: Snapshot
+    snapshot: Snapshot
     rate: float
-    turn: RateIntegral
+    rate_integral: RateIntegral
 
 
 #: Time constant with which a pending correction of the heading is applied in motion, s.
-SETTLING = 1.0
+SETTLING_TIME = 1.0
 #: Blocks at rest whose samples are compared with one estimate of the bias.
-_LOOKED_AHEAD = 12
+_LOOKAHEAD_BLOCKS = 12
 
 
 @dataclass(frozen=True)
@@ -296,19 +310,20 @@ class Samples:
 
     time: Array
     rate: Array
-    moving: Array
-    resting: Array
+    motion_sensitivity: Array
+    rest_sensitivity: Array
     wheels: Sequence[bool | None] | None
-    still: Array | None
+    still_sensitivity: Array | None
 
     def still_at(self, place: int) -> Array | None:
-        return self.still if self.still is None or self.still.ndim == 1 else self.still[place]
+        return (self.still_sensitivity if self.still_sensitivity is None
+                or self.still_sensitivity.ndim == 1 else self.still_sensitivity[place])
 
     def sample(self, place: int, resting: bool,
                ) -> tuple[float, float, Array, bool | None, Array | None]:
         """Return the arguments of `HeadingTracker.add`."""
         return (float(self.time[place]), float(self.rate[place]),
-                (self.resting if resting else self.moving)[place],
+                (self.rest_sensitivity if resting else self.motion_sensitivity)[place],
                 None if self.wheels is None else self.wheels[place], self.still_at(place))
 
 
@@ -319,21 +334,21 @@ class Epoch:
 
     Attributes
     ----------
-    place : index of the sample before its first
-    taken : number of the state
-    opens : last samples of its blocks, and integrals of the rates since the state
-    end : index after its last sample
+    start_index : index of the sample before its first
+    state_version : number of the state
+    open_integrals : last samples of its blocks, and integrals of the rates since the state
+    end_index : index after its last sample
 
     """
 
-    place: int
-    taken: int
-    drift: Drift
-    resting: bool
+    start_index: int
+    state_version: int
+    state: HeadingState
+    is_resting: bool
     heading: float
     pending: float
-    opens: list[tuple[int, RateIntegral]]
-    end: int = -1
+    open_integrals: list[tuple[int, RateIntegral]]
+    end_index: int = -1
 
 
 class EvenSamples:
@@ -342,16 +357,17 @@ class EvenSamples:
 
     Attributes
     ----------
-    time, rate, intervals, halves, turned : stamps, rates, the intervals before them, half of them,
-        and the integrals of the rates over them, shape (n,)
-    moving, resting : sensitivities, shape (n, m)
-    seen : the sensitivities used, first that of the sample before, shape (n + 1, m)
-    begins, ends, whole : first samples and ends of the blocks, and range of complete blocks
-    sums : duration, integral, remaining share of a pending correction, and sums of the rates,
-        their squares, and the squares of their steps, by block
-    weighted : integrals of the sensitivities in motion and at rest, shape (k, m) each
-    found : the result of `HeadingTracker.follow`
-    rested : whether the last sample was at rest
+    time, rate, intervals, half_intervals, angles : stamps, rates, the intervals before them, half
+        of them, and the integrals of the rates over them, shape (n,)
+    motion_sensitivity, rest_sensitivity : sensitivities, shape (n, m)
+    used_sensitivity : the sensitivities used, first that of the sample before, shape (n + 1, m)
+    block_starts, block_stops, whole_blocks : first samples and ends of the blocks, and range of
+        complete blocks
+    block_sums : duration, integral, remaining share of a pending correction, and sums of the
+        rates, their squares, and the squares of their steps, by block
+    sensitivity_integrals : integrals of the sensitivities in motion and at rest, shape (k, m) each
+    results : the result of `HeadingTracker.follow`
+    last_at_rest : whether the last sample was at rest
     epochs : so far
 
     """
@@ -359,101 +375,112 @@ class EvenSamples:
     def __init__(self, given: Samples, where: slice, last: tuple[float, float, float, Array],
                  begun: float, rested: bool, found: Array):
         """Begin after the last sample, with an elapsed duration of the first block, s."""
-        self._given, self._first, self.rested, self.found = given, where.start, rested, found
+        self._given, self._first, self.last_at_rest, self.results = (
+            given, where.start, rested, found)
         self.time, self.rate = given.time[where], given.rate[where]
-        self.moving, self.resting = given.moving[where], given.resting[where]
+        self.motion_sensitivity, self.rest_sensitivity = (
+            given.motion_sensitivity[where], given.rest_sensitivity[where])
         count = len(self.time)
         self.intervals = np.diff(self.time, prepend=last[0])
-        self.halves, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
-        self.turned = self.halves * (2.0 * self.rate - steps)
-        self.seen = np.empty((count + 1, len(last[3])))
-        self.seen[0] = last[3]
-        self.ends = block_ends(self.intervals, BLOCK, begun)
-        whole = len(self.ends)
-        if not self.ends or self.ends[-1] < count:
-            self.ends.append(count)
-        self.begins = [0, *self.ends[:-1]]
-        self.whole = range(bool(begun), whole)
-        moving = self._weighted(self.moving)
-        self.weighted = moving, (moving if given.resting is given.moving
-                                 else self._weighted(self.resting))
-        sums = [self._by_blocks(values).tolist() for values in (
-            self.intervals, self.turned, self.rate, self.rate * self.rate, steps * steps)]
-        self._kept = 1.0 - self.intervals / SETTLING
-        sums.insert(2, np.multiply.reduceat(self._kept, self.begins).tolist())
-        self.sums = list(zip(*sums))
+        self.half_intervals, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
+        self.angles = self.half_intervals * (2.0 * self.rate - steps)
+        self.used_sensitivity = np.empty((count + 1, len(last[3])))
+        self.used_sensitivity[0] = last[3]
+        self.block_stops = block_ends(self.intervals, BLOCK_DURATION, begun)
+        whole = len(self.block_stops)
+        if not self.block_stops or self.block_stops[-1] < count:
+            self.block_stops.append(count)
+        self.block_starts = [0, *self.block_stops[:-1]]
+        self.whole_blocks = range(bool(begun), whole)
+        moving = self._integrate_sensitivity(self.motion_sensitivity)
+        self.sensitivity_integrals = moving, (moving if given.rest_sensitivity
+                                              is given.motion_sensitivity else
+                                              self._integrate_sensitivity(self.rest_sensitivity))
+        sums = [self._sum_by_blocks(values).tolist() for values in (
+            self.intervals, self.angles, self.rate, self.rate * self.rate, steps * steps)]
+        self._pending_retention = 1.0 - self.intervals / SETTLING_TIME
+        sums.insert(2, np.multiply.reduceat(self._pending_retention, self.block_starts).tolist())
+        self.block_sums = list(zip(*sums))
         self.epochs = list[Epoch]()
         self._extremes: tuple[int, int, list[float], list[float]] = -1, 0, [], []
 
-    def _weighted(self, rows: Array) -> Array:
-        before = np.concatenate([self.seen[:1], rows[:-1]])
-        return self._by_blocks(self.halves[:, None] * (rows + before))
+    def _integrate_sensitivity(self, rows: Array) -> Array:
+        before = np.concatenate([self.used_sensitivity[:1], rows[:-1]])
+        return self._sum_by_blocks(self.half_intervals[:, None] * (rows + before))
 
-    def _by_blocks(self, values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, self.begins))
+    def _sum_by_blocks(self, values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, self.block_starts))
 
-    def moved(self, number: int) -> Sequence[bool | None]:
+    def wheels_in_block(self, number: int) -> Sequence[bool | None]:
         """Return whether wheels moved the robot, for the samples of a block."""
         wheels = self._given.wheels
-        return () if wheels is None else wheels[self._first + self.begins[number]:
-                                                self._first + self.ends[number]]
+        return () if wheels is None else wheels[self._first + self.block_starts[number]:
+                                                self._first + self.block_stops[number]]
 
     def still(self, place: int) -> Array | None:
         return self._given.still_at(self._first + place)
 
-    def extremes(self, number: int, offset: float, values: Array,
-                 taken: int) -> tuple[float, float]:
+    def corrected_extremes(self, number: int, offset: float, values: Array,
+                           state_version: int) -> tuple[float, float]:
         """Return the highest and the lowest corrected rate at rest of a block, rad/s."""
         known, first, highest, lowest = self._extremes
-        if known != taken or number >= first + len(highest):
-            first, last = number, min(number + _LOOKED_AHEAD, len(self.ends))
-            rows = slice(self.begins[first], self.ends[last - 1])
-            rate = self.rate[rows] + self.resting[rows] @ values
+        if known != state_version or number >= first + len(highest):
+            first, last = number, min(number + _LOOKAHEAD_BLOCKS, len(self.block_stops))
+            rows = slice(self.block_starts[first], self.block_stops[last - 1])
+            rate = self.rate[rows] + self.rest_sensitivity[rows] @ values
             rate -= offset
-            places = np.array(self.begins[first:last]) - self.begins[first]
+            places = np.array(self.block_starts[first:last]) - self.block_starts[first]
             highest, lowest = (which.reduceat(rate, places).tolist()
                                for which in (np.maximum, np.minimum))
-            self._extremes = taken, first, highest, lowest
+            self._extremes = state_version, first, highest, lowest
         return highest[number - first], lowest[number - first]
 
-    def close(self, end: int) -> None:
+    def close_epoch(self, end: int) -> None:
         """End the last epoch before a sample."""
         if self.epochs:
             epoch = self.epochs[-1]
-            epoch.end = end
-            if end > max(epoch.place, 0):
-                self.seen[epoch.place + 2:end + 2] = (
-                    self.resting if epoch.resting else self.moving)[epoch.place + 1:end + 1]
+            epoch.end_index = end
+            if end > max(epoch.start_index, 0):
+                self.used_sensitivity[epoch.start_index + 2:end
+                                      + 2] = (self.rest_sensitivity if epoch.is_resting else
+                                              self.motion_sensitivity)[epoch.start_index + 1:end
+                                                                       + 1]
 
-    def fill(self, usual: Array) -> None:
-        """Compute the results of the epochs; `usual` are the usual intervals at each sample."""
-        found, interval = self.found, np.clip(np.minimum(self.intervals, usual), SHORTEST, None)
+    def fill_results(self, usual_intervals: Array) -> None:
+        """Compute the results of the epochs; `usual_intervals` has a row for each sample."""
+        found, interval = (self.results,
+                           np.clip(np.minimum(self.intervals, usual_intervals),
+                                   MIN_SAMPLE_INTERVAL, None))
         moving = list[Epoch]()
         for epoch in self.epochs:
-            here = slice(max(epoch.place, 0), epoch.end)
+            here = slice(max(epoch.start_index, 0), epoch.end_index)
             if here.stop <= here.start:
                 continue
-            drift, rows = epoch.drift, self.seen[1:][here]
-            (offset, variance), (values, covariance, shared) = drift.offset, drift.values
+            drift, rows = epoch.state, self.used_sensitivity[1:][here]
+            (offset, variance), (values, covariance, shared) = (
+                drift.wander_rate, drift.calibration_errors)
             found[here, 3] = (variance + ((rows @ covariance - 2.0 * shared) * rows).sum(axis=1)
                               + drift.noise.angle_random_walk ** 2
-                              / (WINDOW if epoch.resting else interval[here]))
-            found[here, 4] = epoch.resting
-            if epoch.resting:
+                              / (WINDOW_DURATION if epoch.is_resting else interval[here]))
+            found[here, 4] = epoch.is_resting
+            if epoch.is_resting:
                 found[here, :3] = epoch.heading, (
-                    float(drift.covariance[HEADING, HEADING]) + epoch.pending ** 2), 0.0
+                    float(drift.covariance[HEADING_INDEX, HEADING_INDEX])
+                    + epoch.pending ** 2), 0.0
                 continue
             moving.append(epoch)
             found[here, 2] = self.rate[here] + rows @ values - offset
-            pending, turned = np.empty(epoch.end - epoch.place), np.empty(epoch.end - epoch.place)
-            inside = slice(epoch.place + 1, epoch.end)
-            pending[0], pending[1:] = epoch.pending, self._kept[inside]
+            pending, turned = (np.empty(epoch.end_index - epoch.start_index),
+                               np.empty(epoch.end_index - epoch.start_index))
+            inside = slice(epoch.start_index + 1, epoch.end_index)
+            pending[0], pending[1:] = epoch.pending, self._pending_retention[inside]
             np.cumprod(pending, out=pending)
-            turned[0], turned[1:] = epoch.heading + epoch.pending, self.turned[inside]
-            turned[1:] += self.halves[inside] * (
-                (self.seen[1:][inside] + self.seen[:-1][inside]) @ values - 2.0 * offset)
+            turned[0], turned[1:] = epoch.heading + epoch.pending, self.angles[inside]
+            turned[1:] += self.half_intervals[inside] * (
+                (self.used_sensitivity[1:][inside] + self.used_sensitivity[:-1][inside]) @ values
+                - 2.0 * offset)
             np.cumsum(turned, out=turned)
-            first = here.start - epoch.place
+            first = here.start - epoch.start_index
             found[here, 0] = (turned - pending)[first:]
             found[here, 1] = pending[first:] ** 2
         if moving:
@@ -461,12 +488,13 @@ class EvenSamples:
 
     def _add_variances(self, epochs: list[Epoch]) -> None:
         """Add the variance of the heading in epochs of motion."""
-        opens = [(epoch.drift, turn) for epoch in epochs for _, turn in epoch.opens]
+        opens = [(epoch.state, turn) for epoch in epochs for _, turn in epoch.open_integrals]
         known = heading_variances(*map(list, zip(*opens)))
         white = [drift.noise.angle_random_walk ** 2 for drift, _ in opens]
-        places = np.array([place for epoch in epochs for place, _ in epoch.opens])
+        places = np.array([place for epoch in epochs for place, _ in epoch.open_integrals])
         until = np.append(np.cumsum(self.intervals), 0.0)  # the last is that of the place -1
-        rows = np.concatenate([np.arange(max(epoch.place, 0), epoch.end) for epoch in epochs])
+        rows = np.concatenate(
+            [np.arange(max(epoch.start_index, 0), epoch.end_index) for epoch in epochs])
         block = np.searchsorted(places, rows, side='right') - 1
-        self.found[rows, 1] += known[block] + np.array(white)[block] * (
+        self.results[rows, 1] += known[block] + np.array(white)[block] * (
             until[rows] - until[places[block]])

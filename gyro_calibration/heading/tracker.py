@@ -24,61 +24,67 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
-from gyro_calibration.heading.gaps import CLOSE, FASTEST, Gaps, LONGEST
+from gyro_calibration.heading.gaps import GapModel, MAX_GAP, MAX_RATE, TIME_TOLERANCE
 from gyro_calibration.heading.integration import Threshold, ThresholdFilter
-from gyro_calibration.heading.kalman import begin, Drift, HEADING, RateIntegral, WALK
+from gyro_calibration.heading.kalman import (
+    HEADING_INDEX,
+    HeadingState,
+    initial_state,
+    RateIntegral,
+    WALK_INDEX,
+)
 from gyro_calibration.heading.stationary import (
-    BEGINS,
-    BLOCK,
     Block,
-    Energy,
+    BLOCK_DURATION,
+    EnergyDetector,
     Epoch,
     EvenSamples,
-    LAGS,
-    most_scatter,
+    MEAN_LAGS,
+    mean_threshold_sigmas,
+    RestScatter,
     Samples,
-    SCATTERED,
-    SCATTERS,
-    SETTLING,
-    sigmas,
+    SCATTER_LAGS,
+    SCATTER_ONSET_THRESHOLD,
+    SCATTER_RATIOS,
+    scatter_threshold,
+    SETTLING_TIME,
     SlowTurn,
     Snapshot,
-    StraightDrives,
-    WINDOW,
+    WINDOW_DURATION,
 )
-from gyro_calibration.logs.log import Array, DEGREE, SHORTEST
+from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
 #: larger change that is reversed in the next sample is an outlier.
-JUMP, ACCELERATION = 0.5, 200.0
+MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
 #: Longest step of the state, s.
-_STEP = 1.0
+_STEP_DURATION = 1.0
 #: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
-_FAR = 4.0
+_BIAS_MARGIN_SIGMAS = 4.0
 #: Shortest rest without a sudden end, s.
-_BRIEF = 2.0
+_MIN_REST_DURATION = 2.0
 #: Change of the bias that is assumed while the wheels stand, rad/s; largest delay of odometry
 #: after the begin of a turn, s.
-_UNSEEN, _LATE_WHEELS = 0.2 * DEGREE, 4.0
+_WHEEL_BIAS_CHANGE, _WHEEL_DELAY = 0.2 * DEGREE, 4.0
 #: Tolerance of the noise figures: factor of the noise of the samples to that of the model from
 #: which on it is used, and factor of the thresholds of means.
-_ALLOWED = 1.25
+_NOISE_TOLERANCE = 1.25
 #: A steady turn slower than so many times the slowest detectable one may be a change of the bias;
 #: it is attributed to the bias after this time, s.
-_SLOW_TURN, _DECIDED = 1.5, 2.0 * LAGS[-1]
+_SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, 2.0 * MEAN_LAGS[-1]
 #: When the detection of rest restarts, a pending correction is delayed by this time, s, so that a
 #: continued rest is detected first.
-_RECOGNIZED = 1.0
+_RECOGNITION_TIME = 1.0
 #: Samples of a log in one chunk.
-_AT_ONCE = 1 << 15
+_CHUNK_SAMPLES = 1 << 15
 #: Last blocks of a rest in memory, among which its end is located.
-_BLOCKS = round((2.0 * _STEP + WINDOW) / BLOCK)
+_MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
 #: States of a rest in memory.
-_SNAPSHOTS = round(LAGS[-1] / _STEP) + 8
+_MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 8
 #: Sigmas of a power of 95 %, for the slowest detectable turn.
-_POWER = 1.645
+_POWER_SIGMAS = 1.645
 
 
 @dataclass(frozen=True)
@@ -101,13 +107,13 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Step:
+class TrackStep:
     """A part of the drive: state before it, integral of the rates, rest or motion, end in s."""
 
-    before: Drift
-    turn: RateIntegral
-    resting: bool
-    end: float
+    state_before: HeadingState
+    rate_integral: RateIntegral
+    is_resting: bool
+    end_time: float
 
 
 class HeadingTracker:
@@ -118,19 +124,21 @@ class HeadingTracker:
     ----------
     heading : published heading, rad, continuous, not wrapped
     rate : rad/s; zero at rest
-    resting : whether the robot is at rest
-    deleted : heading attributed to bias or noise at rest, or deleted by the threshold filter, rad
+    is_resting : whether the robot is at rest
+    deleted_heading : heading attributed to bias or noise at rest, or deleted by the threshold
+        filter, rad
     intervals : of the samples, with the number of lost ones
-    refused : number of samples beyond the largest rate; they count as lost
-    outliers : number of samples beyond the largest acceleration; they count as lost
-    rebuilt : number of times that the state was not finite and was initialized again
+    refused_count : number of samples beyond the largest rate; they count as lost
+    outlier_count : number of samples beyond the largest acceleration; they count as lost
+    rebuild_count : number of times that the state was not finite and was initialized again
     steps : the drive so far, if it is kept
-    renewed : numbers of steps before another calibration was used, and the state before it
+    recalibrations : numbers of steps before another calibration was used, and the state before it
 
     """
 
     def __init__(self, noise: Noise, covariance: Array, settings: Settings,
-                 age: float | None = 0.0, keep: bool = False, per_rate: Array | None = None):
+                 age: float | None = 0.0, keeps_steps: bool = False,
+                 sensitivity_slope: Array | None = None):
         """
         Begin at heading zero.
 
@@ -139,68 +147,75 @@ class HeadingTracker:
         noise : of the model
         covariance : of the calibration, shape (m, m), from `compensation.covariance`
         age : of the self-calibration, whose s and b are the last values, s; None without one
-        keep : the `steps`, for `smoothed`
-        per_rate : change of the sensitivity with the rate, shape (m,): the rates include the bias
-            estimated at rest, on which a scale factor error does not act
+        keeps_steps : the `steps`, for `smoothed`
+        sensitivity_slope : change of the sensitivity with the rate, shape (m,): the rates include
+            the bias estimated at rest, on which a scale factor error does not act
 
         """
-        self._per_rate = per_rate
-        self.heading = self.rate = self.deleted = 0.0
-        self.resting, self.steps, self._keep, self._interval = False, list[Step](), keep, math.inf
-        self.renewed = list[tuple[int, Drift]]()
-        self._wanted, self._held, self._pending = WINDOW, RateIntegral(0.0, 0.0, np.zeros(0)), 0.0
-        self._blocks, self._sure = deque[RateIntegral](maxlen=_BLOCKS), False
-        self._known: float | None = None
-        self._slow: SlowTurn | None = None
-        self._last: tuple[float, float, float, Array] | None = None
-        self._reached = self._hesitates = 0.0
-        self._drives, self.outliers, self._taken = StraightDrives(), 0, 0
-        self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
+        self._sensitivity_slope = sensitivity_slope
+        self.heading = self.rate = self.deleted_heading = 0.0
+        self.is_resting, self.steps, self._keeps_steps, self._interval = (
+            False, list[TrackStep](), keeps_steps, math.inf)
+        self.recalibrations = list[tuple[int, HeadingState]]()
+        self._quiet_duration, self._held_integral, self._pending_correction = (
+            WINDOW_DURATION, RateIntegral(0.0, 0.0, np.zeros(0)), 0.0)
+        self._rest_blocks, self._wheels_stand = deque[RateIntegral](maxlen=_MAX_REST_BLOCKS), False
+        self._open_variance: float | None = None
+        self._suspected_turn: SlowTurn | None = None
+        self._last_sample: tuple[float, float, float, Array] | None = None
+        self._last_time = self._recognition_left = 0.0
+        self._rest_scatter, self.outlier_count, self._state_version = RestScatter(), 0, 0
+        self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
         # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump.
-        self._leap = -math.inf, 0.0
-        self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
-        self._seen: Array | None = None
-        self._biased: Array | None = None
-        self._seen_off, self._bias_seen = 0.0, (0.0, 0.0)
-        self._still: Array | None = None
-        self._gaps, self._energy, self._tested = (
-            Gaps(noise), Energy(noise, settings.false_alarms), (noise, settings.false_alarms))
+        self._before_last_jump = -math.inf, 0.0
+        self.refused_count, self.rebuild_count, self._rebuild_message = 0, 0, ''
+        self._last_finite_heading = 0.0, 0.0
+        self._error_sensitivity: Array | None = None
+        self._bias_sensitivity: Array | None = None
+        self._cached_rate_error, self._cached_bias = 0.0, (0.0, 0.0)
+        self._still_sensitivity: Array | None = None
+        self._gaps, self._energy, self._detector_settings = (GapModel(noise),
+                                                             EnergyDetector(
+                                                                 noise, settings.false_alarms),
+                                                             (noise, settings.false_alarms))
         self.intervals = self._gaps.intervals
-        self._begin(noise, covariance, 0.0, 0.0, age)
-        self.set(settings)
+        self._initialize_state(noise, covariance, 0.0, 0.0, age)
+        self.configure(settings)
 
-    def _begin(self, noise: Noise, covariance: Array, heading: float, variance: float,
-               age: float | None) -> None:
-        self._claimed, self._calibrated = noise, (covariance, age)
-        self._drift = begin(noise, covariance, heading, variance, age if len(covariance) else None)
-        self._nothing = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
-        self._part, self._open = self._none(), self._nothing
+    def _initialize_state(self, noise: Noise, covariance: Array, heading: float, variance: float,
+                          age: float | None) -> None:
+        self._model_noise, self._calibration = noise, (covariance, age)
+        self._state = initial_state(noise, covariance, heading, variance,
+                                    age if len(covariance) else None)
+        self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
+        self._block_integral, self._open_integral = self._new_integral(), self._zero_integral
 
-    def _none(self) -> RateIntegral:
-        return RateIntegral(0.0, 0.0, self._nothing.sensitivity)
+    def _new_integral(self) -> RateIntegral:
+        return RateIntegral(0.0, 0.0, self._zero_integral.sensitivity)
 
-    def set(self, settings: Settings) -> None:  # noqa: A003
+    def configure(self, settings: Settings) -> None:  # noqa: A003
         """Go on with other settings."""
         self._settings = settings
-        self._seeks = settings.false_alarms > 0.0 and self._claimed.angle_random_walk > 0.0
-        rests = (self.resting and self._seeks
-                 and self._tested == (self._claimed, settings.false_alarms))
-        if self._tested != (self._claimed, settings.false_alarms):
-            self._tested = self._claimed, settings.false_alarms
-            self._energy = Energy(*self._tested)
-        self._block, self._driven = Block(), False
-        self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._seeks
+        self._detects_rest = (settings.false_alarms > 0.0
+                              and self._model_noise.angle_random_walk > 0.0)
+        rests = (self.is_resting and self._detects_rest
+                 and self._detector_settings == (self._model_noise, settings.false_alarms))
+        if self._detector_settings != (self._model_noise, settings.false_alarms):
+            self._detector_settings = self._model_noise, settings.false_alarms
+            self._energy = EnergyDetector(*self._detector_settings)
+        self._block, self._wheels_moved = Block(), False
+        self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._detects_rest
                                        else settings.threshold)
-        self._sigmas = {lag: _ALLOWED * sigmas(lag, settings.false_alarms)
-                        for lag in (WINDOW, *LAGS)} if self._seeks else {}
+        self._sigmas = {lag: _NOISE_TOLERANCE * mean_threshold_sigmas(lag, settings.false_alarms)
+                        for lag in (WINDOW_DURATION, *MEAN_LAGS)} if self._detects_rest else {}
         if rests:
-            self._rest()
+            self._enter_rest()
         else:
-            self._recognize()
-        self._take()
+            self._search_rest_again()
+        self._adopt_state()
 
-    def use(self, noise: Noise, covariance: Array, age: float | None = 0.0,
-            per_rate: Array | None = None) -> None:
+    def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0,
+                        sensitivity_slope: Array | None = None) -> None:
         """
         Continue with other noise figures and another calibration.
 
@@ -208,50 +223,55 @@ class HeadingTracker:
         of the heading by it remain.
 
         """
-        heading, variance = self.heading + self._pending, self.variance - self._pending ** 2
-        if self._keep and self._last is not None:
-            drift, turn = self._drift, self._open + self._part
-            self._go_on(self._at_rest(turn) if self.resting else turn, self._reached)
-            self.renewed.append((len(self.steps), self._drift))
-            self._drift = drift
-        self._still, self._per_rate = None, per_rate
-        if self._last is not None:
-            self._last = (*self._last[:3], np.zeros(len(covariance)))
+        heading, variance = (self.heading + self._pending_correction,
+                             self.variance - self._pending_correction ** 2)
+        if self._keeps_steps and self._last_sample is not None:
+            drift, turn = self._state, self._open_integral + self._block_integral
+            self._propagate_state(
+                self._with_still_sensitivity(turn) if self.is_resting else turn, self._last_time)
+            self.recalibrations.append((len(self.steps), self._state))
+            self._state = drift
+        self._still_sensitivity, self._sensitivity_slope = None, sensitivity_slope
+        if self._last_sample is not None:
+            self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
         self._energy.clear()
-        self._begin(noise, covariance, heading, variance, age)
-        self.set(self._settings)
+        self._initialize_state(noise, covariance, heading, variance, age)
+        self.configure(self._settings)
 
     def reset(self) -> None:
         """Set the heading to zero, without uncertainty."""
-        self._settle()
-        self.heading = self.deleted = 0.0
-        self._drift = self._drift.turned_to(0.0)
-        if self._slow:
+        self._advance_to_last_sample()
+        self.heading = self.deleted_heading = 0.0
+        self._state = self._state.with_heading(0.0)
+        if self._suspected_turn:
             # if the turn was a change of the bias, the heading was the same at its begin
-            self._slow.before = replace(
-                self._slow.before, drift=self._slow.before.drift.turned_to(0.0), deleted=0.0)
-        self._take()
-        if self.resting:
-            self._rest()
+            self._suspected_turn.snapshot = replace(
+                self._suspected_turn.snapshot,
+                state=self._suspected_turn.snapshot.state.with_heading(0.0), deleted_heading=0.0)
+        self._adopt_state()
+        if self.is_resting:
+            self._enter_rest()
 
-    def rewind(self, heading: float, variance: float) -> None:
+    def set_heading(self, heading: float, variance: float) -> None:
         """Set the heading, rad, and its variance, rad²; the bias estimate remains."""
-        self._settle()
-        self._recognize()
-        self.heading, self._slow = heading, None
-        self._drift = self._drift.turned_to(heading, variance)
-        self._take()
+        self._advance_to_last_sample()
+        self._search_rest_again()
+        self.heading, self._suspected_turn = heading, None
+        self._state = self._state.with_heading(heading, variance)
+        self._adopt_state()
 
     @property
     def variance(self) -> float:
         """Return the variance of the heading, rad², with the square of a pending correction."""
-        if self.resting:
-            return float(self._drift.covariance[HEADING, HEADING]) + self._pending ** 2
-        if self._known is None:
-            self._known = self._drift.heading_variance(self._moving(self._open))
-        part = self._part
-        return (self._known + self._drift.noise.angle_random_walk ** 2 * part.duration
-                + part.lost + part.noise + self._pending ** 2)
+        if self.is_resting:
+            return (float(self._state.covariance[HEADING_INDEX, HEADING_INDEX])
+                    + self._pending_correction ** 2)
+        if self._open_variance is None:
+            self._open_variance = self._state.heading_variance(
+                self._with_unbiased_sensitivity(self._open_integral))
+        part = self._block_integral
+        return (self._open_variance + self._state.noise.angle_random_walk ** 2 * part.duration
+                + part.lost_variance + part.extra_noise_variance + self._pending_correction ** 2)
 
     # Samples
 
@@ -276,64 +296,70 @@ class HeadingTracker:
         '', or why the integration was restarted with this sample
 
         """
-        if not -FASTEST < rate < FASTEST:
-            self.refused += 1
+        if not -MAX_RATE < rate < MAX_RATE:
+            self.refused_count += 1
             return ''
-        spike, self._spike = self._spike, None
-        if self._last is not None and self._jumps(time, rate):
+        spike, self._held_jump = self._held_jump, None
+        if self._last_sample is not None and self._is_jump(time, rate):
             if spike is None:
-                self._spike = time, rate, sensitivity, wheels, still
+                self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
             # the jump is permanent; its time between the samples is not known
-            self._part.lost += (0.5 * (spike[1] - self._last[1]) * (spike[0] - self._last[0])) ** 2
+            self._block_integral.lost_variance += ((0.5 * (spike[1] - self._last_sample[1]) *
+                                                    (spike[0] - self._last_sample[0])) ** 2)
             # a rate between two jumps within 2 s may be erroneous
-            begun, before = self._leap
-            if 0.0 < spike[0] - begun < _BRIEF:
-                self._part.lost += ((self._last[1] - before) * (spike[0] - begun)) ** 2
-            self._leap = self._last[:2]
-            self._add(*spike)
+            begun, before = self._before_last_jump
+            if 0.0 < spike[0] - begun < _MIN_REST_DURATION:
+                self._block_integral.lost_variance += (((self._last_sample[1] - before) *
+                                                        (spike[0] - begun)) ** 2)
+            self._before_last_jump = self._last_sample[:2]
+            self._take_sample(*spike)
         elif spike is not None:
-            self.outliers += 1
-        return self._add(time, rate, sensitivity, wheels, still)
+            self.outlier_count += 1
+        return self._take_sample(time, rate, sensitivity, wheels, still)
 
-    def _jumps(self, time: float, rate: float) -> bool:
+    def _is_jump(self, time: float, rate: float) -> bool:
         """Tell whether the rate changed by more than a robot can since the last sample."""
-        if self._last is None:
+        if self._last_sample is None:
             return False
-        interval, step = time - self._last[0], abs(rate - self._last[1])
-        return (step > JUMP and step > JUMP + ACCELERATION * interval
+        interval, step = time - self._last_sample[0], abs(rate - self._last_sample[1])
+        return (step > MAX_RATE_STEP and step > MAX_RATE_STEP + MAX_ACCELERATION * interval
                 and 0.0 <= interval <= self._settings.maximum_gap)
 
-    def _add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
-             still: Array | None, lost: int | None = None) -> str:
+    def _take_sample(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
+                     still: Array | None, lost: int | None = None) -> str:
         """Take a sample; `lost` is the number of lost samples before it, if known already."""
-        self._still = still
-        filtered = self._filter.filter(time, rate)
-        last, self._last = self._last, (time, rate, filtered, sensitivity)
+        self._still_sensitivity = still
+        filtered = self._filter.apply(time, rate)
+        last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
         if last is None:
-            self._reached, self.rate = time, rate - self._off(sensitivity)
+            self._last_time, self.rate = time, rate - self._rate_error(sensitivity)
             return ''
         interval = time - last[0]
         if interval < 0.0 or interval > self._settings.maximum_gap:
-            message = self._restart(interval, max(abs(rate), abs(last[1])), wheels is not False)
-            self.rate = rate - self._off(sensitivity)
+            message = self._restart_after_gap(interval, max(abs(rate), abs(last[1])),
+                                              wheels is not False)
+            self.rate = rate - self._rate_error(sensitivity)
             return message
-        self._interval, self._reached = interval, time
+        self._interval, self._last_time = interval, time
         self._integrate(interval, last)
         gap = None if lost == 0 else self._gaps.add(interval, rate, last[1], lost)
         if gap is not None and (filtered == rate or last[2] == last[1]):
-            self._part.lost += gap.motion
-            self._part.noise += gap.noise
-        if self._seeks:
-            self._look(interval if gap is None else interval - gap.duration, last[1], wheels)
-        elif self._part.duration >= BLOCK - CLOSE:
-            self._open, self._part, self._known = self._open + self._part, self._none(), None
-            if self._open.duration >= _STEP - CLOSE:
-                self._advance()
-        self.rate = 0.0 if self.resting or filtered != rate else rate - self._off(sensitivity)
+            self._block_integral.lost_variance += gap.motion_variance
+            self._block_integral.extra_noise_variance += gap.noise_variance
+        if self._detects_rest:
+            self._detect_motion(interval if gap is None else interval - gap.duration, last[1],
+                                wheels)
+        elif self._block_integral.duration >= BLOCK_DURATION - TIME_TOLERANCE:
+            self._open_integral, self._block_integral, self._open_variance = (
+                self._open_integral + self._block_integral, self._new_integral(), None)
+            if self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
+                self._advance_state()
+        self.rate = (0.0 if self.is_resting or filtered != rate else rate
+                     - self._rate_error(sensitivity))
         if not -math.inf < self.heading + self.rate < math.inf:
-            self._rebuild()
-        message, self._mended = self._mended, ''
+            self._rebuild_state()
+        message, self._rebuild_message = self._rebuild_message, ''
         return message
 
     # Many samples at once
@@ -361,213 +387,229 @@ class HeadingTracker:
                         wheels, still)
         found, begin = np.empty((len(time), 5)), 0
         while begin < len(time):
-            count = self._even(time[begin:begin + _AT_ONCE], rate[begin:begin + _AT_ONCE])
+            count = self._count_even(time[begin:begin + _CHUNK_SAMPLES],
+                                     rate[begin:begin + _CHUNK_SAMPLES])
             if count:
-                begin = self._follow_even(given, begin, begin + count, found)
+                begin = self._follow_even_samples(given, begin, begin + count, found)
             else:
-                self.add(*given.sample(begin, self.resting))
-                found[begin] = self._found()
+                self.add(*given.sample(begin, self.is_resting))
+                found[begin] = self._result_row()
                 begin += 1
         return found
 
-    def _found(self) -> tuple[float, float, float, float, bool]:
-        return self.heading, self.variance, self.rate, self.rate_variance, self.resting
+    def _result_row(self) -> tuple[float, float, float, float, bool]:
+        return self.heading, self.variance, self.rate, self.rate_variance, self.is_resting
 
-    def _even(self, time: Array, rate: Array) -> int:
+    def _count_even(self, time: Array, rate: Array) -> int:
         """Return how many samples come without a jump of stamps or rates."""
-        if not self._seeks or self._last is None or self._spike is not None:
+        if not self._detects_rest or self._last_sample is None or self._held_jump is not None:
             return 0
-        intervals = np.diff(time, prepend=self._last[0])
+        intervals = np.diff(time, prepend=self._last_sample[0])
         with np.errstate(invalid='ignore'):
-            steps = np.abs(np.diff(rate, prepend=self._last[1]))
-            even = ((np.abs(rate) < FASTEST) & (intervals >= 0.0)
+            steps = np.abs(np.diff(rate, prepend=self._last_sample[1]))
+            even = ((np.abs(rate) < MAX_RATE) & (intervals >= 0.0)
                     & (intervals <= self._settings.maximum_gap)
-                    & (steps <= JUMP + ACCELERATION * intervals))
+                    & (steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals))
         return len(even) if even.all() else int(np.argmin(even))
 
-    def _follow_even(self, given: Samples, begin: int, end: int, found: Array) -> int:
+    def _follow_even_samples(self, given: Samples, begin: int, end: int, found: Array) -> int:
         """Take samples without jumps up to the next lost ones; return the index after the last."""
-        assert self._last is not None
+        assert self._last_sample is not None
         usual, lost = self.intervals.add_many(
-            np.diff(given.time[begin:end], prepend=self._last[0]))
+            np.diff(given.time[begin:end], prepend=self._last_sample[0]))
         count = len(usual) - bool(lost)
         if count:
-            piece = EvenSamples(given, slice(begin, begin + count), self._last,
-                                self._block.duration, self.resting,
+            piece = EvenSamples(given, slice(begin, begin + count), self._last_sample,
+                                self._block.duration, self.is_resting,
                                 found[begin:begin + count])
-            self._gaps.add_many(piece.intervals, piece.rate, self._last[1])
+            self._gaps.add_many(piece.intervals, piece.rate, self._last_sample[1])
             if not self._block.duration:
-                piece.epochs.append(self._epoch(-1))
-            for number, until in enumerate(piece.ends):
-                if number in piece.whole and self._take_block(piece, number):
-                    if self._taken != piece.epochs[-1].taken:
-                        piece.close(until - 1)
-                        piece.epochs.append(self._epoch(until - 1))
-                    elif not self.resting:
-                        piece.epochs[-1].opens.append((until - 1, self._moving(self._open)))
+                piece.epochs.append(self._new_epoch(-1))
+            for number, until in enumerate(piece.block_stops):
+                if number in piece.whole_blocks and self._take_block(piece, number):
+                    if self._state_version != piece.epochs[-1].state_version:
+                        piece.close_epoch(until - 1)
+                        piece.epochs.append(self._new_epoch(until - 1))
+                    elif not self.is_resting:
+                        piece.epochs[-1].open_integrals.append(
+                            (until - 1, self._with_unbiased_sensitivity(self._open_integral)))
                     continue
-                piece.close(piece.begins[number])
-                for place in range(piece.begins[number], until):
-                    piece.rested = self.resting
-                    sample = given.sample(begin + place, self.resting)
-                    piece.seen[place + 1] = sample[2]
-                    self._add(*sample, lost=0)
-                    found[begin + place] = self._found()
+                piece.close_epoch(piece.block_starts[number])
+                for place in range(piece.block_starts[number], until):
+                    piece.last_at_rest = self.is_resting
+                    sample = given.sample(begin + place, self.is_resting)
+                    piece.used_sensitivity[place + 1] = sample[2]
+                    self._take_sample(*sample, lost=0)
+                    found[begin + place] = self._result_row()
                 if not self._block.duration:
-                    piece.epochs.append(self._epoch(until - 1))
+                    piece.epochs.append(self._new_epoch(until - 1))
             if not self._block.duration:
-                piece.close(count)
-            piece.fill(usual[:count])
-            self.rate = float(piece.found[-1, 2])
+                piece.close_epoch(count)
+            piece.fill_results(usual[:count])
+            self.rate = float(piece.results[-1, 2])
         if lost:
-            self._add(*given.sample(begin + count, self.resting), lost=lost)
-            found[begin + count] = self._found()
+            self._take_sample(*given.sample(begin + count, self.is_resting), lost=lost)
+            found[begin + count] = self._result_row()
         return begin + len(usual)
 
-    def _epoch(self, place: int) -> Epoch:
-        return Epoch(place, self._taken, self._drift, self.resting, self.heading, self._pending,
-                     [(place, self._moving(self._open))])
+    def _new_epoch(self, place: int) -> Epoch:
+        return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
+                     self._pending_correction,
+                     [(place, self._with_unbiased_sensitivity(self._open_integral))])
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
-        begin, end, moved = piece.begins[number], piece.ends[number], piece.moved(number)
+        begin, end, moved = (piece.block_starts[number], piece.block_stops[number],
+                             piece.wheels_in_block(number))
         driven = True in moved
-        if self.resting:
-            highest, lowest = piece.extremes(number, self._offset, self._values, self._taken)
-            limit = math.hypot(self._energy.sudden(), self._unsure)
+        if self.is_resting:
+            highest, lowest = piece.corrected_extremes(
+                number, self._wander_rate, self._calibration_errors, self._state_version)
+            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
             if driven or highest > limit or lowest < -limit:
                 return False
-        elif self._hesitates > 0.0:
+        elif self._recognition_left > 0.0:
             return False
-        part, block, sums = self._part, self._block, piece.sums[number]
-        rows = piece.resting if self.resting else piece.moving
-        part.duration, part.turned, decayed, block.total, block.squares, block.differences = sums
-        part.sensitivity = piece.weighted[self.resting][number]
-        if self.resting != piece.rested:
-            assert self._last is not None
-            part.sensitivity = (part.sensitivity
-                                + piece.halves[begin] * (self._last[3] - rows[begin - 1]))
-            piece.rested = self.resting
+        part, block, sums = self._block_integral, self._block, piece.block_sums[number]
+        rows = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
+        part.duration, part.angle, decayed, *block_sums = sums
+        block.rate_sum, block.square_sum, block.difference_square_sum = block_sums
+        part.sensitivity = piece.sensitivity_integrals[self.is_resting][number]
+        if self.is_resting != piece.last_at_rest:
+            assert self._last_sample is not None
+            part.sensitivity = (part.sensitivity + piece.half_intervals[begin] *
+                                (self._last_sample[3] - rows[begin - 1]))
+            piece.last_at_rest = self.is_resting
         block.duration, block.count = part.duration, end - begin
-        turned = self._corrected(part)
-        if self.resting:
-            self.deleted += turned
+        turned = self._corrected_angle(part)
+        if self.is_resting:
+            self.deleted_heading += turned
         else:
-            self.heading += turned + self._pending * (1.0 - decayed)
-            self._pending *= decayed
+            self.heading += turned + self._pending_correction * (1.0 - decayed)
+            self._pending_correction *= decayed
         time, rate = float(piece.time[end - 1]), float(piece.rate[end - 1])
-        self._last = time, rate, rate, rows[end - 1]
-        self._interval, self._reached = float(piece.intervals[end - 1]), time
-        self._still = piece.still(end - 1)
+        self._last_sample = time, rate, rate, rows[end - 1]
+        self._interval, self._last_time = float(piece.intervals[end - 1]), time
+        self._still_sensitivity = piece.still(end - 1)
         self._end_block(driven, moved[-1] if moved else None)
         if not -math.inf < self.heading < math.inf:
-            self._rebuild()
+            self._rebuild_state()
         return True
 
-    def _off(self, sensitivity: Array) -> float:
+    def _rate_error(self, sensitivity: Array) -> float:
         """Return the error of a rate as estimated at rest, rad/s; cached for one sensitivity."""
-        if sensitivity is not self._seen:
-            self._seen, self._seen_off = (
-                sensitivity, self._offset - float(sensitivity @ self._values))
-        return self._seen_off
+        if sensitivity is not self._error_sensitivity:
+            self._error_sensitivity, self._cached_rate_error = (
+                sensitivity, self._wander_rate - float(sensitivity @ self._calibration_errors))
+        return self._cached_rate_error
 
     def _integrate(self, interval: float, last: tuple[float, float, float, Array]) -> None:
         """Integrate the heading up to the last sample."""
-        assert self._last is not None
+        assert self._last_sample is not None
         (_, rate, filtered, sensitivity), (_, last_rate, last_filtered, last_sensitivity) = (
-            self._last, last)
+            self._last_sample, last)
         half = 0.5 * interval
         kept, last_kept = half * (filtered == rate), half * (last_filtered == last_rate)
         duration, turned = kept + last_kept, half * (filtered + last_filtered)
         if sensitivity is last_sensitivity:
-            seen, corrected = duration * sensitivity, turned - duration * self._off(sensitivity)
+            seen, corrected = (duration * sensitivity,
+                               turned - duration * self._rate_error(sensitivity))
         else:
             seen = kept * sensitivity + last_kept * last_sensitivity
-            corrected = turned - duration * self._offset + float(seen @ self._values)
-        part = self._part
+            corrected = (turned - duration * self._wander_rate
+                         + float(seen @ self._calibration_errors))
+        part = self._block_integral
         part.duration += duration
-        part.turned += turned
+        part.angle += turned
         part.sensitivity = part.sensitivity + seen
-        if self.resting:
-            self.deleted += corrected
+        if self.is_resting:
+            self.deleted_heading += corrected
             return
-        self.deleted += half * (rate - filtered + last_rate - last_filtered)
-        if self._hesitates > 0.0:
-            self._hesitates -= interval
+        self.deleted_heading += half * (rate - filtered + last_rate - last_filtered)
+        if self._recognition_left > 0.0:
+            self._recognition_left -= interval
             settled = 0.0
         else:
-            settled = self._pending * duration / SETTLING
-            self._pending -= settled
+            settled = self._pending_correction * duration / SETTLING_TIME
+            self._pending_correction -= settled
         self.heading += corrected + settled
 
-    def _look(self, duration: float, before: float, wheels: bool | None) -> None:
+    def _detect_motion(self, duration: float, before: float, wheels: bool | None) -> None:
         """Detect sudden motion at each sample, and slower motion at the end of each block."""
-        assert self._last is not None
-        _, rate, _, sensitivity = self._last
+        assert self._last_sample is not None
+        _, rate, _, sensitivity = self._last_sample
         self._block.add(duration, rate, before)
-        if self.resting and (wheels or abs(rate - self._off(sensitivity))
-                             > math.hypot(self._energy.sudden(), self._unsure)):
-            self._notice(0.0)
-        self._driven = self._driven or bool(wheels)
-        if self._block.duration >= BLOCK - CLOSE:
-            self._end_block(self._driven, wheels)
+        if self.is_resting and (wheels or abs(rate - self._rate_error(sensitivity))
+                                > math.hypot(self._energy.sudden_limit(), self._bias_margin)):
+            self._revert_to_motion(0.0)
+        self._wheels_moved = self._wheels_moved or bool(wheels)
+        if self._block.duration >= BLOCK_DURATION - TIME_TOLERANCE:
+            self._end_block(self._wheels_moved, wheels)
 
     def _end_block(self, driven: bool, wheels: bool | None) -> None:
         quiet = self._energy.add(self._block)
-        self._decide(False if driven else quiet, driven or wheels)
-        self._block, self._driven = Block(), False
+        self._decide_rest(False if driven else quiet, driven or wheels)
+        self._block, self._wheels_moved = Block(), False
 
-    def _decide(self, quiet: bool | None, wheels: bool | None) -> None:
+    def _decide_rest(self, quiet: bool | None, wheels: bool | None) -> None:
         """Decide on rest or motion at the end of a block."""
-        part, self._part, self._known = self._part, self._none(), None
-        self._open += part
-        if self.resting:
-            self._blocks.append(part)
-            self._sure = wheels is False
+        part, self._block_integral, self._open_variance = (
+            self._block_integral, self._new_integral(), None)
+        self._open_integral += part
+        if self.is_resting:
+            self._rest_blocks.append(part)
+            self._wheels_stand = wheels is False
             if quiet is False:
-                self._notice(WINDOW)
-            elif self._open.duration >= _STEP - CLOSE:
-                self._advance()
-                self._compare(wheels)
+                self._revert_to_motion(WINDOW_DURATION)
+            elif self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
+                self._advance_state()
+                self._compare_means(wheels)
             return
         if not quiet or wheels:
-            self._wanted, self._slow = WINDOW, None
+            self._quiet_duration, self._suspected_turn = WINDOW_DURATION, None
         if wheels:
             # a constant turn has the energy of a rest: no blocks are held while wheels move
-            self._move(WINDOW)
-        self._hold(part)
-        if self._open.duration >= self._held.duration + _STEP - CLOSE:
-            self._advance(self._held)
-        if quiet and self._stands(wheels):
-            self._advance(self._settled())
-            self._rest()
-            self._take()
-            self._blocks.extend([*self._recent][1:])
+            self._enter_motion(WINDOW_DURATION)
+        self._hold_block(part)
+        beyond = self._open_integral.duration - self._held_integral.duration
+        if beyond >= _STEP_DURATION - TIME_TOLERANCE:
+            self._advance_state(self._held_integral)
+        if quiet and self._is_mean_at_rest(wheels):
+            self._advance_state(self._held_rest_integral())
+            self._enter_rest()
+            self._adopt_state()
+            self._rest_blocks.extend([*self._recent_blocks][1:])
 
-    def _hold(self, part: RateIntegral) -> None:
+    def _hold_block(self, part: RateIntegral) -> None:
         """Hold the last blocks, which may be the begin of a rest."""
-        self._recent.append(part)
-        self._held += part
-        while (len(self._recent) > 2
-               and self._held.duration - self._recent[0].duration >= self._wanted - CLOSE):
-            self._held -= self._recent.popleft()
+        self._recent_blocks.append(part)
+        self._held_integral += part
+        while (len(self._recent_blocks) > 2
+               and self._held_integral.duration - self._recent_blocks[0].duration
+               >= self._quiet_duration - TIME_TOLERANCE):
+            self._held_integral -= self._recent_blocks.popleft()
 
-    def _settled(self) -> RateIntegral:
+    def _held_rest_integral(self) -> RateIntegral:
         """Return the held integral without its first block, in which the robot may move."""
-        return self._held - self._recent[0]
+        return self._held_integral - self._recent_blocks[0]
 
-    def _stands(self, wheels: bool | None) -> bool:
+    def _is_mean_at_rest(self, wheels: bool | None) -> bool:
         """Tell whether the mean over a quiet time of sufficient length is that of a rest."""
-        if self._held.duration < self._wanted - CLOSE or len(self._recent) < 2:
+        if (self._held_integral.duration < self._quiet_duration - TIME_TOLERANCE
+                or len(self._recent_blocks) < 2):
             return False
-        most = self._sigmas[self._wanted] * (1.0 if self._wanted == WINDOW else 0.5)
-        stands = abs(self._surprise(self._drift, self._at_rest(self._settled()),
-                                    _UNSEEN if wheels is False else 0.0)) < most
-        if not stands and self._wanted > WINDOW and not self._drifted():
-            self._move(self._wanted)
+        most = (self._sigmas[self._quiet_duration] *
+                (1.0 if self._quiet_duration == WINDOW_DURATION else 0.5))
+        stands = abs(
+            self._normalized_innovation(self._state,
+                                        self._with_still_sensitivity(self._held_rest_integral()),
+                                        _WHEEL_BIAS_CHANGE if wheels is False else 0.0)) < most
+        if (not stands and self._quiet_duration > WINDOW_DURATION
+                and not self._accept_slow_turn_as_bias()):
+            self._enter_motion(self._quiet_duration)
         return stands
 
-    def _drifted(self) -> bool:
+    def _accept_slow_turn_as_bias(self) -> bool:
         """
         Attribute a slow turn of constant rate to a change of the bias at rest; tell whether so.
 
@@ -575,48 +617,50 @@ class HeadingTracker:
         than the model states would cause a permanent drift of the heading at rest.
 
         """
-        slow, held = self._slow, self._at_rest(self._held)
-        if slow is None:
+        suspected, held = self._suspected_turn, self._with_still_sensitivity(self._held_integral)
+        if suspected is None:
             return False
-        start = slow.before.drift.uncertain(WALK, slow.rate ** 2)
-        moved = start.rested(self._at_rest(slow.turn))
-        if (slow.turn.duration + held.duration < _DECIDED
-                or abs(self._surprise(moved, held)) > self._sigmas[self._wanted]):
-            slow.turn += held
+        start = suspected.snapshot.state.with_added_variance(WALK_INDEX, suspected.rate ** 2)
+        moved = start.advance_at_rest(self._with_still_sensitivity(suspected.rate_integral))
+        if (suspected.rate_integral.duration + held.duration < _SLOW_TURN_DECISION_TIME or abs(
+                self._normalized_innovation(moved, held)) > self._sigmas[self._quiet_duration]):
+            suspected.rate_integral += held
             return False
-        if self._keep:
-            assert self._last is not None
-            del self.steps[slow.before.steps:]
-            self.steps.append(Step(start, self._at_rest(slow.turn), True,
-                                   self._last[0] - self._part.duration - held.duration))
-        self._drift, self._open, self._slow = moved, self._held, None
-        self._rest()
-        self._take()
+        if self._keeps_steps:
+            assert self._last_sample is not None
+            del self.steps[suspected.snapshot.step_count:]
+            self.steps.append(
+                TrackStep(start, self._with_still_sensitivity(suspected.rate_integral), True,
+                          self._last_sample[0] - self._block_integral.duration - held.duration))
+        self._state, self._open_integral, self._suspected_turn = moved, self._held_integral, None
+        self._enter_rest()
+        self._adopt_state()
         return True
 
-    def _surprise(self, drift: Drift, turn: RateIntegral, unseen: float = 0.0) -> float:
+    def _normalized_innovation(self, drift: HeadingState, turn: RateIntegral,
+                               bias_change: float = 0.0) -> float:
         """Return the deviation of an integral from that at rest, in standard deviations."""
-        expected, variance = drift.expected(turn)
-        return (turn.turned - expected) / math.sqrt(variance + (unseen * turn.duration) ** 2)
+        expected, variance = drift.expected_rest_angle(turn)
+        return (turn.angle - expected) / math.sqrt(variance + (bias_change * turn.duration) ** 2)
 
-    def _compare(self, wheels: bool | None) -> None:
+    def _compare_means(self, wheels: bool | None) -> None:
         """Compare the means over the longer lags with the bias that was known before them."""
-        for lag in LAGS:
-            before = self._before(lag)
+        for lag in MEAN_LAGS:
+            before = self._snapshot_before(lag)
             if before is None:
                 return
-            turn = self._rested - before.turn
-            if abs(self._surprise(before.drift, turn)) > self._sigmas[lag]:
+            turn = self._rest_integral - before.rate_integral
+            if abs(self._normalized_innovation(before.state, turn)) > self._sigmas[lag]:
                 if wheels is False:
-                    if lag < _LATE_WHEELS:
+                    if lag < _WHEEL_DELAY:
                         continue
-                    expected, _ = before.drift.expected(turn)
-                    self._drift = self._drift.uncertain(
-                        WALK, ((turn.turned - expected) / turn.duration) ** 2)
-                    self._rest()
-                    self._take()
+                    expected, _ = before.state.expected_rest_angle(turn)
+                    self._state = self._state.with_added_variance(
+                        WALK_INDEX, ((turn.angle - expected) / turn.duration) ** 2)
+                    self._enter_rest()
+                    self._adopt_state()
                 else:
-                    self._notice(lag)
+                    self._revert_to_motion(lag)
                 return
         if wheels is not False:
             self._compare_scatter()
@@ -624,69 +668,81 @@ class HeadingTracker:
     def _compare_scatter(self) -> None:
         """Compare the scatter of the means over 1 s with the noise, over the longer lags."""
         last = self._snapshots[-1]
-        for lag in SCATTERED:
-            before = self._before(lag)
+        for lag in SCATTER_LAGS:
+            before = self._snapshot_before(lag)
             if before is None:
                 return
-            if last.squares - before.squares > _ALLOWED ** 2 * most_scatter(
-                    lag, last.means - before.means, self._settings.false_alarms):
-                self._notice(lag, max(self._snapshots, key=lambda each: (
-                    last.squares - each.squares - BEGINS * (last.means - each.means))))
+            limit = _NOISE_TOLERANCE ** 2 * scatter_threshold(
+                lag, last.innovation_count - before.innovation_count, self._settings.false_alarms)
+            if last.innovation_square_sum - before.innovation_square_sum > limit:
+                self._revert_to_motion(
+                    lag,
+                    max(
+                        self._snapshots, key=lambda each:
+                        (last.innovation_square_sum - each.innovation_square_sum -
+                         SCATTER_ONSET_THRESHOLD *
+                         (last.innovation_count - each.innovation_count))))
                 return
 
-    def _before(self, lag: float) -> Snapshot | None:
+    def _snapshot_before(self, lag: float) -> Snapshot | None:
         """Return the state `lag` s before the last step of this rest; None if before its begin."""
-        snapshots, until = self._snapshots, self._rested.duration - lag + CLOSE
-        if snapshots[0].turn.duration > until:
+        snapshots, until = self._snapshots, self._rest_integral.duration - lag + TIME_TOLERANCE
+        if snapshots[0].rate_integral.duration > until:
             return None
-        place = max(len(snapshots) - 1 - round(lag / _STEP), 0)
-        while place + 1 < len(snapshots) and snapshots[place + 1].turn.duration <= until:
+        place = max(len(snapshots) - 1 - round(lag / _STEP_DURATION), 0)
+        while place + 1 < len(snapshots) and snapshots[place + 1].rate_integral.duration <= until:
             place += 1
-        while snapshots[place].turn.duration > until:
+        while snapshots[place].rate_integral.duration > until:
             place -= 1
         return snapshots[place]
 
     # From rest to motion and back
 
-    def _rest(self) -> None:
+    def _enter_rest(self) -> None:
         """Begin a rest."""
-        self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
-        self._sure = False
-        self._blocks = deque(maxlen=_BLOCKS)
-        self._snapshots = [Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
+        self.is_resting, self._rest_integral, self._recognition_left = (
+            True, self._zero_integral, 0.0)
+        self._wheels_stand = False
+        self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
+        self._snapshots = [
+            Snapshot(self._state, self._zero_integral, self.deleted_heading, len(self.steps))
+        ]
 
-    def _move(self, wanted: float) -> None:
-        """Begin a motion, which lasts until the rate is quiet for `wanted` s."""
-        self.resting, self._wanted, self._recent, self._held = (
-            False, wanted, deque[RateIntegral](), self._nothing)
+    def _enter_motion(self, quiet_duration: float) -> None:
+        """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
+        self.is_resting, self._quiet_duration, self._recent_blocks, self._held_integral = (
+            False, quiet_duration, deque[RateIntegral](), self._zero_integral)
 
-    def _recognize(self) -> None:
+    def _search_rest_again(self) -> None:
         """Restart the detection of rest; a rest may continue."""
-        if self.resting:
-            self._hesitates = _RECOGNIZED
-        self._move(WINDOW)
+        if self.is_resting:
+            self._recognition_left = _RECOGNITION_TIME
+        self._enter_motion(WINDOW_DURATION)
 
-    def _notice(self, lag: float, before: Snapshot | None = None) -> None:
+    def _revert_to_motion(self, lag: float, snapshot: Snapshot | None = None) -> None:
         """Revise a rest to a motion since `lag` s before the last block, or since a snapshot."""
-        self._advance()
-        scattered = before is not None
-        before = before or self._before(max(lag, WINDOW)) or self._snapshots[0]
-        sudden = lag <= WINDOW and not scattered
-        if not sudden and self._rested.duration < _BRIEF - CLOSE:
-            before = self._snapshots[0]
-        turn = self._rested - before.turn
+        self._advance_state()
+        scattered = snapshot is not None
+        snapshot = (snapshot or self._snapshot_before(max(lag, WINDOW_DURATION))
+                    or self._snapshots[0])
+        sudden = lag <= WINDOW_DURATION and not scattered
+        if not sudden and self._rest_integral.duration < _MIN_REST_DURATION - TIME_TOLERANCE:
+            snapshot = self._snapshots[0]
+        turn = self._rest_integral - snapshot.rate_integral
         if sudden:
-            before, turn = self._until_motion(before, turn)
-        self._slow = (self._slow_turn(before, turn) if lag >= LAGS[0] and not scattered else None)
-        if self._snapshots[-1].means and not self._sure:
-            self._drives.learn(self._snapshots[-1])
-        self._drift, self.deleted, self._open = before.drift, before.deleted, turn
-        del self.steps[before.steps:]
-        self._move(max(lag, WINDOW))
-        self._advance()
+            snapshot, turn = self._locate_motion_start(snapshot, turn)
+        self._suspected_turn = (self._slow_turn_since(snapshot, turn)
+                                if lag >= MEAN_LAGS[0] and not scattered else None)
+        if self._snapshots[-1].innovation_count and not self._wheels_stand:
+            self._rest_scatter.learn(self._snapshots[-1])
+        self._state, self.deleted_heading, self._open_integral = (
+            snapshot.state, snapshot.deleted_heading, turn)
+        del self.steps[snapshot.step_count:]
+        self._enter_motion(max(lag, WINDOW_DURATION))
+        self._advance_state()
 
-    def _until_motion(self, before: Snapshot,
-                      turn: RateIntegral) -> tuple[Snapshot, RateIntegral]:
+    def _locate_motion_start(self, snapshot: Snapshot,
+                             turn: RateIntegral) -> tuple[Snapshot, RateIntegral]:
         """
         Return the state after the last block at rest after a snapshot, and the integral since.
 
@@ -695,39 +751,43 @@ class HeadingTracker:
 
         """
         blocks, duration = list[RateIntegral](), 0.0
-        for block in reversed(self._blocks):
-            if duration + block.duration > turn.duration + CLOSE:
+        for block in reversed(self._rest_blocks):
+            if duration + block.duration > turn.duration + TIME_TOLERANCE:
                 break
-            blocks.insert(0, self._at_rest(block))
+            blocks.insert(0, self._with_still_sensitivity(block))
             duration += block.duration
-        if len(blocks) < 3 or turn.duration - duration > BLOCK:
-            return before, turn
-        squares = np.square([self._surprise(before.drift, block) for block in blocks])
+        if len(blocks) < 3 or turn.duration - duration > BLOCK_DURATION:
+            return snapshot, turn
+        squares = np.square(
+            [self._normalized_innovation(snapshot.state, block) for block in blocks])
         at_rest = np.cumsum(squares)[:-1]
         moving = np.maximum((squares.sum() - at_rest) / np.arange(len(blocks) - 1, 0, -1), 1.0)
         last = int(np.argmin(at_rest + np.arange(len(blocks) - 1, 0, -1)
                              * (1.0 + np.log(moving))))
         if not last:
-            return before, turn
+            return snapshot, turn
         quiet = sum(blocks[1:last], blocks[0])
-        while self._snapshots[-1] is not before:
+        while self._snapshots[-1] is not snapshot:
             self._snapshots.pop()
-        del self.steps[before.steps:]
-        self._drift, self._rested = before.drift, before.turn + self._nothing
-        self.deleted = (before.deleted + quiet.turned - before.drift.expected(quiet)[0]
-                        + self._corrected(self._part))
+        del self.steps[snapshot.step_count:]
+        self._state, self._rest_integral = (snapshot.state,
+                                            snapshot.rate_integral + self._zero_integral)
+        self.deleted_heading = (snapshot.deleted_heading + quiet.angle
+                                - snapshot.state.expected_rest_angle(quiet)[0]
+                                + self._corrected_angle(self._block_integral))
         self._advance_at_rest(quiet, turn - quiet)
         return self._snapshots[-1], turn - quiet
 
-    def _slow_turn(self, before: Snapshot, turn: RateIntegral) -> SlowTurn | None:
+    def _slow_turn_since(self, snapshot: Snapshot, turn: RateIntegral) -> SlowTurn | None:
         """Return the detected turn if it is so slow that it may be a change of the bias."""
-        longest = replace(self._nothing, duration=LAGS[-1])
-        least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
-        rate = (turn.turned - before.drift.expected(turn)[0]) / turn.duration
-        return (SlowTurn(before, rate, turn + self._nothing) if abs(rate) < _SLOW_TURN * least
-                else None)
+        longest = replace(self._zero_integral, duration=MEAN_LAGS[-1])
+        least = (self._sigmas[MEAN_LAGS[-1]]
+                 * math.sqrt(snapshot.state.expected_rest_angle(longest)[1]) / MEAN_LAGS[-1])
+        rate = (turn.angle - snapshot.state.expected_rest_angle(turn)[0]) / turn.duration
+        return (SlowTurn(snapshot, rate, turn
+                         + self._zero_integral) if abs(rate) < _SLOW_TURN_FACTOR * least else None)
 
-    def _restart(self, interval: float, fastest: float, unseen: bool) -> str:
+    def _restart_after_gap(self, interval: float, fastest: float, may_have_turned: bool) -> str:
         """
         Restart after a gap or a backward jump of the stamps, over which nothing is integrated.
 
@@ -735,156 +795,174 @@ class HeadingTracker:
         two rests. The duration of a backward jump is unknown.
 
         """
-        self._settle()
-        assert self._last is not None
-        interval, self._reached = min(max(interval, -LONGEST), LONGEST), self._last[0]
-        self._block, self._driven = Block(), False
+        self._advance_to_last_sample()
+        assert self._last_sample is not None
+        interval, self._last_time = min(max(interval, -MAX_GAP), MAX_GAP), self._last_sample[0]
+        self._block, self._wheels_moved = Block(), False
         self._energy.clear()
         self._filter.clear()
         self._gaps.clear()
-        self._recognize()
+        self._search_rest_again()
         duration = max(interval, 0.0)
         if interval > 0.0:
-            self.intervals.count(interval)
-        lost = (fastest * duration) ** 2 + unseen * math.tau ** 2
-        self._go_on(replace(self._nothing, duration=duration, lost=lost, unseen=True),
-                    self._reached)
-        self._take()
+            self.intervals.count_lost(interval)
+        lost = (fastest * duration) ** 2 + may_have_turned * math.tau ** 2
+        self._propagate_state(
+            replace(self._zero_integral, duration=duration, lost_variance=lost,
+                    is_unobserved=True), self._last_time)
+        self._adopt_state()
         return (f'no samples for {interval:.3f} s' if interval > 0.0
                 else f'the stamp jumps back by {-interval:.3f} s')
 
-    def _settle(self) -> None:
+    def _advance_to_last_sample(self) -> None:
         """Propagate the state to the last sample."""
-        self._open, self._part = self._open + self._part, self._none()
-        if not self.resting:
-            self._move(self._wanted)
-        self._advance()
+        self._open_integral, self._block_integral = (self._open_integral + self._block_integral,
+                                                     self._new_integral())
+        if not self.is_resting:
+            self._enter_motion(self._quiet_duration)
+        self._advance_state()
 
-    def _advance(self, left: RateIntegral | None = None) -> None:
-        """Propagate the state over the open integral, except for the part `left`."""
-        left = left or self._nothing
-        turn, self._open = self._open - left, left
-        if turn.duration > CLOSE:
-            if self.resting:
-                self._advance_at_rest(self._at_rest(turn), left)
+    def _advance_state(self, remaining: RateIntegral | None = None) -> None:
+        """Propagate the state over the open integral, except for the part `remaining`."""
+        remaining = remaining or self._zero_integral
+        turn, self._open_integral = self._open_integral - remaining, remaining
+        if turn.duration > TIME_TOLERANCE:
+            if self.is_resting:
+                self._advance_at_rest(self._with_still_sensitivity(turn), remaining)
             else:
-                self._go_on(turn, self._reached - self._part.duration - left.duration)
-        self._take()
+                self._propagate_state(
+                    turn, self._last_time - self._block_integral.duration - remaining.duration)
+        self._adopt_state()
 
-    def _advance_at_rest(self, turn: RateIntegral, left: RateIntegral) -> None:
+    def _advance_at_rest(self, turn: RateIntegral, remaining: RateIntegral) -> None:
         """Propagate the state over a part of a rest, and update the scatter of its rates."""
-        before, (expected, variance) = self._snapshots[-1], self._drift.expected(turn)
-        white = self._drift.noise.angle_random_walk ** 2 * turn.duration
-        squared = (turn.turned - expected) ** 2 / variance
-        ratios = 1.0 + SCATTERS * white / variance
-        likelihood = before.likelihood - 0.5 * (squared / ratios + np.log(ratios))
-        turn.wander = (0.0 if self._sure
-                       else float(self._drives.chances(likelihood) @ SCATTERS) * white)
-        self._go_on(turn, self._reached - self._part.duration - left.duration)
-        self._rested += turn
-        self._snapshots.append(Snapshot(
-            self._drift, self._rested, self.deleted - self._corrected(self._part),
-            len(self.steps), before.squares + squared, before.means + 1, likelihood))
-        del self._snapshots[:-_SNAPSHOTS]
+        before, (expected, variance) = self._snapshots[-1], self._state.expected_rest_angle(turn)
+        white = self._state.noise.angle_random_walk ** 2 * turn.duration
+        squared = (turn.angle - expected) ** 2 / variance
+        ratios = 1.0 + SCATTER_RATIOS * white / variance
+        likelihood = before.log_likelihood - 0.5 * (squared / ratios + np.log(ratios))
+        turn.wander_variance = (
+            0.0 if self._wheels_stand else
+            float(self._rest_scatter.probabilities(likelihood) @ SCATTER_RATIOS) * white)
+        self._propagate_state(turn,
+                              self._last_time - self._block_integral.duration - remaining.duration)
+        self._rest_integral += turn
+        self._snapshots.append(
+            Snapshot(self._state, self._rest_integral,
+                     self.deleted_heading - self._corrected_angle(self._block_integral),
+                     len(self.steps), before.innovation_square_sum + squared,
+                     before.innovation_count + 1, likelihood))
+        del self._snapshots[:-_MAX_SNAPSHOTS]
 
-    def _go_on(self, turn: RateIntegral, end: float) -> None:
+    def _propagate_state(self, turn: RateIntegral, end: float) -> None:
         """Propagate the state over an integral that ends at a time, s."""
-        turn = turn if self.resting else self._moving(turn)
-        if self._keep:
-            self.steps.append(Step(self._drift, turn, self.resting, end))
-        self._drift = self._drift.rested(turn) if self.resting else self._drift.moved(turn)
+        turn = turn if self.is_resting else self._with_unbiased_sensitivity(turn)
+        if self._keeps_steps:
+            self.steps.append(TrackStep(self._state, turn, self.is_resting, end))
+        self._state = (self._state.advance_at_rest(turn)
+                       if self.is_resting else self._state.propagate(turn))
 
-    def _moving(self, turn: RateIntegral) -> RateIntegral:
+    def _with_unbiased_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity for the rates without their bias."""
-        if self._per_rate is None or self._still is None or turn.unseen:
+        if (self._sensitivity_slope is None or self._still_sensitivity is None
+                or turn.is_unobserved):
             return turn
-        bias, _ = self._drift.bias(self._still)
-        return replace(turn, sensitivity=turn.sensitivity - turn.duration * bias * self._per_rate)
+        bias, _ = self._state.rate_error(self._still_sensitivity)
+        return replace(
+            turn, sensitivity=turn.sensitivity - turn.duration * bias * self._sensitivity_slope)
 
-    def _at_rest(self, turn: RateIntegral) -> RateIntegral:
+    def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
-        return (turn + self._nothing if self._still is None
-                else replace(turn, sensitivity=turn.duration * self._still))
+        return (turn + self._zero_integral if self._still_sensitivity is None
+                else replace(turn, sensitivity=turn.duration * self._still_sensitivity))
 
-    def _take(self) -> None:
+    def _adopt_state(self) -> None:
         """Adopt the new state and the noise of the samples; the heading does not jump."""
-        if not math.isfinite(float(self._drift.mean.sum()) + float(self._drift.covariance.sum())):
-            self._rebuild()
-        walk = self._claimed.angle_random_walk * (
-            self._energy.factor if self._seeks and self._energy.factor > _ALLOWED else 1.0)
-        if walk != self._drift.noise.angle_random_walk:
-            self._drift = replace(
-                self._drift, noise=replace(self._claimed, angle_random_walk=walk))
-        self._gaps.noise = self._drift.noise
-        self._offset, self._values, self._seen, self._biased = (
-            self._drift.offset[0], self._drift.values[0], None, None)
-        self._unsure = _FAR * self.bias[1]
-        self._known, self._taken = None, self._taken + 1
-        estimate = float(self._drift.mean[HEADING]) + (
-            0.0 if self.resting else self._corrected(self._open + self._part))
-        self._pending = estimate - self.heading
-        self._good = self.heading, float(self._drift.covariance[HEADING, HEADING])
+        if not math.isfinite(float(self._state.mean.sum()) + float(self._state.covariance.sum())):
+            self._rebuild_state()
+        walk = self._model_noise.angle_random_walk * (
+            self._energy.noise_factor
+            if self._detects_rest and self._energy.noise_factor > _NOISE_TOLERANCE else 1.0)
+        if walk != self._state.noise.angle_random_walk:
+            self._state = replace(
+                self._state, noise=replace(self._model_noise, angle_random_walk=walk))
+        self._gaps.noise = self._state.noise
+        self._wander_rate = self._state.wander_rate[0]
+        self._calibration_errors = self._state.calibration_errors[0]
+        self._error_sensitivity = self._bias_sensitivity = None
+        self._bias_margin = _BIAS_MARGIN_SIGMAS * self.bias[1]
+        self._open_variance, self._state_version = None, self._state_version + 1
+        estimate = float(self._state.mean[HEADING_INDEX]) + (
+            0.0 if self.is_resting else self._corrected_angle(self._open_integral
+                                                              + self._block_integral))
+        self._pending_correction = estimate - self.heading
+        self._last_finite_heading = (self.heading,
+                                     float(self._state.covariance[HEADING_INDEX, HEADING_INDEX]))
 
-    def _rebuild(self) -> None:
+    def _rebuild_state(self) -> None:
         """Initialize the state at the last finite heading, with an uncertainty of a full turn."""
-        heading, variance = self._good
-        covariance, age = self._calibrated
-        self._begin(self._claimed, np.nan_to_num(covariance), heading, variance + math.tau ** 2,
-                    age)
-        self.heading, self.rate, self.deleted, self._hesitates, self._still, self._slow = (
-            heading, 0.0, 0.0, 0.0, None, None)
-        if self._last is not None:
-            self._last = (*self._last[:3], np.zeros(len(covariance)))
-        self._energy, self._block, self._driven = Energy(*self._tested), Block(), False
-        intervals, self._gaps = self.intervals, Gaps(self._claimed)
+        heading, variance = self._last_finite_heading
+        covariance, age = self._calibration
+        self._initialize_state(self._model_noise, np.nan_to_num(covariance), heading,
+                               variance + math.tau ** 2, age)
+        self.heading, self.rate, self.deleted_heading = heading, 0.0, 0.0
+        self._recognition_left, self._still_sensitivity, self._suspected_turn = 0.0, None, None
+        if self._last_sample is not None:
+            self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
+        self._energy, self._block, self._wheels_moved = (
+            EnergyDetector(*self._detector_settings), Block(), False)
+        intervals, self._gaps = self.intervals, GapModel(self._model_noise)
         self.intervals = self._gaps.intervals = intervals
         self._filter.clear()
-        self._move(WINDOW)
-        self._known, self._pending = None, 0.0
-        self.rebuilt += 1
-        self._mended = ('the state was not finite and was initialized again; '
-                        'the heading error may be up to a full turn')
-        self._take()
+        self._enter_motion(WINDOW_DURATION)
+        self._open_variance, self._pending_correction = None, 0.0
+        self.rebuild_count += 1
+        self._rebuild_message = ('the state was not finite and was initialized again; '
+                                 'the heading error may be up to a full turn')
+        self._adopt_state()
 
-    def _corrected(self, part: RateIntegral) -> float:
+    def _corrected_angle(self, part: RateIntegral) -> float:
         """Return the integral of the rates less their error as estimated at rest, rad."""
-        return part.turned - part.duration * self._offset + float(part.sensitivity @ self._values)
+        return (part.angle - part.duration * self._wander_rate
+                + float(part.sensitivity @ self._calibration_errors))
 
     # What is known
 
-    def finish(self) -> Drift:
+    def finish(self) -> HeadingState:
         """Propagate the state to the last sample, and return it."""
-        self._settle()
-        return self._drift
+        self._advance_to_last_sample()
+        return self._state
 
     @property
     def bias(self) -> tuple[float, float]:
         """Return the bias at rest in addition to the calibration, and its deviation, rad/s."""
-        return self.bias_by(self.sensitivity)
+        return self.bias_for(self.sensitivity)
 
     @property
     def sensitivity(self) -> Array:
         """Return that of the last sample."""
-        return self._nothing.sensitivity if self._last is None else self._last[3]
+        return (self._zero_integral.sensitivity
+                if self._last_sample is None else self._last_sample[3])
 
-    def bias_by(self, sensitivity: Array) -> tuple[float, float]:
+    def bias_for(self, sensitivity: Array) -> tuple[float, float]:
         """Return the same for another sensitivity, (m,), as of samples at another temperature."""
-        if sensitivity is not self._biased:
-            bias, variance = self._drift.bias(sensitivity)
-            self._biased, self._bias_seen = sensitivity, (bias, math.sqrt(variance))
-        return self._bias_seen
+        if sensitivity is not self._bias_sensitivity:
+            bias, variance = self._state.rate_error(sensitivity)
+            self._bias_sensitivity, self._cached_bias = sensitivity, (bias, math.sqrt(variance))
+        return self._cached_bias
 
     @property
     def rate_variance(self) -> float:
         """Return the variance of the last rate, (rad/s)², by noise, bias and scale."""
-        interval = max(min(self._interval, self.intervals.usual), SHORTEST)
-        return self.bias[1] ** 2 + self._drift.noise.rate_variance(
-            WINDOW if self.resting else interval)
+        interval = max(min(self._interval, self.intervals.usual_interval), MIN_SAMPLE_INTERVAL)
+        return self.bias[1] ** 2 + self._state.noise.rate_variance(
+            WINDOW_DURATION if self.is_resting else interval)
 
     @property
-    def slowest_noticed(self) -> float:
+    def slowest_detectable_rate(self) -> float:
         """Return the slowest turn, rad/s, that is detected in 95 % of cases; nan if unknown."""
-        turns = ([(lag, replace(self._nothing, duration=lag)) for lag in LAGS]
-                 if self._seeks else [])
-        return min(((self._sigmas[lag] + _POWER) * math.sqrt(self._drift.expected(turn)[1]) / lag
+        turns = ([(lag, replace(self._zero_integral, duration=lag)) for lag in MEAN_LAGS]
+                 if self._detects_rest else [])
+        return min(((self._sigmas[lag] + _POWER_SIGMAS)
+                    * math.sqrt(self._state.expected_rest_angle(turn)[1]) / lag
                     for lag, turn in turns), default=math.nan)

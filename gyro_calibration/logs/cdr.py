@@ -46,25 +46,26 @@ All zeros would declare the whole covariance unknown, z included. A standard dev
 """
 
 
-def along_z(variance: float) -> tuple[float, ...]:
+def z_axis_covariance(variance: float) -> tuple[float, ...]:
     """Return the covariance of a quantity that is measured about or along z only, shape (9,)."""
     return (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, variance)
 
 
 #: Covariance of a quantity that the message does not report, and of one that is not measured.
-NO_COVARIANCE, UNMEASURED = (NOT_REPORTED, *8 * (0.0,)), along_z(UNMEASURED_VARIANCE)
+NOT_REPORTED_COVARIANCE, UNMEASURED_COVARIANCE = ((NOT_REPORTED, *8 * (0.0, )),
+                                                  z_axis_covariance(UNMEASURED_VARIANCE))
 
 #: Largest number of fields, depth of nesting, and length of a definition in characters.
-_MOST, _DEEPEST, _LONGEST = 5000, 10, 100_000
-LINE = '=' * 80
-_CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
-          'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
-          'float32': 'f', 'float64': 'd', 'string': 's'}
-_FIELD = re.compile(r'(?P<kind>[\w/]+)(?:<=\d+)?(?:\[(?P<most><=)?(?P<count>\d{0,9})\])?'
-                    r' +(?P<name>\w+) *(?P<constant>=?)')
+_MAX_FIELDS, _MAX_DEPTH, _MAX_DEFINITION_LENGTH = 5000, 10, 100_000
+DEFINITION_SEPARATOR = '=' * 80
+_STRUCT_CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
+                 'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
+                 'float32': 'f', 'float64': 'd', 'string': 's'}
+_FIELD_PATTERN = re.compile(r'(?P<kind>[\w/]+)(?:<=\d+)?(?:\[(?P<most><=)?(?P<count>\d{0,9})\])?'
+                            r' +(?P<name>\w+) *(?P<constant>=?)')
 
 #: Quantity -> fields that may hold it; the first one present is used. `{}` is the axis.
-_QUANTITIES = {
+_QUANTITY_FIELDS = {
     **{f'orientation.{each}': tuple(f'{where}{each}' for where in (
         'orientation.', 'pose.pose.orientation.', 'pose.orientation.', 'transform.rotation.',
         'quaternion.')) for each in 'xyzw'},
@@ -76,7 +77,7 @@ _QUANTITIES = {
     'temperature': ('temperature',),
 }
 
-_PARTS = {
+_NESTED_DEFINITIONS = {
     'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec',
     'std_msgs/Header': 'builtin_interfaces/Time stamp\nstring frame_id',
     **{f'geometry_msgs/{name}': '\n'.join(f'float64 {each}' for each in axes)
@@ -86,7 +87,7 @@ _PARTS = {
     'geometry_msgs/PoseWithCovariance': 'geometry_msgs/Pose pose\nfloat64[36] covariance',
     'geometry_msgs/TwistWithCovariance': 'geometry_msgs/Twist twist\nfloat64[36] covariance',
 }
-_FIELDS = {
+_MESSAGE_FIELDS = {
     IMU: """geometry_msgs/Quaternion orientation
 float64[9] orientation_covariance
 geometry_msgs/Vector3 angular_velocity
@@ -102,16 +103,17 @@ geometry_msgs/TwistWithCovariance twist""",
 }
 
 
-def _with_parts(text: str) -> str:
-    for name, part in reversed(_PARTS.items()):
+def _append_nested_definitions(text: str) -> str:
+    for name, part in reversed(_NESTED_DEFINITIONS.items()):
         if f'{name} ' in text:
-            text += f'{LINE}\nMSG: {name}\n{part}\n'
+            text += f'{DEFINITION_SEPARATOR}\nMSG: {name}\n{part}\n'
     return text
 
 
 #: Message type -> definition as ROS 2 writes it, for recordings without definitions and recorders.
-DEFINITIONS: Mapping[str, str] = {kind: _with_parts(f'std_msgs/Header header\n{fields}\n')
-                                  for kind, fields in _FIELDS.items()}
+DEFINITIONS: Mapping[str, str] = {kind: _append_nested_definitions('std_msgs/Header '
+                                                                   f'header\n{fields}\n')
+                                  for kind, fields in _MESSAGE_FIELDS.items()}
 
 
 class MessageError(ValueError):
@@ -119,7 +121,7 @@ class MessageError(ValueError):
 
 
 @dataclass(frozen=True)
-class Layout:
+class MessageLayout:
     """The layout in bytes of a message type, with the quantities of a gyro or reference."""
 
     #: Runs of contiguous numbers: size in bytes of an element of the text or sequence before the
@@ -129,23 +131,23 @@ class Layout:
 
 
 @cache
-def layout_of(definition: str, axis: str = 'z') -> Layout:
+def parse_layout(definition: str, axis: str = 'z') -> MessageLayout:
     """Return the layout of a message type by its definition, with the rate about an axis."""
-    if len(definition) > _LONGEST:
-        raise MessageError(f'it has more than {_LONGEST} characters')
+    if len(definition) > _MAX_DEFINITION_LENGTH:
+        raise MessageError(f'it has more than {_MAX_DEFINITION_LENGTH} characters')
     parts: dict[str, list[re.Match[str]]] = {}
-    for part in f'MSG: /\n{definition}'.split(f'{LINE}\n'):
+    for part in f'MSG: /\n{definition}'.split(f'{DEFINITION_SEPARATOR}\n'):
         name, _, text = part.partition('\n')
         fields = [found for line in text.split('\n')
-                  if (found := _FIELD.match(line.partition('#')[0].strip()))]
+                  if (found := _FIELD_PATTERN.match(line.partition('#')[0].strip()))]
         name = name.removeprefix('MSG: ').strip()
         # Definitions name messages of the same package without the package.
         parts[name] = parts[name.rpartition('/')[2] or name] = [
             field for field in fields if not field['constant']]
     names, runs = list[str](), [['', '']]
-    for number, (name, code) in enumerate(_flat(parts, '/', '', 0)):
-        if number > _MOST:
-            raise MessageError(f'it has more than {_MOST} parts')
+    for number, (name, code) in enumerate(_flatten_fields(parts, '/', '', 0)):
+        if number > _MAX_FIELDS:
+            raise MessageError(f'it has more than {_MAX_FIELDS} parts')
         if name and code:
             names.append(name)
             runs[-1][1] += code
@@ -153,14 +155,15 @@ def layout_of(definition: str, axis: str = 'z') -> Layout:
             runs.append([code, ''])
     if names[:2] != ['header.stamp.sec', 'header.stamp.nanosec']:
         raise MessageError('it does not begin with a header')
-    quantities = {quantity: names.index(found) - 2 for quantity, fields in _QUANTITIES.items()
+    quantities = {quantity: names.index(found) - 2 for quantity, fields in _QUANTITY_FIELDS.items()
                   for found in [field.format(axis) for field in fields
                                 if field.format(axis) in names][:1]}
-    return Layout(tuple((struct.calcsize(before), codes) for before, codes in runs), quantities)
+    return MessageLayout(tuple((struct.calcsize(before), codes) for before, codes in runs),
+                         quantities)
 
 
-def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
-          depth: int) -> Iterator[tuple[str, str]]:
+def _flatten_fields(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
+                    depth: int) -> Iterator[tuple[str, str]]:
     """
     Give name and format of each number; texts and sequences have no name, messages no format.
 
@@ -169,40 +172,42 @@ def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
     """
     for field in parts[part]:
         kind, count, name = field['kind'], field['count'], f'{path}{field["name"]}'
-        code = _CODES.get(kind, '')
+        code = _STRUCT_CODES.get(kind, '')
         if field['most'] or count == '':
             if code in ('', 's'):
                 return
             yield '', code
             continue
-        if not code and (kind not in parts or depth == _DEEPEST):
+        if not code and (kind not in parts or depth == _MAX_DEPTH):
             raise MessageError(f'{kind} in it is not defined')
         for number in range(int(count or 1)):
             each = name if count is None else f'{name}.{number}'
             yield '' if code == 's' else each, code
             if not code:
-                yield from _flat(parts, kind, f'{each}.', depth + 1)
+                yield from _flatten_fields(parts, kind, f'{each}.', depth + 1)
 
 
 #: Message type -> layout, with the rate about z.
-LAYOUTS: Mapping[str, Layout] = {kind: layout_of(text) for kind, text in DEFINITIONS.items()}
+LAYOUTS: Mapping[str, MessageLayout] = ({
+    kind: parse_layout(text) for kind, text in DEFINITIONS.items()
+})
 
 
 @cache
-def _struct(order: str, codes: str, place: int) -> struct.Struct:
+def _padded_struct(order: str, codes: str, offset: int) -> struct.Struct:
     """Return the format of numbers with padding, from an offset modulo 8 bytes on."""
     text = [order]
     for code in codes:
         size = struct.calcsize(code)
-        text.append(f'{-place % size}x{code}')
-        place += -place % size + size
+        text.append(f'{-offset % size}x{code}')
+        offset += -offset % size + size
     return struct.Struct(''.join(text))
 
 
-_LENGTHS = {order: struct.Struct(f'{order}I').unpack_from for order in '<>'}
+_UNPACK_LENGTH = {order: struct.Struct(f'{order}I').unpack_from for order in '<>'}
 
 
-def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
+def parse(data: bytes, layout: MessageLayout) -> tuple[int, tuple[float, ...]]:
     """Return the stamp of a message, in ns since 1970, and its numbers, or raise MessageError."""
     if data[:2] not in (b'\0\0', b'\0\1'):
         raise MessageError(f'a message begins with {data[:4].hex()}, which is not plain CDR')
@@ -213,10 +218,10 @@ def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
         for size, codes in layout.runs:
             if size:
                 place += -place % 4 + 4
-                length = _LENGTHS[order](data, place - 4)[0]
+                length = _UNPACK_LENGTH[order](data, place - 4)[0]
                 place += (-(place - 4) % size if length else 0) + length * size
             if codes:
-                run = _struct(order, codes, (place - 4) % 8)
+                run = _padded_struct(order, codes, (place - 4) % 8)
                 numbers += run.unpack_from(data, place)
                 place += run.size
     except (struct.error, OverflowError) as error:
@@ -234,7 +239,7 @@ def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:
             + struct.pack(f'<{len(numbers)}d', *numbers))
 
 
-def heading_of(x: Number, y: Number, z: Number, w: Number) -> Number:
+def quaternion_heading(x: Number, y: Number, z: Number, w: Number) -> Number:
     """Return the rotation about z of a quaternion, rad, wrapped; nan if its norm is far from 1."""
     with np.errstate(invalid='ignore', over='ignore'):
         length = w * w + x * x + y * y + z * z

@@ -25,7 +25,7 @@ import re
 import shlex
 from typing import NamedTuple
 
-from gyro_calibration.files import InputError, plain
+from gyro_calibration.files import InputError, to_printable
 
 _DEGREE = math.radians(1.0)
 
@@ -48,24 +48,24 @@ QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
 #: Axes of a gyro; column names may contain one, such as gyro_x_dps.
 AXES = ('x', 'y', 'z')
 
-_RATES = {'rad/s': 1.0, 'deg/s': _DEGREE, 'dps': _DEGREE, 'mrad/s': 1e-3,
-          'deg/h': _DEGREE / 3600.0}
-_ANGLES = {'rad': 1.0, 'deg': _DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
+_RATE_UNITS = {'rad/s': 1.0, 'deg/s': _DEGREE, 'dps': _DEGREE, 'mrad/s': 1e-3,
+               'deg/h': _DEGREE / 3600.0}
+_ANGLE_UNITS = {'rad': 1.0, 'deg': _DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
-_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
+_OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
-    'gyro': ('output', _RATES),
+    'gyro': ('output', _RATE_UNITS),
     'counts': ('counts', {'1': 1.0}),
     'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
-    'rate': ('reference_rate', _RATES),
-    'heading': ('reference_heading', _ANGLES),
+    'rate': ('reference_rate', _RATE_UNITS),
+    'heading': ('reference_heading', _ANGLE_UNITS),
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
     'moving': ('moving', {'1': 1.0}),
 }
 #: Name of a quantity in options -> pattern of column names in other programs, in lower case,
 #: letters only, without the unit.
-_USUAL = {
+_COLUMN_ALIASES = {
     'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
     'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|gyroscope|gyroscopez|omega|omegaz|.*angularvelocityz|'
             r'angvelz|yawrate|gyrorate',
@@ -75,27 +75,27 @@ _USUAL = {
     'supply': r'vdd|vcc|supply|voltage|volts',
 }
 #: Suffixes of names -> unit.
-_ENDS = {'dps': 'deg/s', 'degs': 'deg/s', 'deg': 'deg', 'rads': 'rad/s', 'rad': 'rad',
-         'ms': 'ms', 'us': 'us', 'ns': 'ns'}
+_UNIT_SUFFIXES = {'dps': 'deg/s', 'degs': 'deg/s', 'deg': 'deg', 'rads': 'rad/s', 'rad': 'rad',
+                  'ms': 'ms', 'us': 'us', 'ns': 'ns'}
 
 
 class Column(NamedTuple):
     """Column of a quantity in a file, and its conversion to SI: ``factor * value + offset``."""
 
-    place: int
+    position: int
     factor: float
     offset: float = 0.0
 
 
-def found_in(header: Sequence[str], given: Mapping[str, str] = {},
-             axis: str = 'z') -> dict[str, Column]:
+def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
+                 axis: str = 'z') -> dict[str, Column]:
     """
     Find the column of each quantity of a log.
 
     Parameters
     ----------
     header : names of the columns
-    given : quantity, as in options -> name of its column, or name:unit
+    user_columns : quantity, as in options -> name of its column, or name:unit
     axis : x, y or z, for names that contain an axis
 
     Returns
@@ -108,16 +108,17 @@ def found_in(header: Sequence[str], given: Mapping[str, str] = {},
 
     """
     found = {}
-    for name, text in given.items():
-        if name not in _QUANTITIES:
-            raise InputError(f'{name} is no quantity of a log; wanted one of '
-                             f'{", ".join(_QUANTITIES)}{_nearest(name, _QUANTITIES)}')
-        quantity, units = _QUANTITIES[name]
-        found[quantity] = _column(header, name, text, units)
-    asked = {column.place for column in found.values()}
+    for name, text in user_columns.items():
+        if name not in _OPTION_QUANTITIES:
+            raise InputError(
+                f'{name} is no quantity of a log; wanted one of '
+                f'{", ".join(_OPTION_QUANTITIES)}{_suggest_nearest(name, _OPTION_QUANTITIES)}')
+        quantity, units = _OPTION_QUANTITIES[name]
+        found[quantity] = _find_column(header, name, text, units)
+    asked = {column.position for column in found.values()}
     names: dict[str, str] = {}
     for index, name in enumerate(header):
-        plain_name = _without_axis(name, axis)
+        plain_name = _strip_axis(name, axis)
         if index in asked or plain_name not in COLUMNS:
             continue
         quantity, factor = COLUMNS[plain_name]
@@ -128,12 +129,13 @@ def found_in(header: Sequence[str], given: Mapping[str, str] = {},
                              'keep one of them')
         found[quantity], names[quantity] = Column(index, factor), name
     if not {'output', 'counts'} & set(found):
-        raise InputError(f'no gyro column among {_short(",".join(header))}; '
-                         f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggestion(header)}')
+        raise InputError(f'no gyro column among {_shorten(",".join(header))}; '
+                         f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggest_columns(header)}')
     return found
 
 
-def _column(header: Sequence[str], name: str, text: str, units: Mapping[str, float]) -> Column:
+def _find_column(header: Sequence[str], name: str, text: str,
+                 units: Mapping[str, float]) -> Column:
     """Return a column that the user named, with or without a unit."""
     column, unit = text, next(iter(units))
     if text not in header and ':' in text:
@@ -143,30 +145,30 @@ def _column(header: Sequence[str], name: str, text: str, units: Mapping[str, flo
                          f'{", ".join(units)}')
     if column not in header:
         raise InputError(f'{name}={text}: there is no column {column} among '
-                         f'{_short(",".join(header))}{_nearest(column, header)}')
+                         f'{_shorten(",".join(header))}{_suggest_nearest(column, header)}')
     offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
     return Column(header.index(column), units[unit], offset)
 
 
-def _without_axis(name: str, axis: str) -> str:
+def _strip_axis(name: str, axis: str) -> str:
     """Return a column name without the axis: gyro_dps for gyro_z_dps."""
     first, _, rest = name.partition(f'_{axis}_')
     return f'{first}_{rest}' if rest and first in ('gyro', 'acceleration') else name
 
 
-def is_header(header: Sequence[str], given: Mapping[str, str], axis: str) -> bool:
+def is_header(header: Sequence[str], user_columns: Mapping[str, str], axis: str) -> bool:
     """Tell whether a row contains at least one known column name."""
-    named = {text for name in given.values() for text in (name, name.rpartition(':')[0])}
-    return any(name in named or _without_axis(name, axis) in COLUMNS for name in header)
+    named = {text for name in user_columns.values() for text in (name, name.rpartition(':')[0])}
+    return any(name in named or _strip_axis(name, axis) in COLUMNS for name in header)
 
 
-def suggestion(header: Sequence[str]) -> str:
+def suggest_columns(header: Sequence[str]) -> str:
     """Suggest the option --columns for a header, or another name; '' without a suggestion."""
     wanted = []
-    names = [name for name in header if name == _short(name) and not set(name) & set(',=:')]
-    for quantity, pattern in _USUAL.items():
+    names = [name for name in header if name == _shorten(name) and not set(name) & set(',=:')]
+    for quantity, pattern in _COLUMN_ALIASES.items():
         for name in names:
-            letters, unit = _letters_and_unit(name, _QUANTITIES[quantity][1])
+            letters, unit = _split_unit(name, _OPTION_QUANTITIES[quantity][1])
             if re.fullmatch(pattern, letters):
                 wanted.append(f'{quantity}={name}:{unit}')
                 break
@@ -177,28 +179,28 @@ def suggestion(header: Sequence[str]) -> str:
     for name in header:
         if name not in COLUMNS and (
                 close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
-            return f'; perhaps {close[0]} is meant by {_short(name)}'
+            return f'; perhaps {close[0]} is meant by {_shorten(name)}'
     return ''
 
 
-def _letters_and_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
+def _split_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
     """Return the letters of a name without its unit, and the unit; UNIT if there is none."""
     base, _, rest = name.replace('[', '(').partition('(')
     unit = rest.rstrip(')] ').replace('°', 'deg').replace('sec', 's')
     letters = re.sub(r'[^a-z]', '', (base if unit in units else name).lower())
     if unit in units:
         return letters, unit
-    for end, unit in _ENDS.items():
+    for end, unit in _UNIT_SUFFIXES.items():
         if unit in units and letters.endswith(end) and len(letters) > len(end):
             return letters.removesuffix(end), unit
     return letters, 'UNIT'
 
 
-def _short(text: str) -> str:
+def _shorten(text: str) -> str:
     """Return at most 100 characters of a text, safe for a terminal."""
-    return plain(text[:100])[:100]
+    return to_printable(text[:100])[:100]
 
 
-def _nearest(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
+def _suggest_nearest(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
     close = difflib.get_close_matches(name, names, 1)
-    return f'; perhaps {_short(close[0])} is meant' if close else ''
+    return f'; perhaps {_shorten(close[0])} is meant' if close else ''

@@ -33,22 +33,22 @@ from typing import Any
 import zlib
 
 from gyro_calibration.files import (
-    GROWN,
-    GROWTH,
+    describe_error,
     InputError,
-    LARGEST,
-    opened,
-    plain,
-    reason,
-    replacing,
+    MAX_EXPANSION_RATIO,
+    MAX_MAGNITUDE,
+    MIN_EXPANSION_BYTES,
+    open_regular_file,
+    open_replacement,
+    to_printable,
 )
 from gyro_calibration.logs.columns import (
     Column,
     COLUMNS,
-    found_in,
+    find_columns,
     is_header,
     QUANTITIES,
-    suggestion,
+    suggest_columns,
 )
 import numpy as np
 from numpy.typing import NDArray
@@ -61,26 +61,26 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
 #: Half-width of the central 95 % interval of a normal distribution, standard deviations.
-NORMAL_95 = 1.96
+NORMAL_QUANTILE_975 = 1.96
 
 #: Samples of a dozen columns that fit into the cache of a processor; memory is half as fast.
-CACHED = 1 << 14
+CACHE_BLOCK_SAMPLES = 1 << 14
 #: Rows in a block of a log.
-ROWS = 1 << 16
+BLOCK_ROWS = 1 << 16
 #: Least interval between samples, s.
-SHORTEST = 1e-9
+MIN_SAMPLE_INTERVAL = 1e-9
 #: Largest number of characters of a line, of notes and header, and of a block of lines or of a row
 #: that spans several lines.
-_LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
+_MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 20, 1 << 24
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
-_WHOLE = 1 << 29
+_MAX_LOG_VALUES = 1 << 29
 
-_MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
+_NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading')
 
 
 #: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
 #: as text.
-_Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
+_ParsedRows = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
 
 class LogError(InputError):
@@ -165,8 +165,9 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
                                  columns=columns, axis=axis):
         numbers += len(block) * (sum(getattr(block, quantity) is not None
                                      for quantity in QUANTITIES) + 10 * len(block.others))
-        if numbers > _WHOLE:
-            raise LogError(f'{path}: has more than {_WHOLE} numbers, which is above the limit of '
+        if numbers > _MAX_LOG_VALUES:
+            raise LogError(f'{path}: has more than {_MAX_LOG_VALUES} numbers, which is above the '
+                           'limit of '
                            'memory; split it')
         blocks.append(block)
     first = blocks[0]
@@ -179,7 +180,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
 
 
 def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
-                    rows: int = ROWS, on_progress: Callable[[int], object] | None = None,
+                    rows: int = BLOCK_ROWS, on_progress: Callable[[int], object] | None = None,
                     columns: Mapping[str, str] = {}, axis: str = 'z') -> Iterator[Log]:
     """
     Read a log file in blocks, so that memory does not grow with its length.
@@ -198,25 +199,30 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
 
     """
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
-    with _refusing(path), opened(path, pipes=True) as file, io.TextIOWrapper(
-            gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
-            encoding='utf-8-sig', newline='') as text:
-        lines = _lines(text)
-        table, first_line = _head(path, _bounded(lines, _HEAD), columns, axis)
+    with _convert_read_errors(path), open_regular_file(
+            path, allow_pipes=True) as file, io.TextIOWrapper(
+                gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
+                encoding='utf-8-sig',
+                newline='') as text:
+        lines = _iter_lines(text)
+        table, first_line = _read_header(path, _limit_length(lines, _MAX_HEADER_LENGTH), columns,
+                                         axis)
         unfolded = 0
         if rate is not None:
             table.columns.pop('time', None)
-        while block := _block(lines, rows):
+        while block := _read_block(lines, rows):
             unfolded += sum(map(len, block))
-            if compressed and file.seekable() and unfolded > GROWN + GROWTH * file.tell():
-                raise LogError(f'{path}: decompresses to more than {GROWTH} times its size, which '
+            if (compressed and file.seekable()
+                    and unfolded > MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * file.tell()):
+                raise LogError(f'{path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
+                               'its size, which '
                                'is the limit; decompress it first if this is intended')
-            places, arrays, others = (_quickly(block, first_line, table)
-                                      or _carefully(path, block, lines, first_line, table))
+            places, arrays, others = (_parse_numeric_rows(block, first_line, table)
+                                      or _parse_text_rows(path, block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
-            last = _refuse_time(path, places, arrays.get('time'), last)
+            last = _refuse_unordered_time(path, places, arrays.get('time'), last)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
             if on_progress is not None and file.seekable():
@@ -228,7 +234,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
 
 
 @contextmanager
-def _refusing(path: str | Path) -> Iterator[None]:
+def _convert_read_errors(path: str | Path) -> Iterator[None]:
     try:
         yield
     except UnicodeDecodeError as error:
@@ -237,46 +243,48 @@ def _refusing(path: str | Path) -> Iterator[None]:
                        f'text, convert it, as by iconv -f {code} -t UTF-8 {path} > log.csv'
                        ) from error
     except (OSError, EOFError, zlib.error, csv.Error) as error:
-        raise LogError(f'{path}: cannot be read as a log ({reason(error)}); '
+        raise LogError(f'{path}: cannot be read as a log ({describe_error(error)}); '
                        'wanted a CSV file, .csv or .csv.gz') from error
 
 
-def _lines(text: io.TextIOWrapper) -> Iterator[str]:
+def _iter_lines(text: io.TextIOWrapper) -> Iterator[str]:
     """Give the lines of a file, without empty ones at its end."""
     empty: list[str] = []
-    for line in iter(partial(text.readline, _LINE + 1), ''):
-        if len(line) < 3 and not line.strip('\r\n') and len(empty) < _BLOCK:
+    for line in iter(partial(text.readline, _MAX_LINE_LENGTH + 1), ''):
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < _MAX_BLOCK_LENGTH:
             empty.append(line)
             continue
-        if len(line) > _LINE:
-            raise csv.Error(f'a line has more than {_LINE} characters')
+        if len(line) > _MAX_LINE_LENGTH:
+            raise csv.Error(f'a line has more than {_MAX_LINE_LENGTH} characters')
         yield from empty
         empty.clear()
         yield line
 
 
-def _block(lines: Iterator[str], rows: int) -> list[str]:
+def _read_block(lines: Iterator[str], rows: int) -> list[str]:
     """Return the next lines: `rows` of them, or fewer where they are long."""
     block: list[str] = []
     length = 0
-    while length < _BLOCK and (more := list(itertools.islice(lines, min(rows - len(block), 256)))):
+    while (length < _MAX_BLOCK_LENGTH
+            and (more := list(itertools.islice(lines, min(rows - len(block), 256))))):
         block += more
         length += sum(map(len, more))
     return block
 
 
-def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
+def _limit_length(lines: Iterator[str], max_length: int) -> Iterator[str]:
     """Give lines, and raise csv.Error beyond a number of characters."""
-    left = most
+    left = max_length
     for line in lines:
         left -= len(line)
         if left < 0:
-            raise csv.Error(f'a row, or what is before the first, has more than {most} characters')
+            raise csv.Error(f'a row, or what is before the first, has more than {max_length} '
+                            'characters')
         yield line
 
 
 @dataclass(frozen=True)
-class _Table:
+class _FileHeader:
     """Notes and header of a file: notes, names, quantity -> column, delimiter."""
 
     notes: tuple[str, ...]
@@ -285,15 +293,15 @@ class _Table:
     delimiter: str
 
     @property
-    def others(self) -> dict[str, int]:
+    def other_columns(self) -> dict[str, int]:
         """Return the names of columns without a quantity, made unique, with their indices."""
-        taken = {column.place for column in self.columns.values()}
-        return {name: index for index, name in enumerate(_distinct(self.header))
+        taken = {column.position for column in self.columns.values()}
+        return {name: index for index, name in enumerate(_make_unique(self.header))
                 if index not in taken and self.header[index] not in COLUMNS}
 
 
-def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
-          axis: str) -> tuple[_Table, int]:
+def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
+                 axis: str) -> tuple[_FileHeader, int]:
     """Read notes and header, and return them with the number of the next line."""
     notes, line = [], next(lines, '')
     while line.startswith('#'):
@@ -301,21 +309,21 @@ def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
         line = next(lines, '')
     delimiter = max((',', ';', '\t'), key=line.count)
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
-    header = [_unix(name.strip()) for name in next(rows, [])]
+    header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
     if not is_header(header, columns, axis):
-        meant = suggestion(header) or (
+        meant = suggest_columns(header) or (
             '; put one such as time_s,gyro_dps,reference_heading_deg there, with # before the '
             'lines above it, or name the columns, as by --columns time=NAME:s,gyro=NAME:deg/s')
         raise LogError(f'{path}: line {len(notes) + 1} is no header with a known column: '
-                       f'{shown(line.strip())}{meant}')
+                       f'{excerpt(line.strip())}{meant}')
     try:
-        found = found_in(header, columns, axis)
+        found = find_columns(header, columns, axis)
     except InputError as error:
         raise LogError(f'{path}: {error}') from None
-    return _Table(tuple(notes), header, found, delimiter), len(notes) + rows.line_num + 1
+    return _FileHeader(tuple(notes), header, found, delimiter), len(notes) + rows.line_num + 1
 
 
-def _distinct(header: list[str]) -> list[str]:
+def _make_unique(header: list[str]) -> list[str]:
     """Return the names of columns, made unique: a second x becomes x.1."""
     taken, numbers, names = set(header), dict[str, int](), list[str]()
     for name in header:
@@ -329,9 +337,10 @@ def _distinct(header: list[str]) -> list[str]:
     return names
 
 
-def _quickly(lines: list[str], first_line: int, table: _Table) -> _Parsed | None:
+def _parse_numeric_rows(lines: list[str], first_line: int,
+                        table: _FileHeader) -> _ParsedRows | None:
     """Parse rows of numbers by numpy; None where they contain anything else."""
-    if table.others:
+    if table.other_columns:
         return None
     if table.delimiter != ',':
         lines = [line.replace(',', '.') for line in lines]
@@ -346,20 +355,21 @@ def _quickly(lines: list[str], first_line: int, table: _Table) -> _Parsed | None
         arrays[quantity] = values[:, index] * factor
         if offset:
             arrays[quantity] += offset
-        if _wrong(values[:, index], quantity).any():
+        if _mask_invalid(values[:, index], quantity).any():
             return None
     return range(first_line, first_line + len(lines) + 1), arrays, {}
 
 
-def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int,
-               table: _Table) -> _Parsed:
+def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterator[str],
+                     first_line: int, table: _FileHeader) -> _ParsedRows:
     """
     Parse rows one by one, with the texts of other columns, and name the faulty row and column.
 
     A quoted text may span lines, and so take lines of the rest.
 
     """
-    reader = csv.reader(itertools.chain(lines, _bounded(rest, _BLOCK)), delimiter=table.delimiter)
+    reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines, _MAX_BLOCK_LENGTH)),
+                        delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):
@@ -373,14 +383,16 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
     if table.delimiter != ',':
         for index, _, _ in table.columns.values():
             texts[index] = tuple(text.replace(',', '.') for text in texts[index])
-    arrays = {quantity: _numbers(path, places, header[index], texts[index], quantity) * factor
-              + offset for quantity, (index, factor, offset) in table.columns.items()}
-    return places, arrays, {name: texts[index] for name, index in table.others.items()}
+    arrays = {
+        quantity: _parse_numbers(path, places, header[index], texts[index], quantity) * factor
+        + offset for quantity, (index, factor, offset) in table.columns.items()
+    }
+    return places, arrays, {name: texts[index] for name, index in table.other_columns.items()}
 
 
-def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...],
-             quantity: str) -> Array:
-    if quantity in _MAY_BE_LOST:
+def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
+                   texts: tuple[str, ...], quantity: str) -> Array:
+    if quantity in _NULLABLE_QUANTITIES:
         texts = tuple(text.strip() or 'nan' for text in texts)
     try:
         values = np.array(texts, dtype=np.float64)
@@ -390,45 +402,49 @@ def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[st
             for text in texts:
                 float(text)
                 row += 1
-        remedy = ('give seconds, or the sample rate with --rate' if quantity == 'time' else
-                  'leave the cell empty if the value is lost' if quantity in _MAY_BE_LOST else
-                  'correct or remove the row')
-        raise LogError(f'{path}: line {places[row]}, column {name}: {reprlib.repr(texts[row])} '
+        remedy = ('give seconds, or the sample rate with --rate'
+                  if quantity == 'time' else 'leave the cell empty if the value is lost'
+                  if quantity in _NULLABLE_QUANTITIES else 'correct or remove the row')
+        raise LogError(f'{path}: line {line_numbers[row]}, column {column}: '
+                       f'{reprlib.repr(texts[row])} '
                        f'is not a number; {remedy}') from None
-    wrong = _wrong(values, quantity)
+    wrong = _mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        fault = (f'beyond the limit of {_most(quantity):g}' if np.isfinite(values[row])
+        fault = (f'beyond the limit of {_max_magnitude(quantity):g}' if np.isfinite(values[row])
                  else 'not a finite number')
-        raise LogError(f'{path}: line {places[row]}, column {name}: {shown(texts[row])} '
+        raise LogError(f'{path}: line {line_numbers[row]}, column {column}: {excerpt(texts[row])} '
                        f'is {fault}; remove the row')
     return values
 
 
-def _wrong(values: Array, quantity: str) -> Mask:
+def _mask_invalid(values: Array, quantity: str) -> Mask:
     size = np.abs(values)
-    return size > LARGEST if quantity in _MAY_BE_LOST else ~(size <= _most(quantity))
+    return (size > MAX_MAGNITUDE
+            if quantity in _NULLABLE_QUANTITIES else ~(size <= _max_magnitude(quantity)))
 
 
-def _most(quantity: str) -> float:
-    return 1e5 if quantity == 'temperature' else LARGEST  # degC, or the unit of the quantity
+def _max_magnitude(quantity: str) -> float:
+    return 1e5 if quantity == 'temperature' else MAX_MAGNITUDE  # degC, or the unit of the quantity
 
 
-def shown(text: str) -> str:
+def excerpt(text: str) -> str:
     """Return the first 100 characters of a text of a file, for a message."""
-    return plain(text[:100])
+    return to_printable(text[:100])
 
 
-def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None,
-                 before: float) -> float:
+def _refuse_unordered_time(path: str | Path, line_numbers: Sequence[int], time: Array | None,
+                           previous_time: float) -> float:
     """Refuse time that does not increase, also from block to block; return the last time."""
     if time is None:
-        return before
-    late = ~(np.diff(time, prepend=before) >= SHORTEST)
+        return previous_time
+    late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))
-        raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s is not later '
-                       f'than {time[row - 1] if row else before:g} s; sort the rows, or give '
+        raise LogError(f'{path}: line {line_numbers[row]}, column time_s: {time[row]:g} s is not '
+                       'later '
+                       f'than {time[row - 1] if row else previous_time:g} s; sort the rows, or '
+                       'give '
                        'the sample rate with --rate')
     return float(time[-1])
 
@@ -450,26 +466,26 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     """
     header = [str(name) for name in table]
     try:
-        found = found_in(header, columns, axis)
+        found = find_columns(header, columns, axis)
         arrays: dict[str, Any] = {
             quantity: np.asarray(table[list(table)[index]], float) * factor + offset
             for quantity, (index, factor, offset) in found.items()}
     except (TypeError, ValueError) as error:
-        raise LogError(f'the table is no log: {reason(error)}') from None
+        raise LogError(f'the table is no log: {describe_error(error)}') from None
     shapes = {values.shape for values in arrays.values()}
     if len(shapes) > 1 or any(len(shape) != 1 or shape[0] < 2 for shape in shapes):
         raise LogError(f'the columns have shapes {sorted(shapes)}; wanted one shape (n,), with at '
                        'least two rows')
     for quantity, values in arrays.items():
-        if (wrong := _wrong(values, quantity)).any():
-            raise LogError(f'row {int(np.argmax(wrong))} of {header[found[quantity].place]} is '
+        if (wrong := _mask_invalid(values, quantity)).any():
+            raise LogError(f'row {int(np.argmax(wrong))} of {header[found[quantity].position]} is '
                            f'{values[np.argmax(wrong)]:g}; remove the row')
-    _refuse_time('the table', range(len(next(iter(arrays.values())))), arrays.get('time'),
-                 -math.inf)
+    _refuse_unordered_time('the table', range(len(next(iter(arrays.values())))),
+                           arrays.get('time'), -math.inf)
     return Log(**arrays)
 
 
-def part(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
+def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
     """Return some rows of a log."""
     which = np.arange(len(log))[rows]
     arrays: dict[str, Any] = {name: getattr(log, name)[which] for name in QUANTITIES
@@ -478,7 +494,8 @@ def part(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
     return replace(log, **arrays, others=others)
 
 
-def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Array, bool]:
+def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
+                   output: Array) -> tuple[Array, bool]:
     """
     Unwrap a heading, and return it with whether the gyro determined a number of turns.
 
@@ -488,7 +505,7 @@ def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Ar
 
     Parameters
     ----------
-    at, wrapped : times, s, and heading, rad, of shape (m,); nan where it was lost
+    reference_time, wrapped : times, s, and heading, rad, of shape (m,); nan where it was lost
     time, output : of the gyro, s and rad/s, shape (n,)
 
     Returns
@@ -501,12 +518,12 @@ def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Ar
         return heading, False
     plainly, rates = np.unwrap(wrapped[known]), np.nan_to_num(output)
     angle = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(time))])
-    turned, steps = np.interp(at[known], time, angle), np.diff(at[known])
+    turned, steps = np.interp(reference_time[known], time, angle), np.diff(reference_time[known])
     # as rates, since over a gap the unwrapped change may be wrong by any number of turns
     plain_rate, gyro_rate = np.diff(plainly) / steps, np.diff(turned) / steps
     sign = -1.0 if np.dot(plain_rate, gyro_rate) < 0.0 else 1.0
     bias = float(np.median(plain_rate - sign * gyro_rate))
-    expected = sign * turned + bias * at[known]
+    expected = sign * turned + bias * reference_time[known]
     heading[known] = expected + np.unwrap(wrapped[known] - expected)
     return heading, bool(np.abs(np.diff(heading[known]) - np.diff(plainly)).max() > np.pi)
 
@@ -539,32 +556,36 @@ def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = Non
 def write_log_blocks(path: str | Path,
                      blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
     """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
-    with (replacing(path) as file,
+    with (open_replacement(path) as file,
           # without a time, so that the same log gives the same file
           gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
           if str(path).endswith('.gz') else nullcontext(file) as data):
         for number, (log, more) in enumerate(blocks):
-            data.write(_text(log, more, headed=number == 0).encode('utf-8', 'backslashreplace'))
+            data.write(
+                _format_rows(log, more,
+                             with_header=number == 0).encode('utf-8', 'backslashreplace'))
 
 
-def _text(log: Log, more: Mapping[str, Array], headed: bool) -> str:
+def _format_rows(log: Log, extra_columns: Mapping[str, Array], with_header: bool) -> str:
     columns: dict[str, Sequence[Any]] = {}
     for name, (quantity, factor) in COLUMNS.items():
         values = getattr(log, quantity)
         if factor == 1.0 and values is not None:
             columns[name] = values.tolist()
-    columns.update({name: list(map(_unix, texts)) for name, texts in log.others.items()})
+    columns.update({
+        name: list(map(_normalize_newlines, texts)) for name, texts in log.others.items()
+    })
     columns.update({name: np.asarray(values, dtype=float).tolist()
-                    for name, values in more.items()})
+                    for name, values in extra_columns.items()})
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
-    if headed:
+    if with_header:
         text.writelines(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
         writer.writerow(columns)
     writer.writerows(zip(*columns.values()))
     return text.getvalue()
 
 
-def _unix(text: str) -> str:
+def _normalize_newlines(text: str) -> str:
     """Return a text with its line ends as newlines."""
     return text.replace('\r\n', '\n').replace('\r', '\n') if '\r' in text else text

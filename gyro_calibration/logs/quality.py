@@ -21,7 +21,7 @@ from scipy.special import ndtri
 
 #: Least alignment of codes on a lattice (length of the mean phasor): 1 for exact codes, 0 for
 #: continuous values.
-_ALIGNED = 0.7
+_MIN_ALIGNMENT = 0.7
 
 
 def robust_deviation(values: Array) -> float:
@@ -29,7 +29,7 @@ def robust_deviation(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values)))
 
 
-def white_noise(values: Array, order: int = 3) -> float:
+def white_noise_deviation(values: Array, order: int = 3) -> float:
     """
     Return the standard deviation of the white part of a signal, by its differences.
 
@@ -47,36 +47,36 @@ def white_noise(values: Array, order: int = 3) -> float:
 
 
 @dataclass(frozen=True)
-class Codes:
+class QuantizationCodes:
     """The distinct values of an output in order, and their counts: arrays of shape (m,)."""
 
     values: Array
     counts: Array
     step: float = 0.0  # between neighbouring codes; 0 where there is no such step
-    aligned: float = 0.0  # alignment of the codes with multiples of the step, 0 to 1
-    deviation: float = 0.0  # standard deviation of the step
+    alignment: float = 0.0  # alignment of the codes with multiples of the step, 0 to 1
+    step_deviation: float = 0.0  # standard deviation of the step
 
 
-def codes_of(values: Array) -> Codes:
+def find_codes(values: Array) -> QuantizationCodes:
     """Return the codes of values without nan, with the coarsest step that fits them."""
     found, counts = np.unique(values, return_counts=True)
     # a conversion of units may round equal values differently
     apart = np.concatenate([[True], np.diff(found) > 1e-12 * np.abs(found[[0, -1]]).max()])
     first = np.flatnonzero(apart)
-    codes = Codes(found[first], np.add.reduceat(counts, first))
+    codes = QuantizationCodes(found[first], np.add.reduceat(counts, first))
     gaps = np.diff(codes.values)
     if not gaps.size:
         return codes
     # where many codes do not occur, few gaps are as small as the step
     for start in sorted({float(gap) for gap in np.quantile(
             gaps, (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5))}, reverse=True):
-        step, aligned, deviation = _lattice(codes, start)
-        if aligned > _ALIGNED:
-            return Codes(codes.values, codes.counts, step, aligned, deviation)
+        step, aligned, deviation = _refine_step(codes, start)
+        if aligned > _MIN_ALIGNMENT:
+            return QuantizationCodes(codes.values, codes.counts, step, aligned, deviation)
     return codes
 
 
-def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
+def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, float]:
     """Refine a step from near to far codes; return step, alignment and deviation."""
     gaps = np.diff(codes.values)
     near = gaps < 8.5 * step
@@ -90,14 +90,14 @@ def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
     while True:
         within = np.abs(place) < reach * step
         aligned, offset = _alignment(place[within], codes.counts[within], step)
-        if aligned < _ALIGNED:
+        if aligned < _MIN_ALIGNMENT:
             return step, aligned, deviation
         number = np.rint((place[within] - offset) / step)
         if np.ptp(number) > 0.0:
-            step, off, spread = _line(number, place[within])
+            step, off, spread = _fit_line(number, place[within])
             good = np.abs(off) <= 0.3 * abs(step)
             if np.ptp(number[good]) > 0.0:
-                step, off, spread = _line(number[good], place[within][good])
+                step, off, spread = _fit_line(number[good], place[within][good])
             deviation = float(np.std(off) / spread)
         if within.all():
             return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
@@ -117,7 +117,7 @@ def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
     return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
 
 
-def _line(number: Array, place: Array) -> tuple[float, Array, float]:
+def _fit_line(number: Array, place: Array) -> tuple[float, Array, float]:
     """Return slope and residuals of positions, and the root of the sum of squares of numbers."""
     centred, apart = number - number.mean(), place - place.mean()
     squares = float(centred @ centred)
@@ -127,16 +127,16 @@ def _line(number: Array, place: Array) -> tuple[float, Array, float]:
 
 def quantization_step(values: Array) -> float:
     """Return the quantization step of an encoder or a digital output; 0 without one."""
-    return codes_of(values).step
+    return find_codes(values).step
 
 
-def runs(mask: Mask) -> list[slice]:
+def find_runs(mask: Mask) -> list[slice]:
     """Return the slices of consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
     return [slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2])]
 
 
-def outliers(values: Array, limit: float) -> Mask:
+def mask_outliers(values: Array, limit: float) -> Mask:
     """
     Mark single samples beyond a limit from their neighbours and from the median.
 
@@ -155,7 +155,7 @@ def outliers(values: Array, limit: float) -> Mask:
                             for off in (alone, values - np.median(values))))
 
 
-def repeated_samples(output: Array) -> Mask:
+def mask_repeated_samples(output: Array) -> Mask:
     """Mark repeats of a value in runs longer than its share of the samples explains."""
     repeated = np.zeros(len(output), dtype=bool)
     share = np.unique(output, return_counts=True)[1].max() / len(output)
@@ -164,7 +164,7 @@ def repeated_samples(output: Array) -> Mask:
     if share > 0.9:
         return repeated
     longest = math.log(1e-6 / len(output)) / math.log(share)
-    for run in runs(np.concatenate([[False], np.diff(output) == 0.0])):
+    for run in find_runs(np.concatenate([[False], np.diff(output) == 0.0])):
         repeated[run] = run.stop - run.start > longest
     return repeated
 
@@ -190,7 +190,7 @@ def refuse_saturated(output: Array) -> None:
 
     """
     values, counts = np.unique(output, return_counts=True)
-    if len(values) < 2 or not _noise_is_resolved(output):
+    if len(values) < 2 or not _is_noise_resolved(output):
         return
     for end, neighbour in ((-1, -2), (0, 1)):
         if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
@@ -200,7 +200,7 @@ def refuse_saturated(output: Array) -> None:
                 'wider range')
 
 
-def _noise_is_resolved(output: Array) -> bool:
+def _is_noise_resolved(output: Array) -> bool:
     """
     Tell whether a fifth of neighbouring samples differ where the rate is steady.
 

@@ -29,32 +29,32 @@ from typing import Any
 
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
-from gyro_calibration.logs.log import Array, Log, LogError, Mask, ROWS, unwrapped
+from gyro_calibration.logs.log import Array, BLOCK_ROWS, Log, LogError, Mask, unwrap_heading
 from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_messages
 import numpy as np
 from numpy.typing import NDArray
 
 _Nanoseconds = NDArray[np.int64]
 
-REFERENCES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
+REFERENCE_TYPES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
 #: Role of a topic -> the option that names it, and its possible message types.
 _ROLES = {
     'gyro': ('--topic', (cdr.IMU,)),
     'temperature': ('--temperature-topic', (cdr.TEMPERATURE,)),
-    'reference': ('--reference-topic', REFERENCES),
+    'reference': ('--reference-topic', REFERENCE_TYPES),
 }
 
 #: Largest step back of stamps by messages out of order, s; a larger one means that a clock was
 #: set.
-_LARGEST_STEP_BACK = 1.0
+_MAX_STEP_BACK = 1.0
 #: Largest number of topics in a message.
-_MOST_LISTED = 20
+_MAX_LISTED_TOPICS = 20
 #: Time without a temperature beyond which a note is made, s; gyros take minutes to warm up.
-_LONG_WITHOUT_TEMPERATURE = 30.0
+_MAX_TEMPERATURE_GAP = 30.0
 
 #: Role -> quantities, of which its topic must have one.
-_NEEDED = {'gyro': {'rate'}, 'temperature': {'temperature'},
-           'reference': {'rate', 'orientation.w'}}
+_REQUIRED_QUANTITIES = {'gyro': {'rate'}, 'temperature': {'temperature'},
+                        'reference': {'rate', 'orientation.w'}}
 
 
 @dataclass(frozen=True)
@@ -72,24 +72,24 @@ class Topics:
     axis: str = 'z'
 
 
-def wrong_kind(role: str, topic: str, kind: str) -> str:
+def topic_type_fault(role: str, topic: str, kind: str) -> str:
     """Return why the message type of a topic does not fit its role; '' if it does."""
     option, kinds = _ROLES[role]
-    return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_listed(kinds, "or")}'
+    return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_join_names(kinds, "or")}'
 
 
-def _same(topic: str, other: str | None) -> bool:
+def _is_same_topic(topic: str, other: str | None) -> bool:
     return topic.strip('/') == (other or '').strip('/')
 
 
-class _Series:
+class _TopicBuffer:
     """Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities."""
 
     def __init__(self, topic: str, kind: str, definition: str, axis: str):
-        self.topic, self.kind, self.damaged = topic, kind, 0
-        self._layout = cdr.layout_of(definition, axis)
+        self.topic, self.kind, self.damaged_count = topic, kind, 0
+        self._layout = cdr.parse_layout(definition, axis)
         self.quantities = tuple(self._layout.quantities)
-        self._kept = tuple(self._layout.quantities.values())
+        self._kept_indices = tuple(self._layout.quantities.values())
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
 
     def __len__(self) -> int:
@@ -101,24 +101,24 @@ class _Series:
             stamp, numbers = cdr.parse(message.data, self._layout)
             self._received.append(message.received)
         except (MessageError, OverflowError):
-            self.damaged += 1
+            self.damaged_count += 1
             return
         self._stamps.append(stamp)
-        self._numbers.extend([numbers[place] for place in self._kept])
+        self._numbers.extend([numbers[place] for place in self._kept_indices])
 
-    def by_arrival(self) -> _Course:
+    def sort_by_arrival(self) -> _TopicSeries:
         """Return the messages in the order of receipt."""
         received = np.frombuffer(self._received, np.int64)
         numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
-        course = _Course(self.topic, self.kind, np.frombuffer(self._stamps, np.int64), received,
-                         numbers, self.quantities)
+        course = _TopicSeries(self.topic, self.kind, np.frombuffer(self._stamps, np.int64),
+                              received, numbers, self.quantities)
         # no copy where they are in order already
         return (course if (received[1:] >= received[:-1]).all()
-                else course.taken(np.argsort(received, kind='stable')))
+                else course.select(np.argsort(received, kind='stable')))
 
 
 @dataclass(frozen=True)
-class _Course:
+class _TopicSeries:
     """Stamps and times of receipt of a topic, ns, shape (n,), and numbers, shape (n, m)."""
 
     topic: str
@@ -137,7 +137,7 @@ class _Course:
             return np.zeros(len(self))
         return self.numbers[:, self.quantities.index(quantity)]
 
-    def reports(self, quantity: str) -> bool:
+    def is_reported(self, quantity: str) -> bool:
         """Return whether the messages have a quantity and do not declare it unknown."""
         return quantity in self.quantities and not (
             self.values(f'{quantity} variance') == cdr.NOT_REPORTED).all()
@@ -147,15 +147,15 @@ class _Course:
         """Return whether the headers have stamps; else they are zero or all the same."""
         return bool(self.stamps.any()) and (len(self) < 2 or int(np.ptp(self.stamps)) > 0)
 
-    def taken(self, which: Mask | NDArray[np.intp]) -> _Course:
+    def select(self, which: Mask | NDArray[np.intp]) -> _TopicSeries:
         return replace(self, stamps=self.stamps[which], received=self.received[which],
                        numbers=self.numbers[which])
 
-    def timed(self, use_stamps: bool) -> _Course:
+    def with_times(self, use_stamps: bool) -> _TopicSeries:
         """Return the series with stamps, or times of receipt, as its stamps."""
         if not use_stamps:
             return replace(self, stamps=self.received)
-        return self if self.stamps.all() else self.taken(self.stamps != 0)
+        return self if self.stamps.all() else self.select(self.stamps != 0)
 
 
 def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | None = None,
@@ -177,20 +177,20 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     LogError : it cannot be read, or has no gyro or several; names its topics
 
     """
-    contents, series = Contents(), dict[str, _Series]()
+    contents, series = Contents(), dict[str, _TopicBuffer]()
     for message in read_messages(path, contents, on_progress):
         if message.topic not in series:
-            axis = 'z' if _same(message.topic, topics.reference) else topics.axis
-            series[message.topic] = _Series(message.topic, message.kind,
-                                            contents.definitions[message.kind], axis)
+            axis = 'z' if _is_same_topic(message.topic, topics.reference) else topics.axis
+            series[message.topic] = _TopicBuffer(message.topic, message.kind,
+                                                 contents.definitions[message.kind], axis)
         series[message.topic].add(message)
-    log = _Reader(path, topics, contents, series).log(rate)
+    log = _LogBuilder(path, topics, contents, series).build(rate)
     for note in log.notes:
         on_note(note)
-    return replace(log, notes=(*log.notes, *contents.about))
+    return replace(log, notes=(*log.notes, *contents.recorder_notes))
 
 
-def blocks_of(log: Log, rows: int = ROWS) -> Iterator[Log]:
+def split_blocks(log: Log, rows: int = BLOCK_ROWS) -> Iterator[Log]:
     """Give a log in blocks, as a log file is read."""
     for begin in range(0, len(log), rows):
         here = slice(begin, begin + rows)
@@ -199,141 +199,148 @@ def blocks_of(log: Log, rows: int = ROWS) -> Iterator[Log]:
         yield replace(log, **pieces)
 
 
-class _Reader:
+class _LogBuilder:
     """Makes a log of the messages of a recording, with notes on selections and corrections."""
 
     def __init__(self, path: str | Path, topics: Topics, contents: Contents,
-                 series: dict[str, _Series]):
+                 series: dict[str, _TopicBuffer]):
         self._path, self._topics, self._contents, self._series = path, topics, contents, series
         self._notes = [f'ROS 2 recording {Path(path).name}']
 
-    def log(self, rate: float | None) -> Log:
+    def build(self, rate: float | None) -> Log:
         wanted = self._topics.gyro
-        gyro = self._course(self._named(wanted, 'gyro') if wanted else self._only_imu())
-        if not gyro.reports('rate'):
+        gyro = self._topic_series(
+            self._find_topic(wanted, 'gyro') if wanted else self._find_only_imu())
+        if not gyro.is_reported('rate'):
             raise LogError(f'{self._path}: {gyro.topic} declares that it reports no angular '
                            'velocity; name another by --topic')
-        reference, temperature = self._reference(), self._temperature_topic()
+        reference, temperature = self._find_reference(), self._find_temperature()
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:
             self._notes.append('headers have no stamps: times are those at which messages were '
                                'received')
-        gyro = self._in_order(gyro.timed(use_stamps), rate)
+        gyro = self._order_samples(gyro.with_times(use_stamps), rate)
         time = (gyro.stamps - gyro.stamps[0]) / NSEC_PER_SEC
         self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, '
-                           f'time_s from {_seconds(gyro.stamps[0])} s on')
+                           f'time_s from {_format_seconds(gyro.stamps[0])} s on')
         output = gyro.values('rate').copy()
         lost = ~np.isfinite(output)
         if lost.any():
             self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
                                'as lost')
             output[lost] = np.nan
-        log = Log(output=output, time=time, specific_force=self._force(gyro))
+        log = Log(output=output, time=time, specific_force=self._specific_force(gyro))
         if temperature is not None:
-            times = temperature.timed(use_stamps and temperature.has_stamps)
-            log = replace(log, temperature=self._temperature(times, gyro.stamps[0], time))
+            times = temperature.with_times(use_stamps and temperature.has_stamps)
+            log = replace(log,
+                          temperature=self._interpolate_temperature(times, gyro.stamps[0], time))
         if reference is not None:
-            log = replace(log, **self._referred(reference.timed(use_stamps), gyro, time,
-                                                log.output))
+            log = replace(
+                log,
+                **self._interpolate_reference(reference.with_times(use_stamps), gyro, time,
+                                              log.output))
         if rate is not None:
             log = replace(log, time=np.arange(len(gyro)) / rate)
         return replace(log, notes=(*self._notes, *self._contents.notes))
 
     # Which topics
 
-    def _only_imu(self) -> str:
-        found = [topic for topic in self._of_kind((cdr.IMU,))
-                 if not _same(topic, self._topics.reference)]
+    def _find_only_imu(self) -> str:
+        found = [topic for topic in self._topics_of_type((cdr.IMU,))
+                 if not _is_same_topic(topic, self._topics.reference)]
         if len(found) == 1:
             return found[0]
         if found:
-            raise LogError(f'{self._path}: several gyros, {_listed(found)}; '
+            raise LogError(f'{self._path}: several gyros, {_join_names(found)}; '
                            'select one with --topic')
         reasons = ''.join(f' ({note})' for note in self._contents.notes)
         raise LogError(f'{self._path}: no message of {cdr.IMU} in it{reasons}'
-                       f'{self._what_there_is()}; record the topic of the gyro')
+                       f'{self._list_topics()}; record the topic of the gyro')
 
-    def _reference(self) -> _Course | None:
+    def _find_reference(self) -> _TopicSeries | None:
         wanted = self._topics.reference
         if wanted is None:
-            found = [topic for topic in self._of_kind(REFERENCES)
+            found = [topic for topic in self._topics_of_type(REFERENCE_TYPES)
                      if self._series[topic].kind != cdr.IMU]
             if found:
                 self._notes.append('no reference was asked for; --reference-topic may be '
-                                   f'{_listed(found)}')
+                                   f'{_join_names(found)}')
             return None
-        return self._course(self._named(wanted, 'reference'))
+        return self._topic_series(self._find_topic(wanted, 'reference'))
 
-    def _temperature_topic(self) -> _Course | None:
+    def _find_temperature(self) -> _TopicSeries | None:
         wanted = self._topics.temperature
         if wanted is not None:
-            return self._course(self._named(wanted, 'temperature'))
-        found = self._of_kind((cdr.TEMPERATURE,))
+            return self._topic_series(self._find_topic(wanted, 'temperature'))
+        found = self._topics_of_type((cdr.TEMPERATURE,))
         if not found:
             return None
-        gyro = self._topics.gyro or self._only_imu()
+        gyro = self._topics.gyro or self._find_only_imu()
         near = max(found, key=lambda topic: len(
             os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
         if len(found) > 1:
-            self._notes.append(f'of the temperatures {_listed(found)}, the one whose name is '
+            self._notes.append(f'of the temperatures {_join_names(found)}, the one whose name is '
                                'nearest to the topic of the gyro is used')
-        return self._course(near)
+        return self._topic_series(near)
 
-    def _named(self, wanted: str, role: str) -> str:
+    def _find_topic(self, wanted: str, role: str) -> str:
         topic = next((topic for topic in self._contents.topics
-                      if _same(topic, wanted)), None)
+                      if _is_same_topic(topic, wanted)), None)
         if topic is None:
-            raise LogError(f'{self._path}: no topic {wanted}{self._what_there_is()}; '
+            raise LogError(f'{self._path}: no topic {wanted}{self._list_topics()}; '
                            f'name one of them by {_ROLES[role][0]}')
         kind = self._contents.topics[topic]
         definition = self._contents.definitions.get(kind)
-        found = cdr.layout_of(definition).quantities if definition else {}
-        if not _NEEDED[role] & set(found) and (wrong := wrong_kind(role, topic, kind)):
+        found = cdr.parse_layout(definition).quantities if definition else {}
+        if (not _REQUIRED_QUANTITIES[role] & set(found)
+                and (wrong := topic_type_fault(role, topic, kind))):
             raise LogError(f'{self._path}: {wrong}')
         if topic not in self._series or not len(self._series[topic]):
             raise LogError(f'{self._path}: {topic} has no message that can be read; record again')
         return topic
 
-    def _of_kind(self, kinds: Sequence[str]) -> list[str]:
+    def _topics_of_type(self, kinds: Sequence[str]) -> list[str]:
         return sorted(topic for topic, series in self._series.items()
                       if series.kind in kinds and len(series))
 
-    def _what_there_is(self) -> str:
+    def _list_topics(self) -> str:
         topics = [f'{topic} ({kind})' for topic, kind in sorted(self._contents.topics.items())]
-        return f'; there are {_listed(topics)}' if topics else ', which holds no topic at all'
+        return f'; there are {_join_names(topics)}' if topics else ', which holds no topic at all'
 
-    def _course(self, topic: str) -> _Course:
+    def _topic_series(self, topic: str) -> _TopicSeries:
         series = self._series[topic]
-        if series.damaged:
-            self._notes.append(f'{series.damaged} messages of {topic} could not be read and were '
+        if series.damaged_count:
+            self._notes.append(f'{series.damaged_count} messages of {topic} could not be read and '
+                               'were '
                                'left out')
-        return series.by_arrival()
+        return series.sort_by_arrival()
 
     # The gyro
 
-    def _in_order(self, gyro: _Course, rate: float | None) -> _Course:
+    def _order_samples(self, gyro: _TopicSeries, rate: float | None) -> _TopicSeries:
         """Sort samples by their stamps, leave out duplicates, and refuse unusable times."""
-        gyro = (self._single(self._sorted(gyro)) if rate is None
+        gyro = (self._drop_duplicates(self._sort_by_stamp(gyro)) if rate is None
                 else replace(gyro, stamps=np.maximum.accumulate(gyro.stamps)))
         if len(gyro) < 2:
             raise LogError(f'{self._path}: {gyro.topic} has {len(gyro)} samples with a time; '
                            'a log has at least two: record more')
         return gyro
 
-    def _sorted(self, gyro: _Course) -> _Course:
+    def _sort_by_stamp(self, gyro: _TopicSeries) -> _TopicSeries:
         back = np.maximum.accumulate(gyro.stamps) - gyro.stamps
         if not back.any():
             return gyro
-        if back.max() > _LARGEST_STEP_BACK * NSEC_PER_SEC:
-            place = int(np.argmax(back > _LARGEST_STEP_BACK * NSEC_PER_SEC))
+        if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
+            place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
             raise LogError(
-                f'{self._path}: the stamps of {gyro.topic} step back by {_seconds(back[place])} s '
+                f'{self._path}: the stamps of {gyro.topic} step back by '
+                f'{_format_seconds(back[place])} s '
                 f'at sample {place + 1}, as after setting a clock; split the recording there, or '
                 'give the sample rate with --rate')
         self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were sorted')
-        return gyro.taken(np.argsort(gyro.stamps, kind='stable'))
+        return gyro.select(np.argsort(gyro.stamps, kind='stable'))
 
-    def _single(self, gyro: _Course) -> _Course:
+    def _drop_duplicates(self, gyro: _TopicSeries) -> _TopicSeries:
         doubled = np.diff(gyro.stamps, prepend=gyro.stamps[:1] - 1) == 0
         if not doubled.any():
             return gyro
@@ -347,9 +354,9 @@ class _Reader:
                            'give the sample rate with --rate')
         self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one '
                            'were left out')
-        return gyro.taken(~doubled)
+        return gyro.select(~doubled)
 
-    def _force(self, gyro: _Course) -> Array | None:
+    def _specific_force(self, gyro: _TopicSeries) -> Array | None:
         """Return the specific force along z, or None if it is not reported or never filled in."""
         force = gyro.values('force')
         if (gyro.values('force variance') == cdr.NOT_REPORTED).any() or not force.any():
@@ -361,7 +368,8 @@ class _Reader:
 
     # Temperature and reference
 
-    def _temperature(self, course: _Course, begin: np.int64, time: Array) -> Array | None:
+    def _interpolate_temperature(self, series: _TopicSeries, begin: np.int64,
+                                 time: Array) -> Array | None:
         """
         Return the temperature at the samples, by linear interpolation between readings.
 
@@ -369,35 +377,35 @@ class _Reader:
         up, so interpolation is closer than the last reading, which a robot has to use.
 
         """
-        course = _rising(course.taken(np.isfinite(course.values('temperature'))))
-        at = (course.stamps - begin) / NSEC_PER_SEC
-        if (not len(at) or at[0] > time[-1] + _LONG_WITHOUT_TEMPERATURE
-                or at[-1] < -_LONG_WITHOUT_TEMPERATURE):
-            self._notes.append(f'temperature: {course.topic} has none at the times of the gyro, '
+        series = _unique_stamps(series.select(np.isfinite(series.values('temperature'))))
+        at = (series.stamps - begin) / NSEC_PER_SEC
+        if (not len(at) or at[0] > time[-1] + _MAX_TEMPERATURE_GAP
+                or at[-1] < -_MAX_TEMPERATURE_GAP):
+            self._notes.append(f'temperature: {series.topic} has none at the times of the gyro, '
                                'and was left out')
             return None
-        self._notes.append(f'temperature: {course.topic} ({course.kind}), {len(at)} readings')
+        self._notes.append(f'temperature: {series.topic} ({series.kind}), {len(at)} readings')
         inside = at[(at >= 0.0) & (at <= time[-1])]
         longest = float(np.diff(np.concatenate([[0.0], inside, time[-1:]])).max())
-        if longest > _LONG_WITHOUT_TEMPERATURE:
+        if longest > _MAX_TEMPERATURE_GAP:
             self._notes.append(f'no temperature came for up to {longest:.0f} s; '
                                'it was interpolated, or held at the ends')
-        return np.interp(time, at, course.values('temperature'))
+        return np.interp(time, at, series.values('temperature'))
 
-    def _referred(self, course: _Course, gyro: _Course, time: Array,
-                  output: Array | None) -> dict[str, Any]:
+    def _interpolate_reference(self, series: _TopicSeries, gyro: _TopicSeries, time: Array,
+                               output: Array | None) -> dict[str, Any]:
         """Return heading and rate of a reference at the samples of the gyro; nan where lost."""
-        if course.topic == gyro.topic:
+        if series.topic == gyro.topic:
             raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; '
                            'name another by --reference-topic')
-        course = _rising(course)
-        at, wrapped = (course.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _headings(course)
-        rate = course.values('rate') if course.reports('rate') else None
+        series = _unique_stamps(series)
+        at, wrapped = (series.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _wrapped_headings(series)
+        rate = series.values('rate') if series.is_reported('rate') else None
         if rate is not None:
             rate = np.where(np.isfinite(rate), rate, np.nan)
         heading = None
         if wrapped is not None:  # without its jumps by whole turns
-            heading, by_gyro = unwrapped(at, wrapped, time, np.asarray(output))
+            heading, by_gyro = unwrap_heading(at, wrapped, time, np.asarray(output))
             if by_gyro:
                 self._notes.append('the reference turned by more than half a turn between two '
                                    'values; the number of turns was taken from the gyro')
@@ -406,61 +414,62 @@ class _Reader:
             self._notes.append('the rates of the reference are all zero, and were left out')
             rate = None
         found: dict[str, Any] = {
-            name: interpolated(time, at, values)
+            name: interpolate_with_gaps(time, at, values)
             for name, values in (('reference_heading', heading), ('reference_rate', rate))
             if values is not None and np.isfinite(values).sum() > 1}
         if not any(np.isfinite(values).any() for values in found.values()):
-            raise LogError(f'{self._path}: {course.topic} has no heading and no rate at the '
+            raise LogError(f'{self._path}: {series.topic} has no heading and no rate at the '
                            'times of the gyro; name another reference, or check that both '
                            'clocks agree')
         lost = np.isnan(next(iter(found.values()))).mean()
-        self._notes.append(f'reference: {course.topic} ({course.kind}), {len(at)} values, '
+        self._notes.append(f'reference: {series.topic} ({series.kind}), {len(at)} values, '
                            f'lost for {100 * lost:.1f} % of the samples')
         return found
 
 
-def _rising(course: _Course) -> _Course:
+def _unique_stamps(series: _TopicSeries) -> _TopicSeries:
     """Return the series sorted by stamps, without duplicates."""
-    return course.taken(np.unique(course.stamps, return_index=True)[1])
+    return series.select(np.unique(series.stamps, return_index=True)[1])
 
 
-def _headings(course: _Course) -> Array | None:
+def _wrapped_headings(series: _TopicSeries) -> Array | None:
     """Return the rotation about z, wrapped, nan where invalid; None if not reported."""
-    if not course.reports('orientation.w'):
+    if not series.is_reported('orientation.w'):
         return None
-    x, y, z, w = (course.values(f'orientation.{each}') for each in 'xyzw')
-    variance = course.values('orientation variance')
+    x, y, z, w = (series.values(f'orientation.{each}') for each in 'xyzw')
+    variance = series.values('orientation variance')
     # declared unknown by an Imu, or left at its default
-    if 'orientation variance' in course.quantities and (
+    if 'orientation variance' in series.quantities and (
             (variance == cdr.NOT_REPORTED).all()
             or not (x.any() or y.any() or z.any() or variance.any()) and (w == 1.0).all()):
         return None
-    heading: Array = cdr.heading_of(x, y, z, w)
+    heading: Array = cdr.quaternion_heading(x, y, z, w)
     return heading
 
 
-def interpolated(time: Array, at: Array, values: Array) -> Array:
+def interpolate_with_gaps(time: Array, known_time: Array, values: Array) -> Array:
     """
     Return values interpolated at other times; nan in gaps.
 
     A gap is longer than 5 median intervals and longer than 0.1 s.
 
     """
-    at, values = at[np.isfinite(values)], values[np.isfinite(values)]
-    if len(at) < 2:
+    known_time, values = known_time[np.isfinite(values)], values[np.isfinite(values)]
+    if len(known_time) < 2:
         return np.full(len(time), np.nan)
-    longest = max(5.0 * float(np.median(np.diff(at))), 0.1)
-    place = np.clip(np.searchsorted(at, time, 'right') - 1, 0, len(at) - 2)
-    inside = (time >= at[0]) & (time <= at[-1])
-    close = (at[place + 1] - at[place] <= longest) | (time == at[place]) | (time == at[place + 1])
-    return np.where(inside & close, np.interp(time, at, values), np.nan)
+    longest = max(5.0 * float(np.median(np.diff(known_time))), 0.1)
+    place = np.clip(np.searchsorted(known_time, time, 'right') - 1, 0, len(known_time) - 2)
+    inside = (time >= known_time[0]) & (time <= known_time[-1])
+    close = ((known_time[place + 1] - known_time[place] <= longest) | (time == known_time[place]) |
+             (time == known_time[place + 1]))
+    return np.where(inside & close, np.interp(time, known_time, values), np.nan)
 
 
-def _seconds(nanoseconds: np.int64) -> str:
+def _format_seconds(nanoseconds: np.int64) -> str:
     return f'{int(nanoseconds) // NSEC_PER_SEC}.{int(nanoseconds) % NSEC_PER_SEC:09d}'
 
 
-def _listed(names: Sequence[str], word: str = 'and') -> str:
-    if len(names) > _MOST_LISTED:
-        names = [*names[:_MOST_LISTED], f'{len(names) - _MOST_LISTED} more']
+def _join_names(names: Sequence[str], word: str = 'and') -> str:
+    if len(names) > _MAX_LISTED_TOPICS:
+        names = [*names[:_MAX_LISTED_TOPICS], f'{len(names) - _MAX_LISTED_TOPICS} more']
     return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} {word} {names[-1]}'

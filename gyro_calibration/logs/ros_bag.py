@@ -44,22 +44,29 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 import zlib
 
-from gyro_calibration.files import GROWN, GROWTH, opened, plain, reason, remedy
-from gyro_calibration.logs.cdr import DEFINITIONS, layout_of, MessageError
-from gyro_calibration.logs.log import LogError, shown
+from gyro_calibration.files import (
+    describe_error,
+    MAX_EXPANSION_RATIO,
+    MIN_EXPANSION_BYTES,
+    open_regular_file,
+    remedy,
+    to_printable,
+)
+from gyro_calibration.logs.cdr import DEFINITIONS, MessageError, parse_layout
+from gyro_calibration.logs.log import excerpt, LogError
 
 #: Largest record or chunk that is read, bytes; recorders make chunks of 1 to 10 MB.
-LARGEST = 1 << 28
-_PIECE = 1 << 20
+MAX_RECORD_BYTES = 1 << 28
+_READ_BYTES = 1 << 20
 
 _MAGIC = b'\x89MCAP0\r\n'
 _ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
 #: Name of the metadata record of this program.
-ABOUT = 'gyro_calibration'
+METADATA_NAME = 'gyro_calibration'
 
-_TABLES = {'topics', 'messages', 'message_definitions'}
+_KNOWN_TABLES = {'topics', 'messages', 'message_definitions'}
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
-_ROWS = """
+_MESSAGES_QUERY = """
     SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
            CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
            CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
@@ -90,32 +97,32 @@ class Contents:
     topics: dict[str, str] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
     #: Notes of the recorder, and notes on the reading.
-    about: list[str] = field(default_factory=list)
+    recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     #: Number of parts that are damaged or too large.
-    left_out: int = 0
+    skipped_parts: int = 0
 
-    def is_useful(self, kind: str, definition: str) -> bool:
+    def keep_definition(self, kind: str, definition: str) -> bool:
         """Tell whether a message type has known quantities, and store its definition."""
         if kind not in self.definitions:
             with suppress(MessageError):
                 definition = DEFINITIONS.get(kind, definition)
-                if layout_of(definition).quantities:
+                if parse_layout(definition).quantities:
                     self.definitions[kind] = definition
         return kind in self.definitions
 
 
-def _printable(text: object) -> str:
+def _to_short_line(text: object) -> str:
     """Return a text of a file as one line of at most 200 printable characters."""
-    return plain(' '.join(str(text).split()))[:200]
+    return to_printable(' '.join(str(text).split()))[:200]
 
 
 def is_recording(path: str | Path) -> bool:
     """Return whether a path is a folder or has the name of a recording."""
-    return os.path.isdir(path) or _kind_of(Path(path)) is not None
+    return os.path.isdir(path) or _recording_suffix(Path(path)) is not None
 
 
-def files_of(path: str | Path) -> list[Path]:
+def list_recording_files(path: str | Path) -> list[Path]:
     """
     Return the files of a recording in order, or raise `LogError` where there are none.
 
@@ -126,9 +133,9 @@ def files_of(path: str | Path) -> list[Path]:
     if not os.path.isdir(path):
         return [path]
     try:
-        found = [file for file in path.iterdir() if file.is_file() and _kind_of(file)]
+        found = [file for file in path.iterdir() if file.is_file() and _recording_suffix(file)]
     except OSError as error:
-        raise LogError(f'{path}: cannot be read ({reason(error)}); '
+        raise LogError(f'{path}: cannot be read ({describe_error(error)}); '
                        f'{remedy(error, path)}') from error
     if not found:
         raise LogError(f'{path}: a folder without an .mcap or .db3 file; '
@@ -155,73 +162,75 @@ def read_messages(path: str | Path, contents: Contents,
     """
     done = 0
 
-    def shifted(place: int) -> None:
+    def report_progress(place: int) -> None:
         on_progress(done + place)
 
-    for file in files_of(path):
+    for file in list_recording_files(path):
         try:
-            with _unpacked_file(file) as source:
-                read = _from_mcap if _kind_of(file) == '.mcap' else _from_database
-                yield from read(source, file, contents, shifted)
+            with _open_uncompressed(file) as source:
+                read = _read_mcap if _recording_suffix(file) == '.mcap' else _read_database
+                yield from read(source, file, contents, report_progress)
             done += file.stat().st_size
         except OSError as error:
-            raise LogError(f'{file}: cannot be read ({reason(error)}); '
+            raise LogError(f'{file}: cannot be read ({describe_error(error)}); '
                            f'{remedy(error, file)}') from error
-    if contents.left_out:
-        parts = ('part of the recording was' if contents.left_out == 1
+    if contents.skipped_parts:
+        parts = ('part of the recording was' if contents.skipped_parts == 1
                  else 'parts of the recording were')
-        contents.notes.append(f'{contents.left_out} damaged or oversized {parts} left out')
+        contents.notes.append(f'{contents.skipped_parts} damaged or oversized {parts} left out')
 
 
-def _kind_of(path: Path) -> str | None:
+def _recording_suffix(path: Path) -> str | None:
     name = path.name.removesuffix('.zstd')
     return next((kind for kind in ('.mcap', '.db3') if name.endswith(kind)), None)
 
 
 @contextmanager
-def _unpacked_file(path: Path) -> Iterator[Path]:
+def _open_uncompressed(path: Path) -> Iterator[Path]:
     """Give the path of a file, or of a temporary decompressed copy."""
-    with opened(path) as packed:
+    with open_regular_file(path) as packed:
         if path.suffix != '.zstd':
             yield path
             return
         with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
-            source, budget = Path(folder) / path.stem, _Budget(path)
+            source, budget = Path(folder) / path.stem, _ExpansionBudget(path)
             with open(source, 'wb') as file:
-                for piece in _unpacked(packed):
+                for piece in _decompress_zstd(packed):
                     budget.spend(len(piece))
                     file.write(piece)
             yield source
 
 
-class _Budget:
+class _ExpansionBudget:
     """The number of bytes to which the content of a compressed file may expand."""
 
     def __init__(self, path: Path):
-        self._path, self._left = path, GROWN + GROWTH * path.stat().st_size
+        self._path, self._remaining = (path, MIN_EXPANSION_BYTES
+                                       + MAX_EXPANSION_RATIO * path.stat().st_size)
 
     def spend(self, size: int) -> None:
         """Count bytes, and raise `LogError` beyond the limit."""
-        self._left -= size
-        if self._left < 0:
-            raise LogError(f'{self._path}: decompresses to more than {GROWTH} times its size, '
+        self._remaining -= size
+        if self._remaining < 0:
+            raise LogError(f'{self._path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
+                           'its size, '
                            'which is the limit; record again, or decompress it first if this is '
                            'intended')
 
 
-def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
+def _decompress_zstd(packed: BinaryIO) -> Iterator[bytes]:
     """Give the decompressed data of a Zstandard stream, up to a truncation or damage."""
-    zstandard = _library('zstandard')
-    reader = zstandard.ZstdDecompressor(max_window_size=LARGEST).stream_reader(
+    zstandard = _import_library('zstandard')
+    reader = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).stream_reader(
         packed, read_across_frames=True)
     try:
-        while piece := reader.read(_PIECE):
+        while piece := reader.read(_READ_BYTES):
             yield piece
     except zstandard.ZstdError:
         return
 
 
-def _library(name: str) -> Any:
+def _import_library(name: str) -> Any:
     """Import a compression library; only compressed recordings need one."""
     try:
         return importlib.import_module(name)
@@ -233,51 +242,54 @@ def _library(name: str) -> Any:
 
 # MCAP
 
-_Code = IntEnum('_Code', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_INDEX CHUNK_INDEX '
-                'ATTACHMENT ATTACHMENT_INDEX STATISTICS METADATA METADATA_INDEX SUMMARY_OFFSET '
-                'DATA_END')
-_READ = _Code.SCHEMA, _Code.CHANNEL, _Code.MESSAGE, _Code.CHUNK, _Code.METADATA
+_RecordCode = IntEnum('_RecordCode', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_INDEX '
+                                     'CHUNK_INDEX '
+                      'ATTACHMENT ATTACHMENT_INDEX STATISTICS METADATA METADATA_INDEX '
+                      'SUMMARY_OFFSET '
+                      'DATA_END')
+_USED_RECORDS = (_RecordCode.SCHEMA, _RecordCode.CHANNEL, _RecordCode.MESSAGE, _RecordCode.CHUNK,
+                 _RecordCode.METADATA)
 #: Closing part of an MCAP file without index and checksum: end of data, and a footer of zeros.
-MCAP_END = (struct.pack('<BQ4x', _Code.DATA_END, 4) + struct.pack('<BQ20x', _Code.FOOTER, 20)
-            + _MAGIC)
+MCAP_END = (struct.pack('<BQ4x', _RecordCode.DATA_END, 4)
+            + struct.pack('<BQ20x', _RecordCode.FOOTER, 20) + _MAGIC)
 
 
-def _from_mcap(source: Path, path: Path, contents: Contents,
+def _read_mcap(source: Path, path: Path, contents: Contents,
                on_progress: OnProgress) -> Iterator[Message]:
     with open(source, 'rb') as file:
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
             raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
-        reader, reported = _McapReader(contents, _Budget(path)), 0
-        for code, body in _records(file, end, contents):
-            if code == _Code.DATA_END:
+        reader, reported = _McapReader(contents, _ExpansionBudget(path)), 0
+        for code, body in _iter_records(file, end, contents):
+            if code == _RecordCode.DATA_END:
                 return
             yield from reader.read(code, body, torn=file.tell() == end)
-            if file.tell() - reported > _PIECE:
+            if file.tell() - reported > _READ_BYTES:
                 reported = file.tell()
                 on_progress(reported)
         contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, '
                               'and was read up to there')
 
 
-def _records(stream: BinaryIO, end: int, contents: Contents,
-             wanted: tuple[_Code, ...] = _READ) -> Iterator[tuple[int, bytes]]:
+def _iter_records(stream: BinaryIO, end: int, contents: Contents,
+                  wanted: tuple[_RecordCode, ...] = _USED_RECORDS) -> Iterator[tuple[int, bytes]]:
     """Give code and content of the records of a file or a chunk, also of a truncated chunk."""
     while len(head := stream.read(9)) == 9:
         code, length = struct.unpack('<BQ', head)
         left = end - stream.tell()
-        if code == _Code.CHUNK in wanted and left < length <= LARGEST:
+        if code == _RecordCode.CHUNK in wanted and left < length <= MAX_RECORD_BYTES:
             yield code, stream.read()
             return
         if length > left or code == 0:
             stream.seek(-9, io.SEEK_CUR)
             return
-        if code in wanted and length <= LARGEST:
+        if code in wanted and length <= MAX_RECORD_BYTES:
             yield code, stream.read(length)
             continue
-        contents.left_out += code in wanted
+        contents.skipped_parts += code in wanted
         stream.seek(length, io.SEEK_CUR)
-        if code == _Code.DATA_END:
+        if code == _RecordCode.DATA_END:
             yield code, b''
             return
 
@@ -285,7 +297,7 @@ def _records(stream: BinaryIO, end: int, contents: Contents,
 class _McapReader:
     """Reads the records of one file, with its channels and schemas."""
 
-    def __init__(self, contents: Contents, budget: _Budget):
+    def __init__(self, contents: Contents, budget: _ExpansionBudget):
         self._contents, self._budget = contents, budget
         self._schemas: dict[int, tuple[str, str]] = {}
         self._channels: dict[int, tuple[str, str]] = {}
@@ -293,90 +305,90 @@ class _McapReader:
     def read(self, code: int, body: bytes, torn: bool = False) -> Iterator[Message]:
         """Give the messages in a record; a truncated chunk is read up to its end."""
         try:
-            if code == _Code.CHUNK:
-                data = _chunk_data(body, torn, self._budget)
-                for inner, content in _records(io.BytesIO(data), len(data), self._contents):
-                    yield from self.read(inner, content) if inner != _Code.CHUNK else ()
-            elif code == _Code.MESSAGE:
+            if code == _RecordCode.CHUNK:
+                data = _read_chunk(body, torn, self._budget)
+                for inner, content in _iter_records(io.BytesIO(data), len(data), self._contents):
+                    yield from self.read(inner, content) if inner != _RecordCode.CHUNK else ()
+            elif code == _RecordCode.MESSAGE:
                 number, _, received, _ = struct.unpack_from('<HIQQ', body)
                 if number in self._channels:
                     yield Message(*self._channels[number], received,
-                                  _message_data(body[22:], self._budget))
-            elif code == _Code.SCHEMA:
-                kind, place = _text(body, 2)
-                definition, _ = _text(body, _text(body, place)[1])
+                                  _decompress_message(body[22:], self._budget))
+            elif code == _RecordCode.SCHEMA:
+                kind, place = _read_text(body, 2)
+                definition, _ = _read_text(body, _read_text(body, place)[1])
                 self._schemas[struct.unpack_from('<H', body)[0]] = kind, definition
-            elif code == _Code.CHANNEL:
+            elif code == _RecordCode.CHANNEL:
                 number, schema = struct.unpack_from('<HH', body)
-                topic, place = _text(body, 4)
-                encoding, _ = _text(body, place)
+                topic, place = _read_text(body, 4)
+                encoding, _ = _read_text(body, place)
                 kind, definition = self._schemas.get(schema, ('unknown', ''))
-                topic, kind = shown(topic), shown(kind)
+                topic, kind = excerpt(topic), excerpt(kind)
                 self._contents.topics[topic] = kind
-                if encoding == 'cdr' and self._contents.is_useful(kind, definition):
+                if encoding == 'cdr' and self._contents.keep_definition(kind, definition):
                     self._channels[number] = topic, kind
-            elif code == _Code.METADATA:
-                name, pairs = _metadata(body)
-                if name == ABOUT:  # written by this program
-                    self._contents.about += [_printable(f'{key}: {value}')
-                                             for key, value in pairs.items()]
-        except (_Damaged, struct.error):
-            self._contents.left_out += 1
+            elif code == _RecordCode.METADATA:
+                name, pairs = _parse_metadata(body)
+                if name == METADATA_NAME:  # written by this program
+                    self._contents.recorder_notes += [_to_short_line(f'{key}: {value}')
+                                                      for key, value in pairs.items()]
+        except (_DamagedPart, struct.error):
+            self._contents.skipped_parts += 1
 
 
-class _Damaged(ValueError):
+class _DamagedPart(ValueError):
     """A part of a recording is damaged."""
 
 
-def _text(body: bytes, place: int) -> tuple[str, int]:
-    end = place + 4 + struct.unpack_from('<I', body, place)[0]
+def _read_text(body: bytes, offset: int) -> tuple[str, int]:
+    end = offset + 4 + struct.unpack_from('<I', body, offset)[0]
     if end > len(body):
-        raise _Damaged
-    return body[place + 4:end].decode(errors='replace'), end
+        raise _DamagedPart
+    return body[offset + 4:end].decode(errors='replace'), end
 
 
-def _metadata(body: bytes) -> tuple[str, dict[str, str]]:
+def _parse_metadata(body: bytes) -> tuple[str, dict[str, str]]:
     """Return name and pairs of a metadata record."""
-    name, place = _text(body, 0)
+    name, place = _read_text(body, 0)
     pairs, place = {}, place + 4
     while place < len(body):
-        key, place = _text(body, place)
-        pairs[key], place = _text(body, place)
+        key, place = _read_text(body, place)
+        pairs[key], place = _read_text(body, place)
     return name, pairs
 
 
-def metadata_of(path: str | Path) -> dict[str, str]:
+def read_metadata(path: str | Path) -> dict[str, str]:
     """Return the pairs of all undamaged metadata records of an MCAP file."""
     found: dict[str, str] = {}
-    with opened(path) as file:
+    with open_regular_file(path) as file:
         if file.read(len(_MAGIC)) == _MAGIC:
-            for code, body in _records(file, os.fstat(file.fileno()).st_size, Contents(),
-                                       (_Code.METADATA,)):
-                with suppress(_Damaged, struct.error):
-                    found |= _metadata(body)[1] if code == _Code.METADATA else {}
+            for code, body in _iter_records(file, os.fstat(file.fileno()).st_size, Contents(),
+                                            (_RecordCode.METADATA,)):
+                with suppress(_DamagedPart, struct.error):
+                    found |= _parse_metadata(body)[1] if code == _RecordCode.METADATA else {}
     return found
 
 
-def _chunk_data(body: bytes, torn: bool, budget: _Budget) -> bytes:
+def _read_chunk(body: bytes, torn: bool, budget: _ExpansionBudget) -> bytes:
     """Return the records of a chunk as bytes; of a truncated one those before its end."""
     _, _, size, check = struct.unpack_from('<QQQI', body)
-    compression, place = _text(body, 28)
-    if size > LARGEST:
-        raise _Damaged
-    data = _expanded(compression, body[place + 8:], size, budget)
+    compression, place = _read_text(body, 28)
+    if size > MAX_RECORD_BYTES:
+        raise _DamagedPart
+    data = _decompress(compression, body[place + 8:], size, budget)
     if not torn and (len(data) != size or check and zlib.crc32(data) != check):
-        raise _Damaged
+        raise _DamagedPart
     return data
 
 
-def _expanded(compression: str, data: bytes, size: int, budget: _Budget) -> bytes:
+def _decompress(compression: str, data: bytes, size: int, budget: _ExpansionBudget) -> bytes:
     """Return decompressed data, up to the stated size."""
     if compression == '':
         return data[:size]
-    if compression not in _COMPRESSIONS:
-        raise _Damaged
+    if compression not in _DECOMPRESSORS:
+        raise _DamagedPart
     expanded = bytearray()
-    for piece in _COMPRESSIONS[compression](data):
+    for piece in _DECOMPRESSORS[compression](data):
         budget.spend(len(piece))
         expanded += piece
         if len(expanded) > size:
@@ -385,32 +397,34 @@ def _expanded(compression: str, data: bytes, size: int, budget: _Budget) -> byte
     return bytes(expanded)
 
 
-def _from_lz4(data: bytes) -> Iterator[bytes]:
-    decompressor = _library('lz4.frame').LZ4FrameDecompressor()
+def _decompress_lz4(data: bytes) -> Iterator[bytes]:
+    decompressor = _import_library('lz4.frame').LZ4FrameDecompressor()
     try:
-        piece = decompressor.decompress(data, max_length=_PIECE)
+        piece = decompressor.decompress(data, max_length=_READ_BYTES)
         while piece:
             yield piece
-            piece = b'' if decompressor.eof else decompressor.decompress(b'', max_length=_PIECE)
+            piece = (b'' if decompressor.eof else decompressor.decompress(
+                b'', max_length=_READ_BYTES))
     except (RuntimeError, EOFError) as error:
-        raise _Damaged from error
+        raise _DamagedPart from error
 
 
-_COMPRESSIONS: dict[str, Callable[[bytes], Iterator[bytes]]] = {
-    'zstd': lambda data: _unpacked(io.BytesIO(data)), 'lz4': _from_lz4}
+_DECOMPRESSORS: dict[str, Callable[[bytes], Iterator[bytes]]] = {
+    'zstd': lambda data: _decompress_zstd(io.BytesIO(data)), 'lz4': _decompress_lz4}
 
 
-def _message_data(data: bytes, budget: _Budget) -> bytes:
+def _decompress_message(data: bytes, budget: _ExpansionBudget) -> bytes:
     """Return the bytes of a message, decompressed if the message itself is compressed."""
-    return _expanded('zstd', data, 1 << 16, budget) if data.startswith(_ZSTANDARD_MAGIC) else data
+    return (_decompress('zstd', data, 1 << 16, budget)
+            if data.startswith(_ZSTANDARD_MAGIC) else data)
 
 
-def _record(code: _Code, *content: bytes) -> bytes:
+def _pack_record(code: _RecordCode, *content: bytes) -> bytes:
     data = b''.join(content)
     return struct.pack('<BQ', code, len(data)) + data
 
 
-def _sized(data: bytes | str) -> bytes:
+def _pack_sized(data: bytes | str) -> bytes:
     data = data.encode() if isinstance(data, str) else data
     return struct.pack('<I', len(data)) + data
 
@@ -419,7 +433,7 @@ class McapWriter:
     """Makes the bytes of an uncompressed MCAP file of ROS 2 messages, chunk by chunk."""
 
     def __init__(self) -> None:
-        self._place = 0
+        self._offset = 0
         self._records = bytearray()
         self._schemas: dict[str, tuple[int, bytes]] = {}
         self._channels: dict[str, tuple[int, bytes]] = {}
@@ -430,39 +444,42 @@ class McapWriter:
         self._metadata_index = b''
 
     @property
-    def pending(self) -> int:
+    def pending_bytes(self) -> int:
         """Bytes of the messages that are not yet in a chunk."""
         return len(self._records)
 
-    def begin(self, library: str, name: str, notes: Mapping[str, str]) -> bytes:
+    def pack_header(self, library: str, name: str, notes: Mapping[str, str]) -> bytes:
         """Return the beginning of a file: header with the program, and a metadata record."""
-        head = _MAGIC + _record(_Code.HEADER, _sized('ros2'), _sized(library))
-        pairs = b''.join(_sized(key) + _sized(value) for key, value in notes.items())
-        metadata = _record(_Code.METADATA, _sized(name), _sized(pairs))
-        self._metadata_index = _record(
-            _Code.METADATA_INDEX, struct.pack('<QQ', len(head), len(metadata)), _sized(name))
-        self._place = len(head + metadata)
+        head = _MAGIC + _pack_record(_RecordCode.HEADER, _pack_sized('ros2'), _pack_sized(library))
+        pairs = b''.join(_pack_sized(key) + _pack_sized(value) for key, value in notes.items())
+        metadata = _pack_record(_RecordCode.METADATA, _pack_sized(name), _pack_sized(pairs))
+        self._metadata_index = _pack_record(_RecordCode.METADATA_INDEX,
+                                            struct.pack('<QQ', len(head), len(metadata)),
+                                            _pack_sized(name))
+        self._offset = len(head + metadata)
         return head + metadata
 
     def add(self, topic: str, kind: str, definition: str, received: int, data: bytes) -> None:
         """Add a message, in CDR, to the next chunk; the time is in ns."""
         if kind not in self._schemas:
-            schema = _record(_Code.SCHEMA, struct.pack('<H', len(self._schemas) + 1), _sized(kind),
-                             _sized('ros2msg'), _sized(definition))
+            schema = _pack_record(_RecordCode.SCHEMA, struct.pack('<H',
+                                                                  len(self._schemas) + 1),
+                                  _pack_sized(kind), _pack_sized('ros2msg'),
+                                  _pack_sized(definition))
             self._schemas[kind] = len(self._schemas) + 1, schema
             self._records += schema
         if topic not in self._channels:
             ends = len(self._channels) + 1, self._schemas[kind][0]
-            channel = _record(_Code.CHANNEL, struct.pack('<HH', *ends), _sized(topic),
-                              _sized('cdr'), _sized(b''))
+            channel = _pack_record(_RecordCode.CHANNEL, struct.pack('<HH', *ends),
+                                   _pack_sized(topic), _pack_sized('cdr'), _pack_sized(b''))
             self._channels[topic] = ends[0], channel
             self._records += channel
         number = self._channels[topic][0]
         self._indexes[number].append((received, len(self._records)))
         head = struct.pack('<HIQQ', number, 0, received, received)
-        self._records += _record(_Code.MESSAGE, head, data)
+        self._records += _pack_record(_RecordCode.MESSAGE, head, data)
 
-    def chunk(self) -> bytes:
+    def pack_chunk(self) -> bytes:
         """Return the messages since the last chunk as a chunk with index; b'' without any."""
         if not self._indexes:
             return b''
@@ -470,44 +487,47 @@ class McapWriter:
         self._spans.append((min(times), max(times)))
         records = bytes(self._records)
         head = struct.pack('<QQQI', *self._spans[-1], len(records), zlib.crc32(records))
-        chunk = _record(_Code.CHUNK, head, _sized(''), struct.pack('<Q', len(records)), records)
+        chunk = _pack_record(_RecordCode.CHUNK, head, _pack_sized(''),
+                             struct.pack('<Q', len(records)), records)
         indexes, offsets = b'', b''
         for number, index in self._indexes.items():
-            offsets += struct.pack('<HQ', number, self._place + len(chunk) + len(indexes))
+            offsets += struct.pack('<HQ', number, self._offset + len(chunk) + len(indexes))
             pairs = b''.join(struct.pack('<QQ', *pair) for pair in sorted(index))
-            indexes += _record(_Code.MESSAGE_INDEX, struct.pack('<H', number), _sized(pairs))
+            indexes += _pack_record(_RecordCode.MESSAGE_INDEX, struct.pack('<H', number),
+                                    _pack_sized(pairs))
             self._counts[number] += len(index)
-        self._chunk_indexes.append(_record(
-            _Code.CHUNK_INDEX, struct.pack('<QQQQ', *self._spans[-1], self._place, len(chunk)),
-            _sized(offsets), struct.pack('<Q', len(indexes)), _sized(''),
-            struct.pack('<QQ', len(records), len(records))))
+        self._chunk_indexes.append(
+            _pack_record(_RecordCode.CHUNK_INDEX,
+                         struct.pack('<QQQQ', *self._spans[-1], self._offset, len(chunk)),
+                         _pack_sized(offsets), struct.pack('<Q', len(indexes)), _pack_sized(''),
+                         struct.pack('<QQ', len(records), len(records))))
         self._records.clear()
         self._indexes.clear()
-        self._place += len(chunk + indexes)
+        self._offset += len(chunk + indexes)
         return chunk + indexes
 
-    def end(self) -> bytes:
+    def pack_summary(self) -> bytes:
         """Return the end of a file: the summary with the index of all chunks."""
-        data_end = _record(_Code.DATA_END, struct.pack('<I', 0))
-        begin = self._place + len(data_end)
+        data_end = _pack_record(_RecordCode.DATA_END, struct.pack('<I', 0))
+        begin = self._offset + len(data_end)
         sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
         span = (min((span[0] for span in self._spans), default=0),
                 max((span[1] for span in self._spans), default=0))
         counts = b''.join(struct.pack('<HQ', *pair) for pair in self._counts.items())
-        groups = {_Code.SCHEMA: [record for _, record in self._schemas.values()],
-                  _Code.CHANNEL: [record for _, record in self._channels.values()],
-                  _Code.STATISTICS: [_record(
-                      _Code.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
-                      struct.pack('<QQ', *span), _sized(counts))],
-                  _Code.CHUNK_INDEX: self._chunk_indexes,
-                  _Code.METADATA_INDEX: [self._metadata_index]}
+        groups = {_RecordCode.SCHEMA: [record for _, record in self._schemas.values()],
+                  _RecordCode.CHANNEL: [record for _, record in self._channels.values()],
+                  _RecordCode.STATISTICS: [_pack_record(
+                      _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
+                      struct.pack('<QQ', *span), _pack_sized(counts))],
+                  _RecordCode.CHUNK_INDEX: self._chunk_indexes,
+                  _RecordCode.METADATA_INDEX: [self._metadata_index]}
         summary, offsets = b'', b''
         for code, records in groups.items():
             group = b''.join(records)
             place = struct.pack('<BQQ', code, begin + len(summary), len(group))
-            offsets += _record(_Code.SUMMARY_OFFSET, place)
+            offsets += _pack_record(_RecordCode.SUMMARY_OFFSET, place)
             summary += group
-        footer = struct.pack('<BQQQ', _Code.FOOTER, 20, begin, begin + len(summary))
+        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, begin, begin + len(summary))
         checked = zlib.crc32(summary + offsets + footer)
         return data_end + summary + offsets + footer + struct.pack('<I', checked) + _MAGIC
 
@@ -515,31 +535,31 @@ class McapWriter:
 # SQLite
 
 
-def _from_database(source: Path, path: Path, contents: Contents,
+def _read_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
-    with _database(source, path) as (database, tables):
-        channels, budget = _topics(database, tables, path, contents), _Budget(path)
+    with _open_database(source, path) as (database, tables):
+        channels, budget = _read_topics(database, tables, path, contents), _ExpansionBudget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
         with suppress(*_DATABASE_ERRORS):  # used for the progress only
             last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
         try:
-            for row, topic, received, data in database.execute(_ROWS):
+            for row, topic, received, data in database.execute(_MESSAGES_QUERY):
                 count += 1
                 if count % 4096 == 0:
                     on_progress(int(size * row / last))
                 if topic not in channels:
                     continue
                 if not (isinstance(received, int) and isinstance(data, bytes)):
-                    contents.left_out += 1
+                    contents.skipped_parts += 1
                     continue
-                yield Message(*channels[topic], received, _message_data(data, budget))
+                yield Message(*channels[topic], received, _decompress_message(data, budget))
         except _DATABASE_ERRORS as error:
             contents.notes.append(f'{path.name} is damaged after {count} messages '
-                                  f'({_why(error)}), and was read up to there')
+                                  f'({_describe_database_error(error)}), and was read up to there')
 
 
 @contextmanager
-def _database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
+def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """
     Open a database read-only, and give it with the names of its tables.
 
@@ -551,10 +571,10 @@ def _database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, se
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
         ways = (('mode=ro', lambda: source), ('mode=ro&immutable=1', lambda: source),
-                ('mode=ro', lambda: _shortened(source, Path(folder))))
+                ('mode=ro', lambda: _correct_page_count(source, Path(folder))))
         for how, file in ways:
             try:
-                database, tables = _opened(file(), how)
+                database, tables = _connect(file(), how)
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
@@ -564,17 +584,18 @@ def _database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, se
                                    'of stored columns; name a recording')
                 yield database, tables
                 return
-    raise LogError(f'{path}: cannot be read as a ROS 2 recording ({_why(reason)}); '
+    raise LogError(f'{path}: cannot be read as a ROS 2 recording '
+                   f'({_describe_database_error(reason)}); '
                    'name a recording, or record again')
 
 
-def _why(error: Exception | None) -> str:
-    return _printable(str(error) or 'it needs more memory than the limit')
+def _describe_database_error(error: Exception | None) -> str:
+    return _to_short_line(str(error) or 'it needs more memory than the limit')
 
 
-def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
+def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
     """Return a database and the names of its tables without computed columns."""
-    database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{how}', uri=True)
+    database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
     try:
         database.text_factory = partial(str, encoding='utf-8', errors='replace')
         # The smallest row of a file has a dozen bytes and takes some 30 steps of SQLite. A query
@@ -582,30 +603,30 @@ def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
         thousands = iter(range(file.stat().st_size // 100 + 1000))
         database.set_progress_handler(lambda: next(thousands, None) is None, 1000)
         if sys.version_info >= (3, 11):
-            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _PIECE)
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
         database.execute('PRAGMA trusted_schema = OFF')
         tables = {name for name, in database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table'")}
-        stored = {name for name in sorted(tables & _TABLES)
+        stored = {name for name in sorted(tables & _KNOWN_TABLES)
                   if not any(hidden for *_, hidden
                              in database.execute(f'PRAGMA table_xinfo({name})'))}
-        database.set_authorizer(_authorized)
+        database.set_authorizer(_authorize)
         return database, stored
     except BaseException:
         database.close()
         raise
 
 
-def _authorized(action: int, first: str | None, second: str | None, _: str | None,
-                within: str | None) -> int:
+def _authorize(action: int, table: str | None, function: str | None, _: str | None,
+               view: str | None) -> int:
     """Allow SQLite to read the tables with the functions used here, but no views."""
-    reads = action == sqlite3.SQLITE_READ and first in _TABLES
-    computes = action == sqlite3.SQLITE_FUNCTION and second in ('length', 'max', 'typeof')
-    allowed = within is None and (action == sqlite3.SQLITE_SELECT or reads or computes)
+    reads = action == sqlite3.SQLITE_READ and table in _KNOWN_TABLES
+    computes = action == sqlite3.SQLITE_FUNCTION and function in ('length', 'max', 'typeof')
+    allowed = view is None and (action == sqlite3.SQLITE_SELECT or reads or computes)
     return sqlite3.SQLITE_OK if allowed else sqlite3.SQLITE_DENY
 
 
-def _shortened(source: Path, folder: Path) -> Path:
+def _correct_page_count(source: Path, folder: Path) -> Path:
     """Return a copy of a truncated database with its page count corrected, as SQLite wants it."""
     copy = Path(shutil.copy(source, folder))
     with open(copy, 'r+b') as file:
@@ -618,8 +639,8 @@ def _shortened(source: Path, folder: Path) -> Path:
     return copy
 
 
-def _topics(database: sqlite3.Connection, tables: set[str], path: Path,
-            contents: Contents) -> dict[int, tuple[str, str]]:
+def _read_topics(database: sqlite3.Connection, tables: set[str], path: Path,
+                 contents: Contents) -> dict[int, tuple[str, str]]:
     channels = {}
     try:
         definitions = dict(database.execute(
@@ -627,11 +648,13 @@ def _topics(database: sqlite3.Connection, tables: set[str], path: Path,
             if 'message_definitions' in tables else ())
         for number, topic, kind, encoding in database.execute(
                 'SELECT id, name, type, serialization_format FROM topics'):
-            topic, kind = shown(str(topic)), shown(str(kind))
+            topic, kind = excerpt(str(topic)), excerpt(str(kind))
             contents.topics[topic] = kind
-            if encoding == 'cdr' and contents.is_useful(kind, str(definitions.get(kind, ''))):
+            if (encoding == 'cdr'
+                    and contents.keep_definition(kind, str(definitions.get(kind, '')))):
                 channels[number] = topic, kind
     except _DATABASE_ERRORS as error:
-        raise LogError(f'{path}: its list of topics cannot be read ({_why(error)}); '
+        raise LogError(f'{path}: its list of topics cannot be read '
+                       f'({_describe_database_error(error)}); '
                        'record again') from error
     return channels

@@ -29,58 +29,59 @@ Integers = NDArray[np.integer]
 
 #: Steps below this fraction of the usual interval are those of delayed samples; above this share
 #: of such steps, stamps are taken to come in bursts.
-_WAITING, _BURSTS = 0.5, 0.02
+_BURST_STEP_RATIO, _MIN_BURST_SHARE = 0.5, 0.02
 
 #: Least number of windows in a record. Windows do not cross gaps of more than 1 / LONG of the
 #: record, and longer windows do not show a motion.
-LONG = 50
+MIN_WINDOWS = 50
 
 
 @dataclass(frozen=True)
-class Stamps:
+class StampGrid:
     """Stamps on an even grid."""
 
     time: Array  # s, shape (n,)
-    lost: Integers  # how many samples are lost after each but the last, shape (n - 1,)
-    number: Integers  # index on the grid, shape (n,); long gaps are cut to `longest_gap`
+    lost_after: Integers  # how many samples are lost after each but the last, shape (n - 1,)
+    grid_index: Integers  # index on the grid, shape (n,); long gaps are cut to `longest_gap`
     interval: float  # of the grid, s
-    wander: float  # largest deviation of the stamps from the grid, s
-    bursts: bool  # the stamps come in bursts or with jitter; the grid is used instead
+    max_deviation: float  # largest deviation of the stamps from the grid, s
+    has_bursts: bool  # the stamps come in bursts or with jitter; the grid is used instead
 
     @property
-    def longest_gap(self) -> int:
+    def max_gap(self) -> int:
         """Return the length to which longer gaps are cut, samples."""
-        return _longest_gap(self.time)
+        return _max_kept_gap(self.time)
 
     @property
     def burst_remarks(self) -> list[str]:
         """Return a sentence on the deviation from the grid, if stamps come in bursts."""
-        if not (self.bursts and self.wander):
+        if not (self.has_bursts and self.max_deviation):
             return []
-        return [f'The stamps come in bursts or with jitter, up to {self.wander:.3g} s off an even '
+        return [f'The stamps come in bursts or with jitter, up to {self.max_deviation:.3g} s off '
+                'an even '
                 f'interval of {1000 * self.interval:.5g} ms, which is used.']
 
     @property
     def loss_remarks(self) -> list[str]:
         """Return a sentence on lost samples, if any."""
-        if not self.lost.any():
+        if not self.lost_after.any():
             return []
-        longest, gaps = int(np.argmax(self.lost)), int(np.count_nonzero(self.lost))
-        return [f'{self.lost.sum()} samples are lost in {gaps} gap{"s" * (gaps > 1)}; '
-                f'the longest, of {self.lost[longest]}, is at {self.time[longest]:.3f} s.']
+        longest, gaps = int(np.argmax(self.lost_after)), int(np.count_nonzero(self.lost_after))
+        return [f'{self.lost_after.sum()} samples are lost in {gaps} gap{"s" * (gaps > 1)}; '
+                f'the longest, of {self.lost_after[longest]}, is at {self.time[longest]:.3f} s.']
 
-    def at(self, number: int | np.integer) -> float:
+    def time_at(self, number: int | np.integer) -> float:
         """Return the time at an index on the grid, s."""
-        return float(np.interp(number, self.number, self.time))
+        return float(np.interp(number, self.grid_index, self.time))
 
 
-def number_stamps(time: Array) -> Stamps:
+def fit_stamp_grid(time: Array) -> StampGrid:
     """Fit an even grid to stamps, or raise `DataRefused` where there is none."""
     steps = np.diff(time)
-    usual = _usual_interval(time, steps)
-    bursts = float((steps < _WAITING * usual).mean()) > _BURSTS
-    lost = _lost_samples(time, steps, usual, bursts)
-    number = _numbers(lost)
+    usual = _typical_interval(time, steps)
+    bursts = float((steps < _BURST_STEP_RATIO * usual).mean()) > _MIN_BURST_SHARE
+    lost = _count_lost_per_step(time, steps, usual, bursts)
+    number = _number_samples(lost)
     interval = float(np.polyfit(number, time - time[0], 1)[0])
     off = time - time[0] - interval * number
     wander = float(np.abs(off - np.median(off)).max())
@@ -90,35 +91,35 @@ def number_stamps(time: Array) -> Stamps:
         raise DataRefused(f'the stamps have no even interval (about {usual:g} s; up to '
                           f'{wander:g} s off); if the samples are even, give the sample rate '
                           'with --rate')
-    return Stamps(time, lost, _numbers(np.minimum(lost, _longest_gap(time))), interval, wander,
-                  bursts)
+    return StampGrid(time, lost, _number_samples(np.minimum(lost, _max_kept_gap(time))), interval,
+                     wander, bursts)
 
 
 def even_times(time: Array) -> Array:
     """Return the even times of stamps with bursts or jitter below an interval, else the stamps."""
     try:
-        stamps = number_stamps(time)
+        stamps = fit_stamp_grid(time)
     except DataRefused:
         return time
-    if stamps.wander > stamps.interval and not stamps.bursts:
+    if stamps.max_deviation > stamps.interval and not stamps.has_bursts:
         return time
-    number = _numbers(stamps.lost)
+    number = _number_samples(stamps.lost_after)
     return np.polynomial.Polynomial.fit(number, time, 1)(number)
 
 
-def lost_samples(time: Array) -> Integers | None:
+def count_lost_samples(time: Array) -> Integers | None:
     """Return how many samples are lost after each but the last; None without an even interval."""
     try:
-        return number_stamps(time).lost
+        return fit_stamp_grid(time).lost_after
     except DataRefused:
         return None
 
 
-def _longest_gap(time: Array) -> int:
-    return len(time) // LONG + 1
+def _max_kept_gap(time: Array) -> int:
+    return len(time) // MIN_WINDOWS + 1
 
 
-def _usual_interval(time: Array, steps: Array) -> float:
+def _typical_interval(time: Array, steps: Array) -> float:
     """Return the interval, s: the median over 100 samples, or the divisor of most steps."""
     lag = min(100, len(time) // 4)
     interval = float(np.median(time[lag:] - time[:-lag])) / lag
@@ -135,7 +136,7 @@ def _usual_interval(time: Array, steps: Array) -> float:
             if alike and float(whole.mean()) > 0.9 else interval)
 
 
-def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> Integers:
+def _count_lost_per_step(time: Array, steps: Array, interval: float, has_bursts: bool) -> Integers:
     """
     Return how many samples are lost in each step.
 
@@ -146,9 +147,9 @@ def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> I
     lost: Integers = np.zeros(len(steps), dtype=np.int64)
     shift, done = 0, 0
     # samples within which delayed stamps catch up, and the least loss beyond their jitter
-    span, least = (300, 10) if bursts else (10, 1)
+    span, least = (300, 10) if has_bursts else (10, 1)
     late = (time - time[0]) / interval - np.arange(len(time))
-    due = np.append(np.flatnonzero(steps >= _WAITING * interval), len(steps))
+    due = np.append(np.flatnonzero(steps >= _BURST_STEP_RATIO * interval), len(steps))
     for step in np.nonzero(steps > (least + 0.5) * interval)[0].tolist():
         late[done:step + 1] -= shift
         done = step + 1
@@ -161,6 +162,6 @@ def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> I
     return lost
 
 
-def _numbers(lost: Integers) -> Integers:
+def _number_samples(lost: Integers) -> Integers:
     """Return the number of each sample, by the samples lost after each but the last."""
     return np.arange(len(lost) + 1) + np.cumsum(np.concatenate([[0], lost]))

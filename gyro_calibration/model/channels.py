@@ -29,24 +29,26 @@ from typing import Any
 
 from gyro_calibration.logs.log import Log, Number
 from gyro_calibration.model.effects import Channels
-from gyro_calibration.model.effects.effect import lag_ahead
+from gyro_calibration.model.effects.effect import lag_difference
 import numpy as np
 
 #: State at the last sample, by (channel, time constant) of a lag and ('heating', filter time,
 #: threshold) of the sign of heating.
-Known = dict[tuple[Any, ...], float]
+LagStates = dict[tuple[Any, ...], float]
 
 
-class History:
+class ChannelHistory:
     """The state of all channels that depend on earlier samples."""
 
-    def __init__(self, stand_in: float = 25.0, low: float = -math.inf, high: float = math.inf):
+    def __init__(self, default_temperature: float = 25.0, min_temperature: float = -math.inf,
+                 max_temperature: float = math.inf):
         """Begin without samples; a default temperature and the bounds of temperatures, degC."""
-        self._stand_in, self._low, self._high = stand_in, low, high
-        self._piece: _Piece | None = None
-        self._begin = 0.0
+        self._default_temperature, self._min_temperature, self._max_temperature = (
+            default_temperature, min_temperature, max_temperature)
+        self._block: _Block | None = None
+        self._start_time = 0.0
 
-    def follow(self, time: Number, temperature: Number | None = None,
+    def update(self, time: Number, temperature: Number | None = None,
                specific_force: Number | None = None, supply: Number | None = None,
                heading: Number = 0.0) -> Channels:
         """
@@ -63,72 +65,77 @@ class History:
         the channels, with rate and output 0
 
         """
-        if self._piece is None:
-            self._begin = float(_end(time, 0))
+        if self._block is None:
+            self._start_time = float(_edge_value(time, 0))
         known = {'specific_force': specific_force}
         if temperature is not None:
-            known['temperature'] = temperature = clip(temperature, self._low, self._high)
-        here = self._stand_in + 0.0 * time if temperature is None else temperature
-        piece = self._piece = _Piece(time, {name: signal for name, signal in known.items()
-                                            if signal is not None}, self._piece)
+            known['temperature'] = temperature = clip(temperature, self._min_temperature,
+                                                      self._max_temperature)
+        here = self._default_temperature + 0.0 * time if temperature is None else temperature
+        piece = self._block = _Block(time, {name: signal for name, signal in known.items()
+                                            if signal is not None}, self._block)
 
         def lagged(channel: str, time_constant: float) -> Number:
             signal = here if channel == 'temperature' else piece.signal(channel)
-            return signal + piece.ahead(channel, time_constant)
+            return signal + piece.lag_difference(channel, time_constant)
 
-        return Channels(0.0 * time, 0.0 * time, here, time - self._begin,
+        return Channels(0.0 * time, 0.0 * time, here, time - self._start_time,
                         0.0 * time if specific_force is None else specific_force, supply,
-                        heading, lagged, piece.heating)
+                        heading, lagged, piece.heating_sign)
 
 
-class _Piece:
+class _Block:
     """One sample, or the samples of a block, with the state at the end of the one before."""
 
-    def __init__(self, time: Number, known: Mapping[str, Number], before: _Piece | None):
-        self._known = dict(known)
-        self._end_time = _end(time, -1)
-        self._last: dict[str, float] = {}
-        self._state: Known = {}
-        begin = _end(time, 0)
-        if before is not None:
-            self._state, begin = before.ended(), before._end_time
-            self._last = before._last | {name: _end(signal, -1)
-                                         for name, signal in before._known.items()}
-        self._ended: Known = {}
-        self._interval = _change(time, begin)
+    def __init__(self, time: Number, signals: Mapping[str, Number], previous: _Block | None):
+        self._signals = dict(signals)
+        self._end_time = _edge_value(time, -1)
+        self._last_values: dict[str, float] = {}
+        self._lag_states: LagStates = {}
+        begin = _edge_value(time, 0)
+        if previous is not None:
+            self._lag_states, begin = previous.end_states(), previous._end_time
+            self._last_values = previous._last_values | {
+                name: _edge_value(signal, -1) for name, signal in previous._signals.items()
+            }
+        self._end_states: LagStates = {}
+        self._interval = _differences(time, begin)
 
     def signal(self, channel: str) -> Number:
         """Return a channel."""
-        if channel == 'vibration' and channel not in self._known:
-            ahead = self.ahead('specific_force', 1.0)  # deviation from its mean over 1 s
-            self._known[channel] = ahead * ahead
-        return self._known.get(channel, 0.0)
+        if channel == 'vibration' and channel not in self._signals:
+            ahead = self.lag_difference('specific_force', 1.0)  # deviation from its mean over 1 s
+            self._signals[channel] = ahead * ahead
+        return self._signals.get(channel, 0.0)
 
-    def ahead(self, channel: str, time_constant: float) -> Number:
+    def lag_difference(self, channel: str, time_constant: float) -> Number:
         """Return the lagged channel minus the channel; the channel is held while it is unknown."""
         signal, key = self.signal(channel), (channel, time_constant)
-        change = (_change(signal, self._last.get(channel, _end(signal, 0)))
-                  if channel in self._known else 0.0 * self._interval)
-        ahead = lag_ahead(self._interval, change, time_constant, self._state.get(key, 0.0))
-        self._ended[key] = _end(ahead, -1)
+        change = (_differences(signal, self._last_values.get(channel, _edge_value(signal, 0)))
+                  if channel in self._signals else 0.0 * self._interval)
+        ahead = lag_difference(self._interval, change, time_constant,
+                               self._lag_states.get(key, 0.0))
+        self._end_states[key] = _edge_value(ahead, -1)
         return ahead
 
-    def heating(self, filter_time: float, threshold: float) -> Number:
+    def heating_sign(self, filter_time: float, threshold: float) -> Number:
         """Return the last sign of the temperature rate while it exceeded a threshold, K/s."""
-        fast, slow = (self.ahead('temperature', lag) for lag in (0.5 * filter_time, filter_time))
+        fast, slow = (self.lag_difference('temperature', lag)
+                      for lag in (0.5 * filter_time, filter_time))
         rate, key = (fast - slow) / (0.5 * filter_time), ('heating', filter_time, threshold)
-        branch = _held(np.sign(rate) * (abs(rate) > threshold), self._state.get(key, 0.0))
-        self._ended[key] = _end(branch, -1)
+        branch = _hold_last_sign(
+            np.sign(rate) * (abs(rate) > threshold), self._lag_states.get(key, 0.0))
+        self._end_states[key] = _edge_value(branch, -1)
         return branch
 
-    def ended(self) -> Known:
+    def end_states(self) -> LagStates:
         """Return the state at the end, including lags that were not requested in this block."""
-        for key in self._state.keys() - self._ended.keys():
-            (self.heating if key[0] == 'heating' else self.ahead)(*key[-2:])
-        return self._ended
+        for key in self._lag_states.keys() - self._end_states.keys():
+            (self.heating_sign if key[0] == 'heating' else self.lag_difference)(*key[-2:])
+        return self._end_states
 
 
-def channels_of(log: Log) -> Channels:
+def channels_from_log(log: Log) -> Channels:
     """
     Return the channels of a whole log, with rate and output 0.
 
@@ -137,7 +144,7 @@ def channels_of(log: Log) -> Channels:
     """
     time = np.zeros(len(log)) if log.time is None else log.time
     heading = np.zeros(len(log)) if log.reference_heading is None else log.reference_heading
-    return History().follow(time, log.temperature, log.specific_force, log.supply, heading)
+    return ChannelHistory().update(time, log.temperature, log.specific_force, log.supply, heading)
 
 
 def clip(value: Number, low: float, high: float) -> Number:
@@ -147,17 +154,18 @@ def clip(value: Number, low: float, high: float) -> Number:
             else min(max(value, low), high))
 
 
-def _end(signal: Number, place: int) -> float:
-    return float(signal[place]) if isinstance(signal, np.ndarray) else signal
+def _edge_value(signal: Number, index: int) -> float:
+    return float(signal[index]) if isinstance(signal, np.ndarray) else signal
 
 
-def _change(signal: Number, before: float) -> Number:
-    return np.diff(signal, prepend=before) if isinstance(signal, np.ndarray) else signal - before
+def _differences(signal: Number, previous: float) -> Number:
+    return (np.diff(signal, prepend=previous) if isinstance(signal, np.ndarray) else signal
+            - previous)
 
 
-def _held(sign: Number, before: float) -> Number:
+def _hold_last_sign(sign: Number, previous: float) -> Number:
     """Return the last sign that is not zero."""
     if not isinstance(sign, np.ndarray):
-        return float(sign) or before
+        return float(sign) or previous
     last = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), -1))
-    return np.where(last < 0, before, sign[last])
+    return np.where(last < 0, previous, sign[last])

@@ -22,29 +22,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gyro_calibration.logs.log import Array, CACHED, Number
+from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, Number
 from gyro_calibration.model.channels import clip
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
 #: Rates beyond this, rad/s, are treated as overflow: the model's values are too large.
-_LARGEST = 1e300
+_MAX_COMPUTABLE_RATE = 1e300
 
 
 @dataclass(frozen=True)
-class Compensated:
+class CompensatedSamples:
     """
     Compensated samples: numbers, or arrays of shape (n,).
 
     Attributes
     ----------
-    modelled : rate after the model and before the self-calibration, rad/s; input of the next
+    model_rate : rate after the model and before the self-calibration, rad/s; input of the next
         self-calibration
     rate : rad/s
     temperature : degC, limited to plausible temperatures
     temperature_clipped : the temperature is outside the calibrated range. Up to
-        `GyroModel.used_temperatures` the correction is extrapolated, beyond that it is held
+        `GyroModel.extrapolation_range` the correction is extrapolated, beyond that it is held
     beyond_range : the output is outside the calibrated range of rates, or not plausible, or no
         rate has this output. Up to `GyroModel.rate_limit` the correction is extrapolated. Beyond
         that, and where the response no longer grows with the rate, the last correction is held, so
@@ -52,7 +52,7 @@ class Compensated:
 
     """
 
-    modelled: Number
+    model_rate: Number
     rate: Number
     temperature: Number
     temperature_clipped: Number
@@ -60,7 +60,7 @@ class Compensated:
 
 
 def compensate(model: GyroModel, output: Number, temperature: Number | None = None,
-               surroundings: Channels | None = None) -> Compensated:
+               environment: Channels | None = None) -> CompensatedSamples:
     """
     Compensate by model (Ojeda et al., eq. 13), then self-calibration (Hong and Park, eq. 3).
 
@@ -68,62 +68,65 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     ----------
     output : rad/s, a number or shape (n,)
     temperature : degC, alike; the model's reference temperature where it is None
-    surroundings : further channels, from the `GyroModel.history` that took the same temperatures;
+    environment : further channels, from the `GyroModel.history` that took the same temperatures;
         needed where the model `looks_around`
 
     """
     given = model.reference_temperature if temperature is None else temperature
     if not isinstance(output, np.ndarray):
-        return _of_one(model, output, given, surroundings)
-    return (_by_blocks(model, output, given) if surroundings is None
-            else _compensated(model, output, given, surroundings))
+        return _compensate_sample(model, output, given, environment)
+    return (_compensate_blocks(model, output, given) if environment is None
+            else _compensate_array(model, output, given, environment))
 
 
-def _of_one(model: GyroModel, output: float, given: float,
-            surroundings: Channels | None) -> Compensated:
+def _compensate_sample(model: GyroModel, output: float, temperature: float,
+                       environment: Channels | None) -> CompensatedSamples:
     """Compensate a single sample, with the same result as in a log."""
     (low, high), (slowest, fastest), limit = (
-        model.used_temperatures, model.rate_range, model.rate_limit)
-    used, seen = min(max(given, low), high), min(max(output, -limit), limit)
+        model.extrapolation_range, model.rate_range, model.rate_limit)
+    used, seen = min(max(temperature, low), high), min(max(output, -limit), limit)
     coldest, hottest = model.valid_temperatures
-    modelled, unexplained = model.rate_in(Channels.of(seen, seen, used) if surroundings is None
-                                          else surroundings.moving(seen, seen))
-    if not -_LARGEST < modelled < _LARGEST:
+    modelled, unexplained = model.rate_from_channels(
+        Channels.instantaneous(seen, seen, used) if environment is
+        None else environment.with_rate(seen, seen))
+    if not -_MAX_COMPUTABLE_RATE < modelled < _MAX_COMPUTABLE_RATE:
         modelled, unexplained = seen, True
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen != output:
         modelled, rate, unexplained = modelled + (output - seen), rate + (output - seen), True
-    return Compensated(modelled, rate,
-                       given if used == given else clip(given, *model.temperature_limits),
-                       not coldest <= given <= hottest,
-                       unexplained or not slowest <= output <= fastest)
+    return CompensatedSamples(
+        modelled, rate,
+        temperature if used == temperature else clip(temperature, *model.temperature_limits),
+        not coldest <= temperature <= hottest, unexplained or not slowest <= output <= fastest)
 
 
-def _compensated(model: GyroModel, output: Array, given: Number,
-                 surroundings: Channels | None = None) -> Compensated:
+def _compensate_array(model: GyroModel, output: Array, temperature: Number,
+                      environment: Channels | None = None) -> CompensatedSamples:
     (slowest, fastest), limit = model.rate_range, model.rate_limit
     # no masks are made where the extremes show that all samples are inside
-    beyond = _outside(output, max(slowest, -limit), min(fastest, limit))
+    beyond = _mask_outside(output, max(slowest, -limit), min(fastest, limit))
     seen = output if beyond is False else np.clip(output, -limit, limit)
-    clipped, used, plausible = _outside(given, *model.valid_temperatures), given, given
+    clipped, used, plausible = (_mask_outside(temperature,
+                                              *model.valid_temperatures), temperature, temperature)
     if clipped is not False:
-        used, plausible = (clip(given, *ends)
-                           for ends in (model.used_temperatures, model.temperature_limits))
+        used, plausible = (clip(temperature, *ends)
+                           for ends in (model.extrapolation_range, model.temperature_limits))
     with np.errstate(all='ignore'):
-        modelled, unexplained = model.rate_in(Channels(seen, seen, used) if surroundings is None
-                                              else surroundings.moving(seen, seen))
-        if not -_LARGEST < modelled.sum() < _LARGEST:
+        modelled, unexplained = model.rate_from_channels(
+            Channels(seen, seen, used) if environment is
+            None else environment.with_rate(seen, seen))
+        if not -_MAX_COMPUTABLE_RATE < modelled.sum() < _MAX_COMPUTABLE_RATE:
             # the model overflows there: these samples are not corrected
-            computed = abs(modelled) < _LARGEST
+            computed = abs(modelled) < _MAX_COMPUTABLE_RATE
             modelled, unexplained = np.where(computed, modelled, seen), unexplained | ~computed
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen is not output:
         modelled, rate = modelled + (output - seen), rate + (output - seen)
-    return Compensated(modelled, rate, plausible, clipped,
-                       beyond if unexplained is False else beyond | unexplained)
+    return CompensatedSamples(modelled, rate, plausible, clipped,
+                              beyond if unexplained is False else beyond | unexplained)
 
 
-def _outside(values: Number, low: float, high: float) -> Number:
+def _mask_outside(values: Number, low: float, high: float) -> Number:
     """Return which values are outside of bounds; False where none is."""
     if not isinstance(values, np.ndarray):
         return not low <= values <= high
@@ -132,52 +135,53 @@ def _outside(values: Number, low: float, high: float) -> Number:
     return (values < low) | (values > high)
 
 
-def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
+def _compensate_blocks(model: GyroModel, output: Array, temperature: Number) -> CompensatedSamples:
     """Compensate in blocks that fit into the cache of the processor."""
     modelled, clipped, beyond = (
         np.empty(len(output)), np.zeros(len(output), bool), np.zeros(len(output), bool))
     rate = modelled if model.self_calibration is None else np.empty(len(output))
-    for begin in range(0, len(output), CACHED):
-        block = slice(begin, begin + CACHED)
-        part = _compensated(model, output[block],
-                            given[block] if isinstance(given, np.ndarray) else given)
-        modelled[block] = part.modelled
+    for begin in range(0, len(output), CACHE_BLOCK_SAMPLES):
+        block = slice(begin, begin + CACHE_BLOCK_SAMPLES)
+        part = _compensate_array(
+            model, output[block],
+            temperature[block] if isinstance(temperature, np.ndarray) else temperature)
+        modelled[block] = part.model_rate
         if part.temperature_clipped is not False:
             clipped[block] = part.temperature_clipped
         if part.beyond_range is not False:
             beyond[block] = part.beyond_range
         if rate is not modelled:
             rate[block] = part.rate
-    plausible = clip(given, *model.temperature_limits) if clipped.any() else given
-    return Compensated(modelled, rate, plausible, clipped, beyond)
+    plausible = clip(temperature, *model.temperature_limits) if clipped.any() else temperature
+    return CompensatedSamples(modelled, rate, plausible, clipped, beyond)
 
 
 def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number,
-                     surroundings: Channels | None = None) -> np.ndarray:
+                     environment: Channels | None = None) -> np.ndarray:
     """
     Return the derivative of the rate by each uncertain value of the model, shape (m, ...).
 
-    First the fitted values of the model, if it has a covariance, then the `GyroModel.tolerated`
-    errors, then (s, b) of the self-calibration, if there is one; the order of `covariance`. The
-    rate of the model solves ``rate = output - error(rate)``, so the derivative of the error is
-    divided by the slope of the output there: 0.5 for a sine response at a phase of 60 deg. Effects
-    that compensation cannot undo have a derivative of 0.
+    First the fitted values of the model, if it has a covariance, then the
+    `GyroModel.active_tolerances` errors, then (s, b) of the self-calibration, if there is one; the
+    order of `covariance`. The rate of the model solves ``rate = output - error(rate)``, so the
+    derivative of the error is divided by the slope of the output there: 0.5 for a sine response at
+    a phase of 60 deg. Effects that compensation cannot undo have a derivative of 0.
 
     """
     calibration, rows = model.self_calibration, []
-    if model.covariance is not None or model.tolerated:
+    if model.covariance is not None or model.active_tolerances:
         modelled = rate if calibration is None else (rate - calibration.offset) / calibration.scale
-        channels = (Channels(modelled, output, clip(temperature, *model.used_temperatures))
-                    if surroundings is None else surroundings.moving(modelled, output))
-        steepness = model.steepness(channels)
+        channels = (Channels(modelled, output, clip(temperature, *model.extrapolation_range))
+                    if environment is None else environment.with_rate(modelled, output))
+        steepness = model.output_slope(channels)
         if model.covariance is not None:
-            rows = [0.0 if term.effect.undone else row / steepness
+            rows = [0.0 if term.effect.not_compensated else row / steepness
                     for term in model.terms for row in term.sensitivity(channels)]
-        if model.tolerated:
-            faster, warmer = model.beyond(output, temperature)
+        if model.active_tolerances:
+            faster, warmer = model.range_excess(output, temperature)
             sizes = {'bias': 1.0, 'scale_factor_error': modelled, 'bias_per_kelvin': warmer,
                      'scale_factor_error_per_kelvin': warmer * modelled, 'per_rate': faster}
-            rows += [sizes[name] / steepness for name in model.tolerated]
+            rows += [sizes[name] / steepness for name in model.active_tolerances]
     if calibration is not None:
         rows += [rate, 1.0]
     if not isinstance(rate, np.ndarray):
@@ -188,7 +192,7 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     return sensitivity * (-1.0 if calibration is None else -calibration.scale)
 
 
-def covariance(model: GyroModel) -> np.ndarray:
+def uncertainty_covariance(model: GyroModel) -> np.ndarray:
     """
     Return the covariance of the uncertain values of a model, shape (m, m); nan where unknown.
 
@@ -196,8 +200,9 @@ def covariance(model: GyroModel) -> np.ndarray:
 
     """
     blocks = [] if model.covariance is None else [model.covariance]
-    if model.tolerated:
-        blocks.append(np.diag([getattr(model.tolerance, name) ** 2 for name in model.tolerated]))
+    if model.active_tolerances:
+        blocks.append(
+            np.diag([getattr(model.tolerance, name) ** 2 for name in model.active_tolerances]))
     if model.self_calibration is not None:
         known = model.self_calibration.covariance
         blocks.append(np.full((2, 2), np.nan) if known is None else np.array(known))

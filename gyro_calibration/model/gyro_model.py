@@ -20,20 +20,20 @@ import math
 from typing import Any
 
 from gyro_calibration.logs.log import Array, DEGREE, Mask, Number
-from gyro_calibration.model.channels import clip, History
+from gyro_calibration.model.channels import ChannelHistory, clip
 from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: Plausible temperatures, degC, where no valid range is stated.
-_TEMPERATURES = (-100.0, 200.0)
+_PLAUSIBLE_TEMPERATURES = (-100.0, 200.0)
 #: The response is inverted where the slope of the output over the rate is at least this, 1.
-_FLATTEST = 0.1
+_MIN_OUTPUT_SLOPE = 0.1
 #: Python floats need no error state of numpy; setting one for each sample would cost time.
-_AS_IT_IS = nullcontext()
+_NO_ERROR_STATE = nullcontext()
 #: Largest last step of a converged iteration, relative to 1 rad/s plus the rate; the error is much
 #: smaller.
-_SETTLED = 1e-10
+_STEP_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -45,33 +45,33 @@ class Term:
 
     def columns(self, channels: Channels) -> Sequence[Number]:
         """Return one column a coefficient."""
-        return self.effect.columns(channels, *self.values[:len(self.effect.shapes)])
+        return self.effect.columns(channels, *self.values[:len(self.effect.nonlinear_parameters)])
 
     def error(self, channels: Channels) -> Number:
         """Return what the effect adds to the output, rad/s."""
-        return self.adding(channels)
+        return self.error_function(channels)
 
     @cached_property
-    def adding(self) -> Callable[[Channels], Number]:
+    def error_function(self) -> Callable[[Channels], Number]:
         """Return the function of the channels that gives the error of the effect, rad/s."""
-        return self.effect.adding(self.values)
+        return self.effect.error_function(self.values)
 
     @cached_property
-    def fitted(self) -> tuple[int, ...]:
+    def fitted_indices(self) -> tuple[int, ...]:
         """Return the indices of the fitted values: parameters without a default."""
         return tuple(place for place, parameter in enumerate(self.effect.parameters)
                      if parameter.default is None)
 
     def sensitivity(self, channels: Channels) -> list[Number]:
         """Return the derivative of the error by each fitted value."""
-        columns, shapes = self.columns(channels), len(self.effect.shapes)
+        columns, shapes = self.columns(channels), len(self.effect.nonlinear_parameters)
         return [self._derivative(place, channels) if place < shapes else columns[place - shapes]
-                for place in self.fitted]
+                for place in self.fitted_indices]
 
-    def _derivative(self, place: int, channels: Channels) -> Number:
-        step = 1e-5 * abs(self.values[place]) or 1e-9
-        below, above = (replace(self, values=(*self.values[:place], self.values[place] + change,
-                                              *self.values[place + 1:]))
+    def _derivative(self, index: int, channels: Channels) -> Number:
+        step = 1e-5 * abs(self.values[index]) or 1e-9
+        below, above = (replace(self, values=(*self.values[:index], self.values[index] + change,
+                                              *self.values[index + 1:]))
                         for change in (-step, step))
         return (above.error(channels) - below.error(channels)) / (2.0 * step)
 
@@ -120,7 +120,7 @@ class SelfCalibration:
         """Return the rate, rad/s, from one that the model has compensated (eq. 3)."""
         return self.scale * rate + self.offset
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return all values by name, in SI; None for unknown ones."""
         scale_deviation, bias_deviation = (None if math.isnan(value) else value
                                            for value in self.standard_deviations)
@@ -196,7 +196,7 @@ class GyroModel:
 
     def estimates(self) -> Iterator[tuple[str, Parameter, float, float]]:
         """Give effect name, parameter, value and standard deviation of each fitted value."""
-        fitted = [(term, place) for term in self.terms for place in term.fitted]
+        fitted = [(term, place) for term in self.terms for place in term.fitted_indices]
         deviations = ([math.nan] * len(fitted) if self.covariance is None
                       else np.sqrt(np.diag(self.covariance)).tolist())
         for (term, place), deviation in zip(fitted, deviations):
@@ -204,18 +204,19 @@ class GyroModel:
 
     def error(self, channels: Channels) -> Number:
         """Return the sum of all effects, rad/s."""
-        return _sum(self.terms, channels)
+        return _sum_errors(self.terms, channels)
 
-    def steepness(self, channels: Channels) -> Number:
+    def output_slope(self, channels: Channels) -> Number:
         """Return the derivative of rate plus error by the rate, 1; at least 0.1 (see `rate`)."""
-        sought = self._terms_by_rate[1]
-        if not sought:
+        dependent = self._split_by_rate[1]
+        if not dependent:
             return 1.0
         # rad/s; small against the curvature of effects, and large against rounding errors
         step = 1e-5
-        below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output))
+        below, above = (_sum_errors(dependent,
+                                    channels.with_rate(channels.rate + change, channels.output))
                         for change in (-step, step))
-        return np.maximum(1.0 + (above - below) / (2.0 * step), _FLATTEST)
+        return np.maximum(1.0 + (above - below) / (2.0 * step), _MIN_OUTPUT_SLOPE)
 
     @cached_property
     def rate_limit(self) -> float:
@@ -234,17 +235,18 @@ class GyroModel:
         """Return the plausible temperatures, degC: at least -100 to 200, and 3 times the range."""
         low, high = self.valid_temperatures
         reach = high - low if math.isfinite(sum(map(abs, self.temperature_range))) else 0.0
-        return min(low - reach, _TEMPERATURES[0]), max(high + reach, _TEMPERATURES[1])
+        return (min(low - reach,
+                    _PLAUSIBLE_TEMPERATURES[0]), max(high + reach, _PLAUSIBLE_TEMPERATURES[1]))
 
     @cached_property
     def valid_temperatures(self) -> tuple[float, float]:
         """Return the calibrated temperatures, degC; the plausible ones where none are stated."""
         low, high = ((value if math.isfinite(value) else usual)
-                     for value, usual in zip(self.temperature_range, _TEMPERATURES))
+                     for value, usual in zip(self.temperature_range, _PLAUSIBLE_TEMPERATURES))
         return low, max(low, high)
 
     @cached_property
-    def used_temperatures(self) -> tuple[float, float]:
+    def extrapolation_range(self) -> tuple[float, float]:
         """Return the temperatures, degC, up to which the correction is extrapolated."""
         (low, high), (coldest, hottest) = self.valid_temperatures, self.temperature_limits
         # the width of the valid range, but at least the warm-up of a robot after a cold start
@@ -252,14 +254,14 @@ class GyroModel:
         return max(low - reach, coldest), min(high + reach, hottest)
 
     @cached_property
-    def tolerated(self) -> tuple[str, ...]:
+    def active_tolerances(self) -> tuple[str, ...]:
         """Return the names of the tolerances above 0 that no self-calibration replaces."""
         found = ('bias', 'scale_factor_error') if self.self_calibration else ()
         return tuple(name for name, value in vars(self.tolerance).items()
                      if value > 0.0 and name not in found)
 
     @cached_property
-    def prior(self) -> Array | None:
+    def prior_deviations(self) -> Array | None:
         """
         Return the standard deviations of (s, b) before a calibration, shape (2,); inf if unknown.
 
@@ -272,7 +274,7 @@ class GyroModel:
         return np.array([getattr(self.tolerance, name) or math.inf
                          for name in ('scale_factor_error', 'bias')])
 
-    def beyond(self, output: Number, temperature: Number) -> tuple[Number, Number]:
+    def range_excess(self, output: Number, temperature: Number) -> tuple[Number, Number]:
         """
         Return how far outputs and temperatures are outside of the calibrated ranges, rad/s and K.
 
@@ -296,20 +298,20 @@ class GyroModel:
         """
         low, high = self.rate_range
         centre = min(max(0.0, low), high)
-        down, up = (self._monotone(centre, side) for side in (-1.0, 1.0))
+        down, up = (self._monotone_distance(centre, side) for side in (-1.0, 1.0))
         return centre - down, centre + up
 
-    def _monotone(self, centre: float, side: float) -> float:
+    def _monotone_distance(self, centre: float, side: float) -> float:
         """Return how far from a rate to one side the output grows with the rate, rad/s."""
-        _, sought = self._terms_by_rate
-        low, high = self.used_temperatures
-        distances = self.rate_limit / _FLATTEST * np.geomspace(1e-6, 1.0, 160)
+        _, dependent = self._split_by_rate
+        low, high = self.extrapolation_range
+        distances = self.rate_limit / _MIN_OUTPUT_SLOPE * np.geomspace(1e-6, 1.0, 160)
 
         def grows(begin: Array, end: Array) -> Mask:
-            ends = [[rate + _sum(sought, Channels(rate, rate, temperature))
+            ends = [[rate + _sum_errors(dependent, Channels(rate, rate, temperature))
                      for rate in (centre + side * begin, centre + side * end)]
                     for temperature in (low, high)]
-            return np.all([side * (after - before) >= _FLATTEST * (end - begin)
+            return np.all([side * (after - before) >= _MIN_OUTPUT_SLOPE * (end - begin)
                            for before, after in ends], axis=0)
 
         with np.errstate(all='ignore'):
@@ -326,23 +328,23 @@ class GyroModel:
                              else (near, middle))
         return float(near[0])
 
-    def looks_at(self, channel: str) -> bool:
+    def uses_channel(self, channel: str) -> bool:
         """Tell whether an effect uses the channel."""
-        return any(channel in term.effect.looks_at for term in self.terms)
+        return any(channel in term.effect.inputs for term in self.terms)
 
     @cached_property
-    def looks_around(self) -> bool:
+    def needs_history(self) -> bool:
         """Tell whether an effect needs a history: more than rate, output and temperature now."""
-        return any(term.effect.looks_at - {'rate', 'output', 'temperature'} for term in self.terms)
+        return any(term.effect.inputs - {'rate', 'output', 'temperature'} for term in self.terms)
 
     @cached_property
     def moves_stamps(self) -> bool:
         """Tell whether samples were taken at another time than their stamps say."""
-        return any(term.effect.moved is not None for term in self.terms)
+        return any(term.effect.correct_stamps is not None for term in self.terms)
 
-    def history(self) -> History:
+    def start_history(self) -> ChannelHistory:
         """Return a new history, with the reference temperature and the bounds of this model."""
-        return History(self.reference_temperature, *self.used_temperatures)
+        return ChannelHistory(self.reference_temperature, *self.extrapolation_range)
 
     def output(self, rate: Number, temperature: Number) -> Number:
         """
@@ -351,14 +353,15 @@ class GyroModel:
         It has no noise.
 
         """
-        return self.output_in(Channels(rate, rate, temperature))
+        return self.output_from_channels(Channels(rate, rate, temperature))
 
-    def output_in(self, channels: Channels) -> Number:
+    def output_from_channels(self, channels: Channels) -> Number:
         """Return the output, rad/s, without noise, at the rate and surroundings of channels."""
-        rate, (known, sought) = channels.rate, self._terms_by_output
-        given = rate + _sum(known, channels)
-        return (_repeated(lambda output: given + _sum(sought, channels.moving(rate, output)),
-                          rate)[0] if sought else given)
+        rate, (independent, dependent) = channels.rate, self._split_by_output
+        given = rate + _sum_errors(independent, channels)
+        return (_iterate_secant(
+            lambda output: given + _sum_errors(dependent, channels.with_rate(rate, output)),
+            rate)[0] if dependent else given)
 
     def rate(self, output: Number, temperature: Number) -> Number:
         """
@@ -367,9 +370,9 @@ class GyroModel:
         Effects that compensation cannot undo are left in it.
 
         """
-        return self.rate_in(Channels(output, output, temperature))[0]
+        return self.rate_from_channels(Channels(output, output, temperature))[0]
 
-    def rate_in(self, channels: Channels) -> tuple[Number, Number]:
+    def rate_from_channels(self, channels: Channels) -> tuple[Number, Number]:
         """
         Return the rate, rad/s, at the output and the surroundings of channels.
 
@@ -377,20 +380,20 @@ class GyroModel:
         `rate_domain` has this output; the correction at the end of the domain is held there.
 
         """
-        output, (known, sought) = channels.output, self._terms_by_rate
-        given = output - _sum(known, channels)
-        if not sought:
+        output, (independent, dependent) = channels.output, self._split_by_rate
+        given = output - _sum_errors(independent, channels)
+        if not dependent:
             return given, False
-        seen = channels.moving(output, output)
+        seen = channels.with_rate(output, output)
 
-        def added(rate: Number) -> Number:
+        def error_at(rate: Number) -> Number:
             # `seen` is local to this call; new channels would take as long as the computation
             seen.__dict__['rate'] = rate
-            return _sum(sought, seen)
+            return _sum_errors(dependent, seen)
 
-        return _inverse(added, given, output, self.rate_domain)
+        return _invert_response(error_at, given, output, self.rate_domain)
 
-    def distorted(self, stage: str, signal: Array, time: Array) -> Array:
+    def distort(self, stage: str, signal: Array, time: Array) -> Array:
         """Return the signal of a log after the effects of a stage, 'rate' or 'output'."""
         for term in self.terms:
             if term.effect.distortion is not None and term.effect.stage == stage:
@@ -401,39 +404,40 @@ class GyroModel:
         """Return the time of measurement of a sample by its stamp, both in s since power-on."""
         # in the inverse order of `distorted`
         for term in reversed(self.terms):
-            if term.effect.moved is not None:
-                time = term.effect.moved(time, *term.values)
+            if term.effect.correct_stamps is not None:
+                time = term.effect.correct_stamps(time, *term.values)
         return time
 
     @cached_property
-    def _terms_by_output(self) -> _Split:
-        return _split(self.terms, 'output')
+    def _split_by_output(self) -> _TermSplit:
+        return _split_terms(self.terms, 'output')
 
     @cached_property
-    def _terms_by_rate(self) -> _Split:
-        return _split([term for term in self.terms if not term.effect.undone], 'rate')
+    def _split_by_rate(self) -> _TermSplit:
+        return _split_terms([term for term in self.terms if not term.effect.not_compensated],
+                            'rate')
 
 
 #: Terms that do not depend on the unknown, which need no iteration, and terms that do.
-_Split = tuple[list[Term], list[Term]]
+_TermSplit = tuple[list[Term], list[Term]]
 
 
-def _split(terms: Sequence[Term], channel: str) -> _Split:
-    known = [term for term in terms if channel not in term.effect.looks_at]
-    return known, [term for term in terms if channel in term.effect.looks_at]
+def _split_terms(terms: Sequence[Term], channel: str) -> _TermSplit:
+    independent = [term for term in terms if channel not in term.effect.inputs]
+    return independent, [term for term in terms if channel in term.effect.inputs]
 
 
-def _sum(terms: Sequence[Term], channels: Channels) -> Number:
+def _sum_errors(terms: Sequence[Term], channels: Channels) -> Number:
     if not terms:
         return 0.0
-    total = terms[0].adding(channels)
+    total = terms[0].error_function(channels)
     for term in terms[1:]:
-        total = total + term.adding(channels)
+        total = total + term.error_function(channels)
     return total
 
 
-def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.inf,
-              high: float = math.inf) -> tuple[Number, Number]:
+def _iterate_secant(g: Callable[[Number], Number], start: Number, low: float = -math.inf,
+                    high: float = math.inf) -> tuple[Number, Number]:
     """
     Solve x = g(x) for a slope of g well below one; return x, and the last step.
 
@@ -457,15 +461,15 @@ def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.i
     return b, step
 
 
-def _inverse(added: Callable[[Number], Number], given: Number, start: Number,
-             domain: tuple[float, float]) -> tuple[Number, Number]:
+def _invert_response(error_at: Callable[[Number], Number], output: Number, start: Number,
+                     domain: tuple[float, float]) -> tuple[Number, Number]:
     """
     Solve ``rate + added(rate) = given`` in a domain where the left side grows with the rate.
 
     Parameters
     ----------
-    added : rate -> error at that rate, rad/s
-    given : output, rad/s, a number or shape (n,)
+    error_at : rate -> error at that rate, rad/s
+    output : output, rad/s, a number or shape (n,)
     start : first value of the iteration, rad/s, a number or shape (n,)
     domain : lowest and highest rate, rad/s
 
@@ -476,24 +480,25 @@ def _inverse(added: Callable[[Number], Number], given: Number, start: Number,
 
     """
     low, high = domain
-    many = isinstance(given, np.ndarray)
-    with np.errstate(all='ignore') if many else _AS_IT_IS:
+    many = isinstance(output, np.ndarray)
+    with np.errstate(all='ignore') if many else _NO_ERROR_STATE:
         # a single sample may leave the domain by at most 1 rad/s during the iteration
-        rate, step = _repeated(lambda x: given - added(x), start, low - 1.0, high + 1.0)
-        solved = (low <= rate) & (rate <= high) & (abs(step) <= _SETTLED * (1.0 + abs(rate)))
+        rate, step = _iterate_secant(lambda x: output - error_at(x), start, low - 1.0, high + 1.0)
+        solved = ((low <= rate) & (rate <= high) & (abs(step) <= _STEP_TOLERANCE *
+                                                    (1.0 + abs(rate))))
     if solved.all() if many else solved:
         return rate, False
     with np.errstate(all='ignore'):
-        at_low, at_high = added(low), added(high)
-        below, above = given < low + at_low, given > high + at_high
+        at_low, at_high = error_at(low), error_at(high)
+        below, above = output < low + at_low, output > high + at_high
         if not np.all(solved | below | above):
-            begin, end = low + 0.0 * given, high + 0.0 * given
+            begin, end = low + 0.0 * output, high + 0.0 * output
             for _ in range(80):
                 middle = 0.5 * (begin + end)
-                higher = middle + added(middle) < given
+                higher = middle + error_at(middle) < output
                 begin, end = np.where(higher, middle, begin), np.where(higher, end, middle)
             rate = np.where(solved, rate, begin)
-        rate = np.where(below, given - at_low, np.where(above, given - at_high, rate))
+        rate = np.where(below, output - at_low, np.where(above, output - at_high, rate))
     return (rate, below | above) if many else (float(rate), bool(below or above))
 
 
@@ -502,7 +507,7 @@ def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None)
     return replace(model, self_calibration=calibration)
 
 
-def same_effects(model: GyroModel, other: GyroModel) -> bool:
+def have_same_effects(model: GyroModel, other: GyroModel) -> bool:
     """Tell whether two models have the same effects, so that a self-calibration fits both."""
     first, second = ([(term.effect.name, term.values) for term in each.terms]
                      for each in (model, other))

@@ -19,16 +19,24 @@ import io
 import math
 from pathlib import Path
 
-from gyro_calibration.files import InputError, LARGEST, read_bytes, reason
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Number, SHORTEST, shown
-from gyro_calibration.model.channels import History
+from gyro_calibration.files import describe_error, InputError, MAX_MAGNITUDE, read_bytes
+from gyro_calibration.logs.log import (
+    Array,
+    DataRefused,
+    DEGREE,
+    excerpt,
+    Log,
+    MIN_SAMPLE_INTERVAL,
+    Number,
+)
+from gyro_calibration.model.channels import ChannelHistory
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import simulate_noise
 import numpy as np
 
 #: Largest motion profile, bytes: twice the size of an hour at 100 Hz.
-BYTES = 16_000_000
+MAX_PROFILE_BYTES = 16_000_000
 
 
 class MotionError(InputError):
@@ -76,18 +84,18 @@ class Motion:
         return np.interp(time, self.time, rate, left=0.0, right=0.0)
 
 
-def from_rates(time: Array, rate: Array) -> Motion:
+def motion_from_rates(time: Array, rate: Array) -> Motion:
     """Return the motion whose rate, rad/s, is linear between the given times, s."""
     heading = np.concatenate([[0.0], np.cumsum(np.diff(time) * (rate[1:] + rate[:-1]) / 2.0)])
     return Motion(np.asarray(time, float) - time[0], heading, np.asarray(rate, float))
 
 
-def from_headings(time: Array, heading: Array) -> Motion:
+def motion_from_headings(time: Array, heading: Array) -> Motion:
     """Return the motion through the given headings, rad, at the given times, s."""
     return Motion(np.asarray(time, float) - time[0], np.asarray(heading, float) - heading[0])
 
 
-def motion_of(log: Log) -> tuple[Motion, float]:
+def motion_from_log(log: Log) -> tuple[Motion, float]:
     """
     Return the motion of the reference of a log with a time, and the time of its beginning, s.
 
@@ -97,8 +105,8 @@ def motion_of(log: Log) -> tuple[Motion, float]:
     DataRefused : the reference has fewer than two values
 
     """
-    for values, motion in ((log.reference_heading, from_headings),
-                           (log.reference_rate, from_rates)):
+    for values, motion in ((log.reference_heading, motion_from_headings),
+                           (log.reference_rate, motion_from_rates)):
         if values is not None and log.time is not None:
             known = np.isfinite(values)
             if known.sum() < 2:
@@ -108,47 +116,48 @@ def motion_of(log: Log) -> tuple[Motion, float]:
     raise InputError('no reference over time; give the motion')
 
 
-def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
+def constant_rate_motion(segments: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
     """
     Return a motion of constant rates.
 
     Parameters
     ----------
-    rates : (duration, s, rate, deg/s) of each stretch
+    segments : (duration, s, rate, deg/s) of each stretch
     ramp : duration of the linear ramp at the beginning of each stretch, s
 
     """
     time, rate = [0.0], [0.0]
-    for duration, value in rates:
+    for duration, value in segments:
         start = time[-1]
         time += [start + ramp, start + duration]
         rate += [value * DEGREE] * 2
-    return from_rates(np.array(time), np.array(rate))
+    return motion_from_rates(np.array(time), np.array(rate))
 
 
 #: 20 s that separate scale factor error from bias: both signs, two speeds, rests, ramps of 0.5 s,
 #: and the first heading at the end.
-CALIBRATION = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30),
-                     (1, 0)])
+CALIBRATION_MOTION = constant_rate_motion([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30),
+                                           (1, 0), (3.5, -30), (1, 0)])
 #: 160 s of a robot in a building, half of it at rest or on straight paths.
-ROBOT = turns([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10), (6, 0), (9.5, 10),
-               (6, 0), (5, 20), (8, 0), (5, -20), (7, 0), (5, -20), (8, 0), (5, 20), (7, 0),
-               (9.5, 10), (6, 0), (9.5, -10), (8, 0), (9, 0)])
-NAMED = {
-    'calibration': CALIBRATION,
-    'robot': ROBOT,
-    'rest': from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+ROBOT_MOTION = constant_rate_motion([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10),
+                                     (6, 0), (9.5, 10), (6, 0), (5, 20), (8, 0), (5, -20), (7, 0),
+                                     (5, -20), (8, 0), (5, 20), (7, 0), (9.5, 10), (6, 0),
+                                     (9.5, -10), (8, 0), (9, 0)])
+NAMED_MOTIONS = {
+    'calibration': CALIBRATION_MOTION,
+    'robot': ROBOT_MOTION,
+    'rest': motion_from_rates(np.array([0.0, 60.0]), np.zeros(2)),
 }
 
 
 def motion_by_name(motion: str | Path) -> Motion:
-    """Return a motion of `NAMED`, or that of a profile; raise as `read_motion`."""
-    return NAMED.get(str(motion)) or read_motion(motion)
+    """Return a motion of `NAMED_MOTIONS`, or that of a profile; raise as `read_motion`."""
+    return NAMED_MOTIONS.get(str(motion)) or read_motion(motion)
 
 
-_WORDS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE,
-          'reference_heading_rad': 1.0, 'rate_dps': DEGREE, 'rate_rad_s': 1.0,
-          'reference_rate_dps': DEGREE, 'reference_rate_rad_s': 1.0}
+_COLUMN_UNITS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE,
+                 'reference_heading_rad': 1.0, 'rate_dps': DEGREE, 'rate_rad_s': 1.0,
+                 'reference_rate_dps': DEGREE, 'reference_rate_rad_s': 1.0}
 
 
 def read_motion(path: str | Path) -> Motion:
@@ -165,38 +174,40 @@ def read_motion(path: str | Path) -> Motion:
 
     """
     try:
-        lines = io.StringIO(read_bytes(path, BYTES).decode('utf-8-sig'), newline=None)
+        lines = io.StringIO(read_bytes(path, MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
-        name = _moving_column(path, header)
+        name = _find_motion_column(path, header)
         columns = {each: header.index(each) for each in ('time_s', name)}
-        time, values = np.fromiter(_numbers(path, rows, columns), dtype=float).reshape(-1, 2).T
+        time, values = (np.fromiter(_read_numbers(path, rows, columns),
+                                    dtype=float).reshape(-1, 2).T)
     except MotionError:
         raise
     except (OSError, ValueError, csv.Error) as error:
-        raise MotionError(f'{path}: cannot be read as a motion profile ({reason(error)}); '
+        raise MotionError(f'{path}: cannot be read as a motion profile ({describe_error(error)}); '
                           'wanted a CSV file with time_s and heading_deg') from error
     known = np.isfinite(values)
-    time, values = time[known], values[known] * _WORDS[name]
-    if len(time) < 2 or not (np.diff(time) >= SHORTEST).all():
+    time, values = time[known], values[known] * _COLUMN_UNITS[name]
+    if len(time) < 2 or not (np.diff(time) >= MIN_SAMPLE_INTERVAL).all():
         raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
-    return from_rates(time, values) if 'rate' in name else from_headings(time, values)
+    return (motion_from_rates(time, values) if 'rate' in name else motion_from_headings(
+        time, values))
 
 
-def _moving_column(path: str | Path, header: list[str]) -> str:
+def _find_motion_column(path: str | Path, header: list[str]) -> str:
     """Return the name of the column that holds the motion."""
-    found = [name for name in _WORDS if name in header]
+    found = [name for name in _COLUMN_UNITS if name in header]
     both = (len(found) == 2 and found[0].startswith('reference_heading')
             and found[1].startswith('reference_rate'))
     if 'time_s' not in header or not (len(found) == 1 or both):
-        given = shown(','.join(header)) or 'nothing'
+        given = excerpt(','.join(header)) or 'nothing'
         raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
                           'heading_deg, heading_rad, rate_dps, rate_rad_s')
     return found[0]
 
 
-def _numbers(path: str | Path, rows: Iterable[list[str]],
-             columns: dict[str, int]) -> Iterator[float]:
+def _read_numbers(path: str | Path, rows: Iterable[list[str]],
+                  columns: dict[str, int]) -> Iterator[float]:
     """Give time and value of one row after the other, nan where a reference was lost."""
     for row in rows:
         for name, place in columns.items():
@@ -204,7 +215,8 @@ def _numbers(path: str | Path, rows: Iterable[list[str]],
                 value = float(row[place])
             except (IndexError, ValueError):
                 value = math.inf
-            if not (abs(value) <= LARGEST or math.isnan(value) and name.startswith('reference_')):
+            if not (abs(value) <= MAX_MAGNITUDE
+                    or math.isnan(value) and name.startswith('reference_')):
                 raise MotionError(f'{path}: column {name} holds something that is not a finite '
                                   'number; correct or remove the row')
             yield value
@@ -229,14 +241,14 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
     rate, heading = motion.rate_at(time), motion.heading_at(time)
     degc = np.broadcast_to(model.reference_temperature if temperature is None else temperature,
                            len(time)).astype(float)
-    channels = History().follow(time, degc, heading=heading)
-    output = respond(model, time, channels.moving(rate, rate), generator)
+    channels = ChannelHistory().update(time, degc, heading=heading)
+    output = simulate_gyro_output(model, time, channels.with_rate(rate, rate), generator)
     return Log(output=output, time=time, temperature=degc, reference_rate=rate,
                reference_heading=heading)
 
 
-def respond(model: GyroModel, time: Array, channels: Channels,
-            generator: np.random.Generator | None = None) -> Array:
+def simulate_gyro_output(model: GyroModel, time: Array, channels: Channels,
+                         generator: np.random.Generator | None = None) -> Array:
     """
     Return the output, rad/s, shape (n,), of a gyro in a motion and its surroundings.
 
@@ -248,9 +260,9 @@ def respond(model: GyroModel, time: Array, channels: Channels,
     generator : source of the noise; without one there is none
 
     """
-    rate = model.distorted('rate', channels.rate, time)
-    output = model.output_in(channels.moving(rate, rate))
+    rate = model.distort('rate', channels.rate, time)
+    output = model.output_from_channels(channels.with_rate(rate, rate))
     if generator is not None:
         output = output + simulate_noise(model.noise, len(time), float(np.median(np.diff(time))),
                                          generator)
-    return model.distorted('output', output, time)
+    return model.distort('output', output, time)

@@ -21,12 +21,12 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
-ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
+ALLAN_FLOOR_RATIO = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: Averaging time of the bias estimate, s: the length of a self-calibration.
-CALIBRATED = 20.0
+BIAS_AVERAGING_TIME = 20.0
 #: Time constants, s, a factor of 10 apart, of the Gauss-Markov processes that approximate flicker
 #: from 1 s to some hours.
-_FLICKER = np.array([3.0, 30.0, 300.0, 3000.0])
+_FLICKER_TIME_CONSTANTS = np.array([3.0, 30.0, 300.0, 3000.0])
 
 
 @dataclass(frozen=True)
@@ -51,18 +51,18 @@ class Noise:
         return self.angle_random_walk ** 2 / interval
 
     @property
-    def floor(self) -> float:
+    def allan_floor(self) -> float:
         """Return the floor of the Allan deviation by the flicker alone, rad/s."""
-        return ALLAN_FLOOR * self.bias_instability
+        return ALLAN_FLOOR_RATIO * self.bias_instability
 
     def allan_variance(self, duration: Number) -> Number:
         """Return the Allan variance at an averaging time of `duration` s, (rad/s)²."""
-        return (self.angle_random_walk ** 2 / duration + self.floor ** 2
+        return (self.angle_random_walk ** 2 / duration + self.allan_floor ** 2
                 + self.rate_random_walk ** 2 * duration / 3.0)
 
-    def wander(self, age: Number, duration: float) -> Number:
+    def mean_change_variance(self, elapsed: Number, duration: float) -> Number:
         """
-        Return the variance of the change of a mean over `duration` s after `age` s, (rad/s)².
+        Return the variance of the change of a mean over `duration` s after `elapsed` s, (rad/s)².
 
         White noise is not included. Flicker with the two-sided spectrum B² / (2 pi f) has the
         generalized covariance -B² / pi log|t|. Means over T at a distance t far above T then
@@ -70,10 +70,10 @@ class Noise:
 
         """
         flicker = 2.0 / math.pi * self.bias_instability ** 2 * (
-            np.log(np.maximum(age / duration, 1.0)) + 1.5)
-        return flicker + self.rate_random_walk ** 2 * np.maximum(age, duration)
+            np.log(np.maximum(elapsed / duration, 1.0)) + 1.5)
+        return flicker + self.rate_random_walk ** 2 * np.maximum(elapsed, duration)
 
-    def flicker(self) -> tuple[Array, float]:
+    def flicker_processes(self) -> tuple[Array, float]:
         """
         Return time constants, s, and variance, (rad/s)², of k Gauss-Markov processes for flicker.
 
@@ -82,7 +82,8 @@ class Noise:
         B² / (2 pi f).
 
         """
-        constants = _FLICKER if self.bias_instability else _FLICKER[:0]
+        constants = (_FLICKER_TIME_CONSTANTS
+                     if self.bias_instability else _FLICKER_TIME_CONSTANTS[:0])
         return constants, self.bias_instability ** 2 * math.log(10.0) / math.pi
 
     def drift_variance(self, duration: Number) -> Number:
@@ -92,10 +93,11 @@ class Noise:
         The bias is estimated as its mean over the `CALIBRATED` s before.
 
         """
-        variance = self.rate_random_walk ** 2 * (duration ** 3 + CALIBRATED * duration ** 2) / 3.0
-        constants, of_each = self.flicker()
+        variance = (self.rate_random_walk ** 2 *
+                    (duration ** 3 + BIAS_AVERAGING_TIME * duration ** 2) / 3.0)
+        constants, of_each = self.flicker_processes()
         for constant in constants:
-            within, shared = known_mean(constant)
+            within, shared = averaged_process_moments(constant)
             decayed = constant * (1.0 - np.exp(-duration / constant))
             variance = variance + of_each * (2.0 * constant * (duration - decayed)
                                              + duration ** 2 * within
@@ -107,7 +109,7 @@ class Noise:
         return self.angle_random_walk ** 2 * duration + self.drift_variance(duration)
 
 
-def known_mean(constant: Number) -> tuple[Number, Number]:
+def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
     """
     Return the variance of the mean of a process over `CALIBRATED` s, and a covariance.
 
@@ -115,7 +117,7 @@ def known_mean(constant: Number) -> tuple[Number, Number]:
     the value at the end of the interval.
 
     """
-    ratio = CALIBRATED / constant
+    ratio = BIAS_AVERAGING_TIME / time_constant
     decayed = 1.0 - np.exp(-ratio)
     return 2.0 * (ratio - decayed) / ratio ** 2, decayed / ratio
 
@@ -129,8 +131,8 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
 
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
-    angle = (noise.bias_instability ** 2 * FLICKER.covariance(apart)
-             + noise.rate_random_walk ** 2 * RATE_RANDOM_WALK.covariance(apart))
+    angle = (noise.bias_instability ** 2 * FLICKER.angle_covariance(apart)
+             + noise.rate_random_walk ** 2 * RATE_RANDOM_WALK.angle_covariance(apart))
     means = np.diff(np.diff(angle, axis=0), axis=1) / np.outer(lengths, lengths)
     return means + np.diag(noise.angle_random_walk ** 2 / lengths)
 
@@ -152,7 +154,7 @@ class GaussMarkov:
         return self.density ** 2 * self.correlation_time * bracket / (2.0 * ratio ** 2)
 
     @property
-    def deviation(self) -> float:
+    def standard_deviation(self) -> float:
         """Return the standard deviation of the process, rad/s."""
         return self.density * math.sqrt(0.5 * self.correlation_time)
 
@@ -162,11 +164,11 @@ class GaussMarkov:
         # a series where ratio - 1 + exp(-ratio) would lose all digits
         growth = np.where(ratio < 1e-4, ratio ** 2 * (0.5 - ratio / 6.0),
                           ratio + np.expm1(-ratio))
-        return -(self.deviation * self.correlation_time) ** 2 * growth
+        return -(self.standard_deviation * self.correlation_time) ** 2 * growth
 
 
 @dataclass(frozen=True)
-class Part:
+class NoiseTerm:
     """
     A noise term by the slope of its Allan deviation (IEEE Std 952, C.1).
 
@@ -178,14 +180,14 @@ class Part:
     symbol: str
     unit: str  # in SI
     slope: float  # of log Allan deviation over log averaging time
-    factor: float
+    allan_factor: float
     #: Covariance of the angle at a time difference, for a coefficient of 1, except terms that
     #: second differences remove.
-    covariance: Callable[[Number], Array]
+    angle_covariance: Callable[[Number], Array]
 
-    def variance(self, time: Number) -> Array:
+    def allan_variance(self, time: Number) -> Array:
         """Return the Allan variance for a coefficient of 1."""
-        return self.factor * np.asarray(time, dtype=float) ** (2.0 * self.slope)
+        return self.allan_factor * np.asarray(time, dtype=float) ** (2.0 * self.slope)
 
 
 def _flicker_covariance(time: Number) -> Array:
@@ -194,15 +196,16 @@ def _flicker_covariance(time: Number) -> Array:
     return size ** 2 * np.log(np.where(size == 0.0, 1.0, size)) / (2.0 * math.pi)
 
 
-ANGLE_RANDOM_WALK = Part('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
-                         lambda time: -0.5 * np.abs(time))
-FLICKER = Part('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR ** 2, _flicker_covariance)
-RATE_RANDOM_WALK = Part('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
-                        lambda time: np.abs(time) ** 3 / 12.0)
-QUANTIZATION = Part('quantization', 'Q', 'rad', -1.0, 3.0,
-                    lambda time: (np.asarray(time) == 0.0).astype(float))
-RATE_RAMP = Part('rate_ramp', 'R', 'rad/s²', 1.0, 0.5, lambda time: 0.0 * np.asarray(time))
-PARTS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
+ANGLE_RANDOM_WALK = NoiseTerm('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
+                              lambda time: -0.5 * np.abs(time))
+FLICKER = NoiseTerm('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR_RATIO ** 2,
+                    _flicker_covariance)
+RATE_RANDOM_WALK = NoiseTerm('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
+                             lambda time: np.abs(time) ** 3 / 12.0)
+QUANTIZATION = NoiseTerm('quantization', 'Q', 'rad', -1.0, 3.0,
+                         lambda time: (np.asarray(time) == 0.0).astype(float))
+RATE_RAMP = NoiseTerm('rate_ramp', 'R', 'rad/s²', 1.0, 0.5, lambda time: 0.0 * np.asarray(time))
+NOISE_TERMS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
 
 
 def simulate_noise(noise: Noise, count: int, interval: float,

@@ -45,7 +45,7 @@ class Preset:
                           Term(BIAS, (self.bias * DEGREE,))), noise=self.noise)
 
     @property
-    def true(self) -> tuple[float, float]:
+    def true_values(self) -> tuple[float, float]:
         """Return scale factor error s, and bias b, rad/s."""
         return self.scale_factor_error, self.bias * DEGREE
 

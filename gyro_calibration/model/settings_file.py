@@ -25,20 +25,20 @@ import re
 import reprlib
 from typing import Any
 
-from gyro_calibration.files import LARGEST, plain, read_bytes
+from gyro_calibration.files import MAX_MAGNITUDE, read_bytes, to_printable
 import numpy as np
 import yaml
 
 #: Largest file, bytes: twice the size of a model with the covariance of 150 values.
-BYTES = 1_000_000
+MAX_SETTINGS_BYTES = 1_000_000
 #: Largest depth of nested lists and names, and largest number of nodes; parsing takes 30 us each.
-_DEEPEST, _MOST = 10, 50_000
+_MAX_DEPTH, _MAX_VALUES = 10, 50_000
 #: Shortens large values in messages.
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel = 3
+_SHORT_REPR = reprlib.Repr()
+_SHORT_REPR.maxlevel = 3
 
 
-def read_settings(path: str | Path, most: int = BYTES) -> Any:
+def read_settings(path: str | Path, max_size: int = MAX_SETTINGS_BYTES) -> Any:
     """
     Read a YAML file of names, texts, numbers, true, false, null and lists.
 
@@ -52,33 +52,34 @@ def read_settings(path: str | Path, most: int = BYTES) -> Any:
 
     """
     try:
-        text = read_bytes(path, most).decode('utf-8-sig')
+        text = read_bytes(path, max_size).decode('utf-8-sig')
         content = yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f'line {mark.line + 1}: ' if mark else ''
-        raise ValueError(f'{place}{_line(error.problem or error.context)}') from error
+        raise ValueError(f'{place}{_to_single_line(error.problem or error.context)}') from error
     except yaml.YAMLError as error:
-        raise ValueError(_line(error)) from error
+        raise ValueError(_to_single_line(error)) from error
     if isinstance(content, dict) and 'format' in content and not text.endswith(('\n', '\r')):
         raise ValueError('its last line has no end, as that of a file which was cut off')
     return content
 
 
-class WrongValue(ValueError):
+class InvalidValue(ValueError):
     """A value does not fit its schema; the message is part of a sentence."""
 
-    def __init__(self, place: str, given: Any, wanted: str):
-        super().__init__(f'{plain(place[:100])} is {_SHORT.repr(given)}; wanted {wanted}')
+    def __init__(self, key_path: str, value: Any, expected: str):
+        super().__init__(f'{to_printable(key_path[:100])} is {_SHORT_REPR.repr(value)}; wanted '
+                         f'{expected}')
 
 
-def checked(place: str, value: Any, schema: Any) -> Any:
+def validate(key_path: str, value: Any, schema: Any) -> Any:
     """
     Return a value as parsed by its schema.
 
     Parameters
     ----------
-    place : of the value in the file, such as `noise.angle_random_walk`
+    key_path : of the value in the file, such as `noise.angle_random_walk`
     value : what the file holds there
     schema : a function of place and value; or a mapping of names to schemas, all of them optional
         in the file; or None, for a mapping of any names
@@ -89,47 +90,50 @@ def checked(place: str, value: Any, schema: Any) -> Any:
 
     """
     if callable(schema):
-        return schema(place, value)
+        return schema(key_path, value)
     if not isinstance(value, dict):
-        raise WrongValue(place, value, 'names with values')
+        raise InvalidValue(key_path, value, 'names with values')
     if schema is None:
         return value
-    refuse_others(place, value, schema)
-    return {name: checked(f'{place}.{name}', each, schema[name]) for name, each in value.items()}
+    refuse_unknown_names(key_path, value, schema)
+    return ({
+        name: validate(f'{key_path}.{name}', each, schema[name]) for name, each in value.items()
+    })
 
 
-def refuse_others(place: str, given: Mapping[str, Any],
-                  known: Sequence[str] | Mapping[str, Any]) -> None:
-    """Raise `WrongValue` for an unknown name."""
+def refuse_unknown_names(key_path: str, given: Mapping[str, Any],
+                         known: Sequence[str] | Mapping[str, Any]) -> None:
+    """Raise `InvalidValue` for an unknown name."""
     for name in given:
         if name not in known:
-            raise WrongValue(f'{place}.{name}', given[name], f'one of {", ".join(known)}')
+            raise InvalidValue(f'{key_path}.{name}', given[name], f'one of {", ".join(known)}')
 
 
-def number(place: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> float:
-    """Return a finite number within bounds, or raise `WrongValue`."""
+def parse_number(key_path: str, value: Any, low: float = -MAX_MAGNITUDE,
+                 high: float = MAX_MAGNITUDE) -> float:
+    """Return a finite number within bounds, or raise `InvalidValue`."""
     if (isinstance(value, bool) or not isinstance(value, (int, float))
             or not low <= value <= high):
-        least = '' if low == -LARGEST else f' of at least {low:g}'
-        wanted = (f'a finite number{least}' if high == LARGEST
+        least = '' if low == -MAX_MAGNITUDE else f' of at least {low:g}'
+        wanted = (f'a finite number{least}' if high == MAX_MAGNITUDE
                   else f'a number from {low:g} to {high:g}')
-        raise WrongValue(place, value, wanted)
+        raise InvalidValue(key_path, value, wanted)
     return float(value)
 
 
-def text(place: str, value: Any) -> str:
+def parse_text(key_path: str, value: Any) -> str:
     """Return a scalar as text, also one that YAML reads as a number."""
     if isinstance(value, (list, dict)):
-        raise WrongValue(place, value, 'a text')
+        raise InvalidValue(key_path, value, 'a text')
     return str(value)
 
 
-def _line(text: object) -> str:
+def _to_single_line(text: object) -> str:
     """Return a message as one line of at most 200 characters."""
     return ' '.join(str(text).split())[:200]
 
 
-def settings_text(content: Any) -> str:
+def format_settings(content: Any) -> str:
     """
     Return names, texts, numbers and lists as YAML that `read_settings` reads back unchanged.
 
@@ -156,13 +160,13 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         event: Any = self.peek_event()
         if event.anchor is not None:
-            _refuse('an anchor or alias is not read; write out what it stands for', event)
+            _refuse_node('an anchor or alias is not read; write out what it stands for', event)
         if event.tag is not None:
-            _refuse('a tag is not read; leave it out', event)
-        if self._depth == _DEEPEST:
-            _refuse(f'more than {_DEEPEST} levels are nested', event)
-        if self._count == _MOST:
-            _refuse(f'there are more than {_MOST} values', event)
+            _refuse_node('a tag is not read; leave it out', event)
+        if self._depth == _MAX_DEPTH:
+            _refuse_node(f'more than {_MAX_DEPTH} levels are nested', event)
+        if self._count == _MAX_VALUES:
+            _refuse_node(f'there are more than {_MAX_VALUES} values', event)
         self._depth, self._count = self._depth + 1, self._count + 1
         node = super().compose_node(parent, index)
         self._depth -= 1
@@ -172,9 +176,9 @@ class _Loader(yaml.SafeLoader):
         names: dict[str, Any] = {}
         for name, value in node.value:
             if not isinstance(name, yaml.ScalarNode):
-                _refuse('a name is a list, or holds names', name)
+                _refuse_node('a name is a list, or holds names', name)
             if name.value in names:
-                _refuse(f'{name.value[:50]!r} is given twice; keep one of them', name)
+                _refuse_node(f'{name.value[:50]!r} is given twice; keep one of them', name)
             names[name.value] = self.construct_object(value, deep)
         return names
 
@@ -194,19 +198,19 @@ class _Dumper(yaml.SafeDumper):
                                      '"' if re.search('[\x85\u2028\u2029]', data) else None)
 
 
-def _number(dumper: Any, value: float) -> Any:
+def _represent_float(dumper: Any, value: float) -> Any:
     if not math.isfinite(value):
         raise ArithmeticError(f'{value:g} is no number that a file may hold')
     return yaml.SafeDumper.represent_float(dumper, value)
 
 
-def _refuse(problem: str, at: Any) -> None:
-    raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
+def _refuse_node(problem: str, node: Any) -> None:
+    raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
 #: Name -> (pattern, first characters, constructor). More than 400 digits are not read as a number,
 #: since that would take long.
-_KINDS: dict[str, tuple[str, list[str], Any]] = {
+_YAML_TYPES: dict[str, tuple[str, list[str], Any]] = {
     'null': ('~|null|Null|NULL|', ['~', 'n', 'N', ''], lambda loader, node: None),
     'bool': ('true|True|TRUE|false|False|FALSE', list('tTfF'),
              lambda loader, node: node.value.lower() == 'true'),
@@ -220,10 +224,10 @@ _KINDS: dict[str, tuple[str, list[str], Any]] = {
     'map': ('', [], yaml.SafeLoader.construct_yaml_map),
 }
 _Dumper.add_representer(str, _Dumper.represent_str)
-_Dumper.add_representer(float, _number)
+_Dumper.add_representer(float, _represent_float)
 _Dumper.add_multi_representer(np.generic, lambda dumper, value: dumper.represent_data(
     float(value) if isinstance(value, np.floating) else value.item()))
-for _name, (_pattern, _first, _constructor) in _KINDS.items():
+for _name, (_pattern, _first, _constructor) in _YAML_TYPES.items():
     _tag = f'tag:yaml.org,2002:{_name}'
     _Loader.add_constructor(_tag, _constructor)
     if _first:

@@ -31,7 +31,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 
-def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:
+def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:
     """
     Return the process that fits bias instability and rate random walk best.
 
@@ -57,23 +57,24 @@ def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarko
     wanted = noise.allan_variance(octaves)
     white = noise.angle_random_walk ** 2 / octaves
 
-    def process(logarithms: Array) -> GaussMarkov:
+    def to_process(logarithms: Array) -> GaussMarkov:
         return GaussMarkov(*np.exp(logarithms).tolist())
 
-    def errors(logarithms: Array) -> Array:
-        return np.log((white + process(logarithms).allan_variance(octaves)) / wanted)
+    def log_errors(logarithms: Array) -> Array:
+        return np.log((white + to_process(logarithms).allan_variance(octaves)) / wanted)
 
     longest = math.log(100.0 * span)  # beyond it the process is a random walk over the span
     begins = [np.array([math.log(walk + floor / math.sqrt(time)), math.log(time)])
               for time in np.geomspace(span / 100.0, span, 5)]
-    found = min((minimize(lambda x: float(np.mean(errors(x) ** 2)), begin, method='Nelder-Mead',
-                          bounds=((None, None), (math.log(interval), longest)))
-                 for begin in begins), key=lambda each: float(each.fun))
-    return process(found.x), float(np.expm1(0.5 * np.abs(errors(found.x)).max()))
+    found = min(
+        (minimize(lambda x: float(np.mean(log_errors(x) ** 2)), begin, method='Nelder-Mead',
+                  bounds=((None, None), (math.log(interval), longest)))
+         for begin in begins), key=lambda each: float(each.fun))
+    return to_process(found.x), float(np.expm1(0.5 * np.abs(log_errors(found.x)).max()))
 
 
 @dataclass(frozen=True)
-class Figures:
+class SimulatorParameters:
     """
     The parameters of a gyro that simulators support, in rad/s and s; 0 where there is none.
 
@@ -91,8 +92,8 @@ class Figures:
     interval: float
 
 
-def figures(model: GyroModel, sample_rate: float, temperature: float,
-            span: float) -> tuple[Figures, float]:
+def simulator_parameters(model: GyroModel, sample_rate: float, temperature: float,
+                         span: float) -> tuple[SimulatorParameters, float]:
     """
     Return the parameters of a model that simulators support.
 
@@ -112,19 +113,19 @@ def figures(model: GyroModel, sample_rate: float, temperature: float,
     run = model.self_calibration
     begin = run.bias if run else 0.0
     still = {'rate', 'output', 'temperature'}
-    terms = [term for term in model.terms if term.effect.looks_at <= still]
+    terms = [term for term in model.terms if term.effect.inputs <= still]
     channels = Channels(begin, begin, temperature)
     bias = begin + sum(float(term.error(channels)) for term in terms)
     deviation = run.standard_deviations[1] if run else math.nan
     values = {term.effect.name: term.values[0] for term in model.terms}
-    wander, error = gauss_markov(model.noise, interval, span)
-    return Figures(bias, 0.0 if math.isnan(deviation) else deviation,
-                   math.sqrt(model.noise.rate_variance(interval)), wander,
-                   values.get('saturation', 0.0), values.get('quantization', 0.0),
-                   values.get('time_offset', 0.0), interval), error
+    wander, error = fit_gauss_markov(model.noise, interval, span)
+    return SimulatorParameters(bias, 0.0 if math.isnan(deviation) else deviation,
+                               math.sqrt(model.noise.rate_variance(interval)), wander,
+                               values.get('saturation', 0.0), values.get('quantization', 0.0),
+                               values.get('time_offset', 0.0), interval), error
 
 
-def _sdf(held: Figures) -> tuple[str, set[str]]:
+def _format_sdf(parameters: SimulatorParameters) -> tuple[str, set[str]]:
     """
     Return the noise of the z axis for an `<imu>` in SDF.
 
@@ -133,14 +134,14 @@ def _sdf(held: Figures) -> tuple[str, set[str]]:
     Gauss-Markov process.
 
     """
-    quantized = held.quantization >= 1e-6  # rad/s; Gazebo makes no smaller steps
-    values = {'mean': held.bias, 'stddev': held.white_noise, 'bias_mean': 0.0,
-              'bias_stddev': held.bias_deviation}
-    if held.wander.density:
-        values |= {'dynamic_bias_stddev': held.wander.density,
-                   'dynamic_bias_correlation_time': held.wander.correlation_time}
+    quantized = parameters.quantization >= 1e-6  # rad/s; Gazebo makes no smaller steps
+    values = {'mean': parameters.bias, 'stddev': parameters.white_noise, 'bias_mean': 0.0,
+              'bias_stddev': parameters.bias_deviation}
+    if parameters.wander.density:
+        values |= {'dynamic_bias_stddev': parameters.wander.density,
+                   'dynamic_bias_correlation_time': parameters.wander.correlation_time}
     if quantized:
-        values['precision'] = held.quantization
+        values['precision'] = parameters.quantization
     kind = 'gaussian_quantized' if quantized else 'gaussian'
     lines = [f'        <{name}>{value:.9g}</{name}>' for name, value in values.items()]
     text = '\n'.join(['<imu>', '  <angular_velocity>', '    <z>', f'      <noise type="{kind}">',
@@ -149,41 +150,45 @@ def _sdf(held: Figures) -> tuple[str, set[str]]:
                   *(['quantization'] if quantized else [])}
 
 
-def _isaac(held: Figures) -> tuple[str, set[str]]:
+def _format_isaac(parameters: SimulatorParameters) -> tuple[str, set[str]]:
     """Return the noise of an observation term of Isaac Lab, which draws the bias at each reset."""
     return '\n'.join([
         'from isaaclab.utils.noise import GaussianNoiseCfg, NoiseModelWithAdditiveBiasCfg', '',
         'GYRO_NOISE = NoiseModelWithAdditiveBiasCfg(',
-        f'    noise_cfg=GaussianNoiseCfg(mean=0.0, std={held.white_noise:.9g}),',
-        f'    bias_noise_cfg=GaussianNoiseCfg(mean={held.bias:.9g}, '
-        f'std={held.bias_deviation:.9g}),', ')']), {'bias', 'angle_random_walk'}
+        f'    noise_cfg=GaussianNoiseCfg(mean=0.0, std={parameters.white_noise:.9g}),',
+        f'    bias_noise_cfg=GaussianNoiseCfg(mean={parameters.bias:.9g}, '
+        f'std={parameters.bias_deviation:.9g}),', ')']), {'bias', 'angle_random_walk'}
 
 
-def _mujoco(held: Figures) -> tuple[str, set[str]]:
+def _format_mujoco(parameters: SimulatorParameters) -> tuple[str, set[str]]:
     """Return a sensor of MuJoCo; from release 3.1.4 on it stores `noise`, but adds none."""
-    attributes = {'name': 'gyro', 'site': 'imu', 'noise': f'{held.white_noise:.9g}'}
+    attributes = {'name': 'gyro', 'site': 'imu', 'noise': f'{parameters.white_noise:.9g}'}
     names = set()
-    if held.saturation:
-        attributes['cutoff'] = f'{held.saturation:.9g}'
+    if parameters.saturation:
+        attributes['cutoff'] = f'{parameters.saturation:.9g}'
         names.add('saturation')
-    if held.time_offset > 0.0:
-        attributes |= {'delay': f'{held.time_offset:.9g}', 'interval': f'{held.interval:.9g}',
-                       'nsample': f'{math.ceil(held.time_offset / held.interval) + 2}',
-                       'interp': 'linear'}
+    if parameters.time_offset > 0.0:
+        attributes |= {
+            'delay': f'{parameters.time_offset:.9g}',
+            'interval': f'{parameters.interval:.9g}',
+            'nsample': f'{math.ceil(parameters.time_offset / parameters.interval) + 2}',
+            'interp': 'linear'
+        }
         names.add('time_offset')
     inside = ' '.join(f'{name}="{value}"' for name, value in attributes.items())
     return f'<sensor>\n  <gyro {inside}/>\n</sensor>', names | {'angle_random_walk'}
 
 
-_FORMATS: dict[str, Callable[[Figures], tuple[str, set[str]]]] = {
-    'sdf': _sdf, 'isaac': _isaac, 'mujoco': _mujoco}
+_FORMATTERS: dict[str, Callable[[SimulatorParameters], tuple[str, set[str]]]] = {
+    'sdf': _format_sdf, 'isaac': _format_isaac, 'mujoco': _format_mujoco}
 #: Names of the simulators.
-SIMULATORS = tuple(_FORMATS)
-_NOISE = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
-          'rate_random_walk': 'rad/s/√s'}
+SIMULATORS = tuple(_FORMATTERS)
+_NOISE_UNITS = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
+                'rate_random_walk': 'rad/s/√s'}
 
 
-def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list[str]]:
+def export_model(parameters: SimulatorParameters, model: GyroModel,
+                 simulator: str) -> tuple[str, list[str]]:
     """
     Write the `figures` of a gyro for one of `SIMULATORS`.
 
@@ -193,19 +198,19 @@ def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list
     parameters, one text each
 
     """
-    text, names = _FORMATS[simulator](held)
+    text, names = _FORMATTERS[simulator](parameters)
     run, noise = model.self_calibration, model.noise
     found = {term.effect.name: ', '.join(
         f'{parameter.name} = {value:.6g} {parameter.unit}'
         for parameter, value in zip(term.effect.parameters, term.values)) for term in model.terms}
     if run and run.scale_factor_error:
         found['scale_factor_error'] = f'{run.scale_factor_error:.6g} by the self-calibration'
-    if held.bias:
-        found['bias'] = f'{held.bias:.6g} rad/s at rest'
-    found |= {name: f'{getattr(noise, name):.6g} {unit}' for name, unit in _NOISE.items()
+    if parameters.bias:
+        found['bias'] = f'{parameters.bias:.6g} rad/s at rest'
+    found |= {name: f'{getattr(noise, name):.6g} {unit}' for name, unit in _NOISE_UNITS.items()
               if getattr(noise, name)}
     left_out = [f'{name}: {value}' for name, value in found.items() if name not in names]
-    if simulator == 'mujoco' and held.white_noise:
+    if simulator == 'mujoco' and parameters.white_noise:
         left_out.append('angle_random_walk: stored as noise; MuJoCo 3.1.4 and later add none')
     if not left_out:
         return f'{text}\n', left_out

@@ -34,28 +34,28 @@ from types import SimpleNamespace
 from gyro_calibration.calibration.self_calibration import (
     calibrate_bias,
     check_rest,
-    Limits,
-    record,
-    Reference,
-    rest_after,
+    find_rest_after,
+    ReferenceErrors,
+    RunLimits,
     self_calibrate,
-    SETTLED,
+    SETTLING_TIME,
+    to_model_record,
 )
 from gyro_calibration.calibration.whole_turns import calibrate_turns
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import (
-    CALIBRATION,
-    from_headings,
-    from_rates,
+    CALIBRATION_MOTION,
     Motion,
+    motion_from_headings,
+    motion_from_rates,
     MotionError,
     read_motion,
 )
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.clock import Clock, node_time, StampDelay
-from gyro_calibration.ros.health_monitor import changed, HealthMonitor
+from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
 from gyro_calibration.ros.state_store import StateStore
 from gyro_calibration.ros.wheels import Velocity
 import numpy as np
@@ -64,40 +64,40 @@ PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
 #: Duration of a calibration of the bias alone, s.
 _REST_DURATION = 15.0
 #: Duration of the rest after whole turns, s.
-MARKED = 2.5
+REST_AFTER_TURNS = 2.5
 #: Longest duration of a run that waits for `finish`, s.
-LONGEST = 600.0
+FINISH_TIMEOUT = 600.0
 #: Time without a sample after which a run without a drive ends, s.
-SILENCE = 5.0
+SAMPLE_TIMEOUT = 5.0
 #: Time without a sample, s or intervals, after which a drive ends; the longer one applies.
-BLIND, _BLIND_INTERVALS = 0.25, 4.0
+DRIVE_SAMPLE_TIMEOUT, _DRIVE_TIMEOUT_INTERVALS = 0.25, 4.0
 #: Longest wait for a node that receives the commands, s; discovery may take 3 s.
-DISCOVERY = 5.0
+DISCOVERY_TIMEOUT = 5.0
 #: Longest turn of the robot after the last command, s: latency and deceleration.
-STOPPING = 1.5
+STOPPING_DURATION = 1.5
 #: Least change of the odometry heading over a run that shows a turn, rad.
-_TURNED = 1.0 * DEGREE
+_MIN_TURN_ANGLE = 1.0 * DEGREE
 #: Largest number of own commands that have not come back; 5 s at 50 Hz.
-_ECHOES = 256
+_MAX_PENDING_COMMANDS = 256
 #: Longest pause of the node in a drive, s: after it the base has stopped by itself, or turned
 #: on.
-_HELD_UP = 1.0
+_MAX_NODE_PAUSE = 1.0
 #: Time over which stamps and clock are compared in a drive, s; it shows a jump of the stamps.
-_DRIVEN = 2.0
+_DRIVE_COMPARISON_TIME = 2.0
 #: Duration of repeated zero commands after a drive, s: the link to the base may lose some.
-_REPEATED = 1.0
+_STOP_REPEAT_DURATION = 1.0
 
 
 @dataclass
-class Run:
+class CalibrationRun:
     """A calibration in progress."""
 
     kind: str  # PROFILE, ODOMETRY, TURNS or REST
     duration: float  # of the compared motion, s; inf until `CalibrationSession.finish`
-    after: float  # duration of samples after the motion, s
-    received: float  # time of the last sample, or of the request, s of the steady clock
+    extra_duration: float  # duration of samples after the motion, s
+    last_received: float  # time of the last sample, or of the request, s of the steady clock
     motion: Motion | None = None  # the profile
-    reason: str | None = None  # reason of the end; '' where the samples are complete
+    end_reason: str | None = None  # reason of the end; '' where the samples are complete
     times: list[float] = field(default_factory=list)  # stamps, s
     outputs: list[float] = field(default_factory=list)  # rad/s
     rates: list[float] = field(default_factory=list)  # after the model, rad/s
@@ -116,16 +116,17 @@ class Run:
     def finish(self) -> str:
         """End the motion now; return the remaining instruction for the user."""
         self.duration = min(self.duration, self.elapsed)
-        left = self.duration + self.after - self.elapsed
+        left = self.duration + self.extra_duration - self.elapsed
         return f'leave the robot at rest for {left:.1f} s more'
 
     @property
-    def over(self) -> str | None:
+    def due_end_reason(self) -> str | None:
         """Return '' if the samples are complete, the reason of a time-out, or None."""
-        if self.elapsed >= self.duration + self.after:
+        if self.elapsed >= self.duration + self.extra_duration:
             return ''
-        if math.isinf(self.duration) and self.elapsed > LONGEST:
-            return (f'finish_calibration was not called within {LONGEST:g} s: call it when the '
+        if math.isinf(self.duration) and self.elapsed > FINISH_TIMEOUT:
+            return (f'finish_calibration was not called within {FINISH_TIMEOUT:g} s: call it when '
+                    'the '
                     'robot stands on the mark again')
         return None
 
@@ -135,20 +136,21 @@ class Run:
         return self.times[-1] - self.times[0] if self.times else 0.0
 
     @property
-    def total(self) -> float:
+    def max_duration(self) -> float:
         """Return the longest duration of the run, s."""
-        return LONGEST if math.isinf(self.duration) else self.duration + self.after
+        return FINISH_TIMEOUT if math.isinf(self.duration) else self.duration + self.extra_duration
 
     @property
     def progress(self) -> float:
         """Return the completed fraction, 0 to 1."""
-        return min(self.elapsed / self.total, 1.0)
+        return min(self.elapsed / self.max_duration, 1.0)
 
     @property
     def status(self) -> str:
         """Return the progress in words."""
         return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
-                if math.isinf(self.duration) else f'{self.elapsed:.0f} of {self.total:.0f} s')
+                if math.isinf(self.duration) else f'{self.elapsed:.0f} of {self.max_duration:.0f} '
+                                                  's')
 
     @property
     def temperature(self) -> float | None:
@@ -157,25 +159,26 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Rules:
+class AcceptanceRules:
     """Criteria for accepting a run; with 0 `turns` the gyro determines their number."""
 
-    limits: Limits = Limits()
-    odometry: Reference = Reference()
+    limits: RunLimits = RunLimits()
+    odometry: ReferenceErrors = ReferenceErrors()
     turns: int = 0
 
-    def after(self, kind: str) -> float:
+    def extra_duration(self, kind: str) -> float:
         """Return the duration of samples after the motion, s."""
         if kind in (TURNS, REST):
-            return MARKED if kind == TURNS else 0.0
-        return self.limits.time_offset + SETTLED + self.limits.rest
+            return REST_AFTER_TURNS if kind == TURNS else 0.0
+        return self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration
 
 
-def rules(values: SimpleNamespace) -> Rules:
+def rules_from_parameters(values: SimpleNamespace) -> AcceptanceRules:
     """Return the rules by the parameters of the node."""
-    return Rules(Limits(bias=values.calibration_maximum_bias),
-                 Reference(scale_deviation=values.calibration_odometry_scale_deviation),
-                 values.calibration_turns)
+    return AcceptanceRules(
+        RunLimits(max_bias=values.calibration_maximum_bias),
+        ReferenceErrors(scale_deviation=values.calibration_odometry_scale_deviation),
+        values.calibration_turns)
 
 
 class Drive:
@@ -189,90 +192,94 @@ class Drive:
     INTERVAL = 0.02
     """Time between commands, s."""
 
-    def __init__(self, run: Run, clock: Clock, blind: Callable[[], float]):
-        """Start to wait for a receiver of the commands; `blind` returns s, see `BLIND`."""
+    def __init__(self, run: CalibrationRun, clock: Clock, sample_timeout: Callable[[], float]):
+        """Start to wait for a receiver of the commands; `sample_timeout` returns s."""
         assert run.motion is not None
-        self._run, self._motion, self._clock, self._blind = run, run.motion, clock, blind
-        self._begun = self._polled = clock.steady()
-        self._received = self._suspected = self._called = self._alone = False
-        self._due = -math.inf
-        self._delay = StampDelay(clock, BLIND, _DRIVEN)
+        self._run, self._motion, self._clock, self._sample_timeout = (
+            run, run.motion, clock, sample_timeout)
+        self._start_time = self._last_poll = clock.steady()
+        self._has_receiver = self._silence_suspected = False
+        self._had_callers = self._callers_gone = False
+        self._next_command_time = -math.inf
+        self._stamp_delay = StampDelay(clock, DRIVE_SAMPLE_TIMEOUT, _DRIVE_COMPARISON_TIME)
         self.command_lateness = self.sample_lateness = 0.0
 
-    def see_sample(self, time: float) -> None:
+    def add_sample(self, time: float) -> None:
         """Update the lateness of samples relative to the recent least delay."""
-        self.sample_lateness = max(self.sample_lateness, self._delay.add(time))
+        self.sample_lateness = max(self.sample_lateness, self._stamp_delay.add(time))
 
-    def waits(self, receivers: int) -> bool:
+    def is_waiting(self, receivers: int) -> bool:
         """Tell whether the run still waits for a node that receives its commands."""
-        self._received = self._received or receivers > 0
-        return not self._received
+        self._has_receiver = self._has_receiver or receivers > 0
+        return not self._has_receiver
 
-    def fault(self, receivers: int, ros_time_stands: bool) -> str:
+    def find_fault(self, receivers: int, is_ros_time_paused: bool) -> str:
         """Return why the run must end; '' if it continues."""
         now = self._clock.steady()
-        pause, self._polled = now - self._polled, now
-        if self.waits(receivers):
-            return self._not_received if now - self._begun > DISCOVERY else ''
+        pause, self._last_poll = now - self._last_poll, now
+        if self.is_waiting(receivers):
+            return self._no_receiver_message if now - self._start_time > DISCOVERY_TIMEOUT else ''
         if not receivers:
-            return self._not_received
-        if ros_time_stands:
-            return STANDING_TIME
-        if pause > _HELD_UP:
+            return self._no_receiver_message
+        if is_ros_time_paused:
+            return ROS_TIME_PAUSED
+        if pause > _MAX_NODE_PAUSE:
             return (f'this computer was busy: the node was held up for {pause:.1f} s while it '
                     'drove the robot; reduce its load and run again')
-        if fault := self._delay.fault():
+        if fault := self._stamp_delay.find_fault():
             return fault
         # Decided at the second poll: after a pause of this process, queued samples are delivered
         # after its timers.
-        silence = now - self._run.received
-        before, self._suspected = self._suspected, silence > self._blind()
+        silence = now - self._run.last_received
+        before, self._silence_suspected = self._silence_suspected, silence > self._sample_timeout()
         return (f'no sample came for {silence:.2f} s while the robot was driven: check the gyro '
-                'and its driver') if before and self._suspected else ''
+                'and its driver') if before and self._silence_suspected else ''
 
     def is_abandoned(self, callers: int) -> bool:
         """Tell whether the callers of the service are gone at two polls in a row."""
-        self._called = self._called or callers > 0
-        before, self._alone = self._alone, self._called and not callers
-        return before and self._alone
+        self._had_callers = self._had_callers or callers > 0
+        before, self._callers_gone = self._callers_gone, self._had_callers and not callers
+        return before and self._callers_gone
 
-    def command(self) -> float | None:
+    def next_command(self) -> float | None:
         """Return the rate to command now, rad/s; None if no command is due."""
         now = node_time(self._clock)
-        left = self._due - now  # more than an interval if ROS time has jumped back
+        left = self._next_command_time - now  # more than an interval if ROS time has jumped back
         if 0.5 * self.INTERVAL < left <= 1.5 * self.INTERVAL:
             return None
-        if self._due > -math.inf:
-            self.command_lateness = max(self.command_lateness, now - self._due)
-        self._due = now + self.INTERVAL
+        if self._next_command_time > -math.inf:
+            self.command_lateness = max(self.command_lateness, now - self._next_command_time)
+        self._next_command_time = now + self.INTERVAL
         # After a pause of this process, queued samples may be delivered before the next poll.
-        held_up = self._clock.steady() - self._polled > _HELD_UP
-        if self._suspected or held_up or not self._run.times:
+        held_up = self._clock.steady() - self._last_poll > _MAX_NODE_PAUSE
+        if self._silence_suspected or held_up or not self._run.times:
             return 0.0
         # By the stamps, but delayed samples do not delay the motion.
-        elapsed = max(now - self._delay.least - self._run.times[0], self._run.elapsed)
+        elapsed = max(now - self._stamp_delay.min_delay - self._run.times[0], self._run.elapsed)
         return float(self._motion.rate_at(np.array(elapsed)))
 
-    _not_received = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel '
-                     'to its topic, or change cmd_vel_stamped')
+    _no_receiver_message = ('no other node receives cmd_vel: start what moves the robot, remap '
+                            'cmd_vel '
+                            'to its topic, or change cmd_vel_stamped')
 
-    def lateness(self, limits: Limits) -> str:
+    def describe_lateness(self, limits: RunLimits) -> str:
         """Return a sentence on the lateness of commands and samples beyond the residual limit."""
         late = max(self.command_lateness, self.sample_lateness)
-        if late * _fastest(self._motion) <= limits.residual:
+        if late * _max_rate(self._motion) <= limits.max_stretch_residual:
             return ''
         return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s '
                 f'late and samples up to {self.sample_lateness:.2f} s; reduce its load and '
                 'run again')
 
 
-def _fastest(motion: Motion) -> float:
+def _max_rate(motion: Motion) -> float:
     """Return the fastest rate of a motion, rad/s."""
     return float(np.abs(motion.rate_at(motion.time)).max())
 
 
-STANDING_TIME = ('ROS time stands still: start or resume the simulation that publishes /clock, or '
-                 'set use_sim_time to false')
+ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '
+                   'or '
+                   'set use_sim_time to false')
 
 
 class CalibrationSession:
@@ -283,7 +290,7 @@ class CalibrationSession:
     ----------
     run : the run in progress, or None
     warning : that the robot kept turning after a drive, in a sentence; ''
-    lateness : largest lateness of commands and of samples in the last drive, s
+    max_lateness : largest lateness of commands and of samples in the last drive, s
 
     """
 
@@ -299,18 +306,18 @@ class CalibrationSession:
         clock : of the node
 
         """
-        self.run: Run | None = None
-        self.warning, self.lateness = '', (0.0, 0.0)
+        self.run: CalibrationRun | None = None
+        self.warning, self.max_lateness = '', (0.0, 0.0)
         self._estimator, self._store, self._monitor = estimator, store, monitor
         self._send, self._clock = send, clock
-        self._rules = Rules()
+        self._rules = AcceptanceRules()
         self._drive: Drive | None = None
-        self._sent: deque[float] = deque(maxlen=_ECHOES)
-        self._others = self._stopped = self._repeats_until = -math.inf
-        self._begun, self._suspected = 0.0, False
+        self._pending_commands: deque[float] = deque(maxlen=_MAX_PENDING_COMMANDS)
+        self._last_foreign_command = self._stop_time = self._stop_repeat_end = -math.inf
+        self._start_time, self._silence_suspected = 0.0, False
 
     @property
-    def drives(self) -> bool:
+    def is_driving(self) -> bool:
         """Tell whether a run drives the robot."""
         return self._drive is not None
 
@@ -342,46 +349,49 @@ class CalibrationSession:
         if kind == PROFILE:
             try:
                 file = values.calibration_profile_file
-                motion = read_motion(Path(os.path.expanduser(file))) if file else CALIBRATION
+                motion = (read_motion(Path(os.path.expanduser(file)))
+                          if file else CALIBRATION_MOTION)
             except MotionError as error:
                 return str(error)
             duration = motion.duration
-            fastest, limit = _fastest(motion), self._estimator.used.rate_limit
+            fastest, limit = _max_rate(motion), self._estimator.current_model.rate_limit
             if drives and fastest > limit:
                 return (f'the profile turns at {fastest / DEGREE:.0f} deg/s, but the gyro '
                         f'measures at most {limit / DEGREE:.0f} deg/s: correct '
                         'calibration.profile_file')
         if drives and obstacle:
             return obstacle
-        if drives and self._clock.steady() - self._others < 1.0:
+        if drives and self._clock.steady() - self._last_foreign_command < 1.0:
             return 'another node sends commands on cmd_vel: stop it, and run again'
-        self._rules, self._suspected, self.warning = rules(values), False, ''
-        self._begun = node_time(self._clock)
-        self.run = run = Run(kind, duration, self._rules.after(kind), self._clock.steady(), motion)
-        self._drive = Drive(run, self._clock, self._blind) if drives else None
+        self._rules, self._silence_suspected, self.warning = (
+            rules_from_parameters(values), False, '')
+        self._start_time = node_time(self._clock)
+        self.run = run = CalibrationRun(kind, duration, self._rules.extra_duration(kind),
+                                        self._clock.steady(), motion)
+        self._drive = Drive(run, self._clock, self._sample_timeout) if drives else None
         self._monitor.restart()
         return ''
 
-    def _blind(self) -> float:
-        usual = _BLIND_INTERVALS * self._estimator.tracker.intervals.usual
-        return min(max(BLIND, usual), self._rules.limits.gap)
+    def _sample_timeout(self) -> float:
+        usual = _DRIVE_TIMEOUT_INTERVALS * self._estimator.tracker.intervals.usual_interval
+        return min(max(DRIVE_SAMPLE_TIMEOUT, usual), self._rules.limits.max_gap)
 
     # Inputs
 
     def add(self, time: float, output: float, receivers: int) -> None:
         """Add a sample; `receivers` is the number of other nodes that receive the commands."""
         run = self.run
-        if run is None or run.reason is not None:
+        if run is None or run.end_reason is not None:
             return
-        run.received = self._clock.steady()
+        run.last_received = self._clock.steady()
         if self._drive:
-            self._drive.see_sample(time)
-            if self._drive.waits(receivers):
+            self._drive.add_sample(time)
+            if self._drive.is_waiting(receivers):
                 return
         estimator = self._estimator
-        run.add(time, output, float(estimator.last.modelled),
-                None if estimator.temperature_is_lost else estimator.temperature)
-        if (reason := run.over) is not None:
+        run.add(time, output, float(estimator.last_compensated.model_rate),
+                None if estimator.is_temperature_lost else estimator.temperature)
+        if (reason := run.due_end_reason) is not None:
             self.end(reason)
         elif self._drive:
             self._command_if_due(self._drive)
@@ -390,54 +400,55 @@ class CalibrationSession:
         """Add a heading, rad, and a rate, rad/s, of the odometry."""
         if self.run:
             self.run.odometry.append((time, heading, rate))
-        late = self._clock.steady() - self._stopped
-        alone = self._others < self._stopped
-        if alone and STOPPING < late < 2.0 * STOPPING and abs(rate) > math.radians(1.0):
+        late = self._clock.steady() - self._stop_time
+        alone = self._last_foreign_command < self._stop_time
+        if (alone and STOPPING_DURATION < late < 2.0 * STOPPING_DURATION
+                and abs(rate) > math.radians(1.0)):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
                             f'{late:.1f} s after it was commanded to stop: set the command '
                             'time-out of its base, and check for other nodes that command it')
 
     def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel; a foreign one ends a drive."""
-        for place, rate in enumerate(self._sent):
+        for place, rate in enumerate(self._pending_commands):
             if velocity == Velocity(angular=(0.0, 0.0, rate)):
                 for _ in range(place + 1):
-                    self._sent.popleft()
+                    self._pending_commands.popleft()
                 return
-        self._others = self._clock.steady()
-        if self.run and self.run.kind == REST and velocity.moves:
+        self._last_foreign_command = self._clock.steady()
+        if self.run and self.run.kind == REST and velocity.is_moving:
             self.end('another node sent a command to move on cmd_vel during the rest: stop that '
                      'node and run again')
         if self._drive:
             self.end('another node sent a command on cmd_vel while the robot was driven, and '
                      'controls the robot now: stop that node and run again')
-        self._repeats_until = -math.inf
+        self._stop_repeat_end = -math.inf
 
     # Guards
 
-    def watch(self, values: SimpleNamespace, receivers: int, ros_time_stands: bool = False,
-              conflict: str = '') -> None:
+    def poll(self, values: SimpleNamespace, receivers: int, is_ros_time_paused: bool = False,
+             conflict: str = '') -> None:
         """
         Send the next command of a drive, or end a run by its guards.
 
-        To be called every `Drive.INTERVAL` while `drives`, else a few times per second.
+        To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second.
 
         Parameters
         ----------
         values : the parameters of the node
         receivers : number of other nodes that receive the commands
-        ros_time_stands : ROS time has stood still for longer than `BLIND`
+        is_ros_time_paused : ROS time has stood still for longer than `DRIVE_SAMPLE_TIMEOUT`
         conflict : why the samples cannot be used; ''
 
         """
         run = self.run
-        if self._clock.steady() < self._repeats_until and not self._drive:
+        if self._clock.steady() < self._stop_repeat_end and not self._drive:
             self._command(0.0)
-        if run is None or run.reason is not None:
+        if run is None or run.end_reason is not None:
             return
         reason = conflict
         if self._drive:
-            reason = reason or self._drive.fault(receivers, ros_time_stands)
+            reason = reason or self._drive.find_fault(receivers, is_ros_time_paused)
             if not values.calibration_drive:
                 reason = ('calibration.drive was set to false while the robot was driven: set it '
                           'to true and run again')
@@ -445,14 +456,16 @@ class CalibrationSession:
             self.end(reason)
         elif self._drive:
             self._command_if_due(self._drive)
-        if node_time(self._clock) - self._begun > 2.0 * run.total + SILENCE:
+        if node_time(self._clock) - self._start_time > 2.0 * run.max_duration + SAMPLE_TIMEOUT:
             self.end('the stamps on imu/data_raw advance too slowly: check the clock of the '
                      'driver, and use_sim_time')
-        suspected, self._suspected = self._suspected, self._clock.steady() - run.received > SILENCE
-        if suspected and self._suspected:
-            self.end(f'no sample came for {SILENCE:g} s: check the gyro and its driver')
+        suspected, self._silence_suspected = (self._silence_suspected,
+                                              self._clock.steady() - run.last_received
+                                              > SAMPLE_TIMEOUT)
+        if suspected and self._silence_suspected:
+            self.end(f'no sample came for {SAMPLE_TIMEOUT:g} s: check the gyro and its driver')
 
-    def see_callers(self, count: int) -> None:
+    def update_callers(self, count: int) -> None:
         """End a drive without clients of the service; called a few times per second."""
         if self._drive and self._drive.is_abandoned(count):
             self.end('the program that called calibrate has ended before the answer: keep it '
@@ -465,11 +478,11 @@ class CalibrationSession:
 
     def _command_if_due(self, drive: Drive) -> None:
         """Send the next command if it is due, at samples and polls: simulations may be fast."""
-        if (rate := drive.command()) is not None:
+        if (rate := drive.next_command()) is not None:
             self._command(rate)
 
     def _command(self, rate: float) -> None:
-        self._sent.append(rate)
+        self._pending_commands.append(rate)
         self._send(rate)
 
     def stop_robot(self) -> bool:
@@ -477,17 +490,17 @@ class CalibrationSession:
         if not self._drive:
             return False
         self._command(0.0)
-        self._stopped = self._clock.steady()
+        self._stop_time = self._clock.steady()
         return True
 
     # End
 
     def end(self, reason: str) -> None:
         """End the run and stop the robot; the reason is '' if its samples are complete."""
-        if self.run and self.run.reason is None:
-            self.run.reason = reason
+        if self.run and self.run.end_reason is None:
+            self.run.end_reason = reason
             if self.stop_robot() and reason:
-                self._repeats_until = self._stopped + _REPEATED
+                self._stop_repeat_end = self._stop_time + _STOP_REPEAT_DURATION
 
     def finish(self) -> tuple[bool, str]:
         """End the motion of a run by turns or by odometry."""
@@ -503,7 +516,7 @@ class CalibrationSession:
         """Cancel the run without a change of the calibration."""
         if self.run is None:
             return False, 'no calibration is in progress'
-        if self.run.reason is not None:
+        if self.run.end_reason is not None:
             return False, ('the calibration has just ended; its own answer states whether it is '
                            'in use')
         self.end('cancelled')
@@ -512,39 +525,40 @@ class CalibrationSession:
     def conclude(self) -> tuple[bool, str]:
         """Fit a finished run and use its calibration, or return why nothing was changed."""
         run, drive = self.run, self._drive
-        assert run is not None and run.reason is not None
+        assert run is not None and run.end_reason is not None
         try:
-            if run.reason:
-                raise DataRefused(run.reason)
-            return True, self._use(run)
+            if run.end_reason:
+                raise DataRefused(run.end_reason)
+            return True, self._apply_calibration(run)
         except DataRefused as error:
-            late = drive.lateness(self._rules.limits) if drive and not run.reason else ''
+            late = (drive.describe_lateness(self._rules.limits)
+                    if drive and not run.end_reason else '')
             return False, f'{late} (the run shows: {error})' if late else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
             return False, f'the fit failed and nothing was changed: {error!r}'
         finally:
             if drive:
-                self.lateness = drive.command_lateness, drive.sample_lateness
+                self.max_lateness = drive.command_lateness, drive.sample_lateness
             self.run = self._drive = None
 
-    def _use(self, run: Run) -> str:
+    def _apply_calibration(self, run: CalibrationRun) -> str:
         estimator, now = self._estimator, datetime.fromtimestamp(self._clock.date(), timezone.utc)
         noise = estimator.model.noise
-        calibration, remark = calibrated(run, self._rules, noise,
-                                         now.isoformat(timespec='seconds'), estimator.model.prior)
+        calibration, remark = fit_run(run, self._rules, noise, now.isoformat(timespec='seconds'),
+                                      estimator.model.prior_deviations)
         if run.kind == REST:
-            calibration = self._with_scale(calibration)
-        difference = changed(estimator.claimed, calibration, noise,
-                             estimator.known_for(now.timestamp()))
-        trouble = self._store.keep(calibration)
-        estimator.use(self._store.model, now.timestamp())
-        self._monitor.recalibrated()
+            calibration = self._with_current_scale(calibration)
+        difference = describe_change(estimator.current_calibration, calibration, noise,
+                                     estimator.bias_age(now.timestamp()))
+        trouble = self._store.store_calibration(calibration)
+        estimator.use_calibration(self._store.model, now.timestamp())
+        self._monitor.reset_biases()
         return '; '.join(filter(None, [f'{calibration}, from {len(run.times)} samples', remark,
                                        difference, trouble]))
 
-    def _with_scale(self, bias: SelfCalibration) -> SelfCalibration:
+    def _with_current_scale(self, bias: SelfCalibration) -> SelfCalibration:
         """Return a calibration of the bias with the scale factor error in use."""
-        used = self._estimator.used.self_calibration
+        used = self._estimator.current_model.self_calibration
         unknown = SelfCalibration(covariance=((0.0, 0.0), (0.0, 0.0)))
         last = self._estimator.model.self_calibration or used or unknown
         known = last.covariance or used and used.covariance or unknown.covariance
@@ -553,8 +567,8 @@ class CalibrationSession:
         return replace(bias, scale_factor_error=last.scale_factor_error, covariance=covariance)
 
 
-def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
-               prior: Array | None = None) -> tuple[SelfCalibration, str]:
+def fit_run(run: CalibrationRun, rules: AcceptanceRules, noise: Noise, date: str,
+            prior: Array | None = None) -> tuple[SelfCalibration, str]:
     """
     Return the calibration by a complete run, and a remark.
 
@@ -573,22 +587,22 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
             at, headings, rates = np.array(run.odometry).T
             turned = max(float(np.mean(rates) * np.ptp(at)),
                          float(np.unwrap(headings)[-1] - headings[0]), key=abs)
-        if abs(turned) > _TURNED:
+        if abs(turned) > _MIN_TURN_ANGLE:
             raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
                               f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap '
                               'odom to an odometry of the wheels')
-        return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), when,
+        return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), date,
                                run.temperature, 'rest'), ''
     if run.kind == TURNS:
         found = calibrate_turns(time - time[0], rate, rules.turns or None, rules.limits, noise,
                                 output=output)
-        return (record(found.fit, 'turns', when, run.temperature),
+        return (to_model_record(found.fit, 'turns', date, run.temperature),
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
     begin, motion = (time[0], run.motion) if run.motion is not None else _odometry_motion(run)
-    return _compared(run, time - begin, rate, output, motion, rules, noise, when, prior)
+    return _fit_to_motion(run, time - begin, rate, output, motion, rules, noise, date, prior)
 
 
-def _odometry_motion(run: Run) -> tuple[float, Motion]:
+def _odometry_motion(run: CalibrationRun) -> tuple[float, Motion]:
     """Return the time of the first odometry, s, and the motion of the odometry."""
     end = run.times[0] + run.duration
     rows = np.array([each for each in run.odometry if each[0] <= end])
@@ -599,16 +613,18 @@ def _odometry_motion(run: Run) -> tuple[float, Motion]:
             'increasing stamps over most of the run are needed: check the odometry')
     time, heading, rate = rows.T
     heading = np.unwrap(heading)
-    turned = np.ptp(heading) > _TURNED
-    motion = from_headings(time, heading) if turned else from_rates(time - time[0], rate)
+    turned = np.ptp(heading) > _MIN_TURN_ANGLE
+    motion = (motion_from_headings(time, heading) if turned else motion_from_rates(
+        time - time[0], rate))
     return float(time[0]), motion
 
 
-def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion, rules: Rules,
-              noise: Noise, when: str, prior: Array | None) -> tuple[SelfCalibration, str]:
+def _fit_to_motion(run: CalibrationRun, time: Array, rate: Array, output: Array, motion: Motion,
+                   rules: AcceptanceRules, noise: Noise, date: str,
+                   prior: Array | None) -> tuple[SelfCalibration, str]:
     """Fit a run to its motion, and check the fit by the rest after it."""
     limits, odometry = rules.limits, run.kind == ODOMETRY
-    inside = (time >= -limits.time_offset) & (time <= motion.duration + limits.time_offset)
+    inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
                          reference=rules.odometry if odometry else None, output=output[inside],
                          prior=prior)
@@ -616,12 +632,12 @@ def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion,
     if fit.goodness:
         remarks.append(str(fit.goodness))
     # After odometry the robot may drive on; a profile ends at rest.
-    begin = motion.duration + max(fit.time_offset, 0.0) + SETTLED
-    after = rest_after(time, rate, fit, motion, limits) if odometry else time > begin
+    begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
+    after = find_rest_after(time, rate, fit, motion, limits) if odometry else time > begin
     if after is not None:
         rest = check_rest(time[after], rate[after], fit, noise, limits)
         fit = rest.fit
         remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, limit '
                        f'{rest.limit / DEGREE:.4f} deg/s')
     method = 'odometry' if odometry else 'likelihood'
-    return record(fit, method, when, run.temperature), '; '.join(remarks)
+    return to_model_record(fit, method, date, run.temperature), '; '.join(remarks)

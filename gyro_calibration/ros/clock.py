@@ -18,9 +18,9 @@ from typing import Protocol
 
 #: Window of the least delay of stamps behind the clock, s: few samples are delayed for longer, and
 #: a gyro clock that is 3 % off drifts by 15 ms in it.
-_PROMPT = 0.5
+_DELAY_WINDOW = 0.5
 #: Largest difference in rate of stamps and clock, 1; the clocks of gyros are up to 3 % off.
-_PACE = 0.05
+_MAX_CLOCK_DEVIATION = 0.05
 
 
 class Clock(Protocol):
@@ -46,42 +46,42 @@ class StampDelay:
     """
     Delay of stamps behind the clock of a node, and a test whether both advance equally.
 
-    `least` is the least delay of recent samples, s; nan before the first.
+    `min_delay` is the least delay of recent samples, s; nan before the first.
 
     """
 
     def __init__(self, clock: Clock, tolerance: float, window: float):
         """Start without samples; tolerance of their delay and window of the test, both in s."""
         self._clock, self._tolerance, self._window = clock, tolerance, window
-        self.least = math.nan
+        self.min_delay = math.nan
         # Time of arrival and delay, s, of samples with less delay than any after them.
-        self._prompt = deque[tuple[float, float]]()
-        self._before: tuple[float, float] | None = None
+        self._min_delays = deque[tuple[float, float]]()
+        self._previous: tuple[float, float] | None = None
 
     def add(self, time: float) -> float:
         """Add the stamp of a sample, s; return its delay beyond the least one, s."""
         now = node_time(self._clock)
-        while self._prompt and self._prompt[-1][1] >= now - time:
-            self._prompt.pop()
-        self._prompt.append((now, now - time))
-        while now - self._prompt[0][0] > _PROMPT:
-            self._prompt.popleft()
-        self.least = self._prompt[0][1]
-        return now - time - self.least
+        while self._min_delays and self._min_delays[-1][1] >= now - time:
+            self._min_delays.pop()
+        self._min_delays.append((now, now - time))
+        while now - self._min_delays[0][0] > _DELAY_WINDOW:
+            self._min_delays.popleft()
+        self.min_delay = self._min_delays[0][1]
+        return now - time - self.min_delay
 
-    def fault(self) -> str:
+    def find_fault(self) -> str:
         """Return a sentence if stamps and clock advance differently; else ''."""
         now = node_time(self._clock)
-        then, before = self._before or (now, self.least)
-        elapsed, grown = now - then, self.least - before
+        then, before = self._previous or (now, self.min_delay)
+        elapsed, grown = now - then, self.min_delay - before
         # In a fast simulation the same delay is more simulated time.
         limit = self._tolerance * (1.0 if self._clock.simulated() is None else 4.0)
-        if abs(grown) > limit + _PACE * abs(elapsed):
+        if abs(grown) > limit + _MAX_CLOCK_DEVIATION * abs(elapsed):
             return (f'this computer was busy, or the clock of the driver is wrong: the stamps on '
                     f'imu/data_raw advanced by {elapsed - grown:.2f} s in {elapsed:.2f} s; reduce '
                     'the load, or check that clock and use_sim_time')
-        if self._prompt and (self._before is None or elapsed > self._window):
-            self._before = now, self.least
+        if self._min_delays and (self._previous is None or elapsed > self._window):
+            self._previous = now, self.min_delay
         return ''
 
 
@@ -91,16 +91,16 @@ class RosTime:
 
     Attributes
     ----------
-    standing : time since its last advance, s of the steady clock; 0 where it is not simulated,
-        inf before a simulation starts
+    paused_duration : time since its last advance, s of the steady clock; 0 where it is not
+        simulated, inf before a simulation starts
 
     """
 
     def __init__(self) -> None:
         """Start without readings."""
-        self.standing = 0.0
+        self.paused_duration = 0.0
         self._last: float | None = -1.0
-        self._changed = self._polled = 0.0
+        self._last_change = self._last_poll = 0.0
 
     def poll(self, clock: Clock) -> None:
         """
@@ -111,9 +111,9 @@ class RosTime:
         """
         now, time = clock.steady(), clock.simulated()
         if time != self._last:
-            self._last, self._changed, self._polled = time, now, now
+            self._last, self._last_change, self._last_poll = time, now, now
         if time is None:
-            self.standing = 0.0
+            self.paused_duration = 0.0
         else:
-            self.standing = self._polled - self._changed if time else math.inf
-        self._polled = now
+            self.paused_duration = self._last_poll - self._last_change if time else math.inf
+        self._last_poll = now

@@ -35,26 +35,26 @@ from geometry_msgs.msg import (
     TwistStamped,
     TwistWithCovarianceStamped,
 )
-from gyro_calibration.driver.timestamps import steady
+from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.logs.cdr import (
-    along_z,
-    NO_COVARIANCE,
     NOT_REPORTED,
+    NOT_REPORTED_COVARIANCE,
     NSEC_PER_SEC,
-    UNMEASURED,
+    UNMEASURED_COVARIANCE,
     UNMEASURED_VARIANCE,
+    z_axis_covariance,
 )
 from gyro_calibration.ros.calibration_session import Drive, REST
 from gyro_calibration.ros.compensation_report import calibration_status, CompensationReport
 from gyro_calibration.ros.diagnostics import Diagnostics, OK, status_array
-from gyro_calibration.ros.pipeline import Output, PARAMETERS, Pipeline
+from gyro_calibration.ros.pipeline import CorrectedSample, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
-    answer_later,
+    allow_deferred_response,
     call_every,
-    declare,
+    declare_parameters,
     LATCHED_QOS,
     publish_on,
-    run,
+    run_node,
     subscribe_to,
 )
 from gyro_calibration.ros.wheels import Velocity
@@ -70,13 +70,13 @@ from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 
 #: Interval of polls of publishers, receivers and clocks, s.
-_WATCH_INTERVAL = 0.2
+_GRAPH_POLL_INTERVAL = 0.2
 
 
 class NodeClock:
     """The clocks of a node; see `clock.Clock`."""
 
-    steady, date = staticmethod(steady), staticmethod(time.time)
+    steady, date = staticmethod(read_steady_clock), staticmethod(time.time)
 
     def __init__(self, node: Node):
         """Read ROS time from a node."""
@@ -96,32 +96,35 @@ class CompensationNode(Node):
     def __init__(self) -> None:
         """Read the model and the last calibration; without them raw rates are published."""
         super().__init__('compensation_node')
-        values = declare(self, PARAMETERS, self._set)
+        values = declare_parameters(self, PARAMETERS, self._use_parameters)
         self._values, clock = values, NodeClock(self)
         self._velocity: Publisher | None = None
-        self._stamped = values.cmd_vel_stamped
-        self._pipeline = Pipeline(values, self._calibration_file(), clock, self._command)
+        self._is_velocity_stamped = values.cmd_vel_stamped
+        self._pipeline = Pipeline(values, self._calibration_file(), clock, self._publish_command)
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
         self._receivers = 0
-        self._waiting: tuple[Trigger.Response, Future] | None = None
+        self._pending_answer: tuple[Trigger.Response, Future] | None = None
         self._timer: Timer | None = None
         self._assumed_variance = values.assumed_bias ** 2
-        self._connect()
+        self._create_topics()
         self._report = CompensationReport(self._pipeline, clock)
         self._diagnostics = Diagnostics(self, 'heading', lambda: self._report.make())
         session = self._pipeline.session
-        self._offer('calibrate',
-                    lambda answer: self._calibrate(self._values.calibration_reference, answer))
-        self._offer('calibrate_bias', lambda answer: self._calibrate(REST, answer))
-        self._offer('finish_calibration', lambda answer: self._fill(answer, *session.finish()))
-        self._offer('cancel_calibration', self._cancel)
-        self._offer('reset_heading',
-                    lambda answer: self._fill(answer, True, self._pipeline.reset()))
+        self._offer_service(
+            'calibrate',
+            lambda answer: self._calibrate(self._values.calibration_reference, answer))
+        self._offer_service('calibrate_bias', lambda answer: self._calibrate(REST, answer))
+        self._offer_service('finish_calibration',
+                            lambda answer: self._fill_response(answer, *session.finish()))
+        self._offer_service('cancel_calibration', self._cancel)
+        self._offer_service(
+            'reset_heading',
+            lambda answer: self._fill_response(answer, True, self._pipeline.reset_heading()))
         # One timer for all: each one, also a cancelled one, costs time at every sample.
-        self._watched = 0
-        call_every(self, _WATCH_INTERVAL, self._watch)
-        self._show_status()
+        self._poll_count = 0
+        call_every(self, _GRAPH_POLL_INTERVAL, self._poll_graph)
+        self._publish_status()
 
     def _calibration_file(self) -> Path:
         if self._values.calibration_file:
@@ -130,12 +133,12 @@ class CompensationNode(Node):
         name = self.get_fully_qualified_name().strip('/').replace('/', '_')
         return home / 'gyro_calibration' / f'{name}.yaml'
 
-    def _connect(self) -> None:
+    def _create_topics(self) -> None:
         self._imu = publish_on(self, Imu, 'imu/data')
         self._heading = publish_on(self, PoseWithCovarianceStamped, 'heading')
         self._yaw_rate = publish_on(self, TwistWithCovarianceStamped, 'yaw_rate')
         self._status = publish_on(self, DiagnosticArray, '~/calibration_status', LATCHED_QOS)
-        self._wanted = {self._heading: False, self._yaw_rate: False}
+        self._has_subscribers = {self._heading: False, self._yaw_rate: False}
         self._pose_message = PoseWithCovarianceStamped()
         self._pose_message.header.frame_id = self._values.heading_frame
         self._rate_message = TwistWithCovarianceStamped()
@@ -143,32 +146,35 @@ class CompensationNode(Node):
             self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
             self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
         subscribe_to(self, Temperature, 'imu/temperature',
-                     lambda message: self._pipeline.temperature(_stamp(message.header),
-                                                                message.temperature))
+                     lambda message: self._pipeline.add_temperature(_stamp_ns(message.header),
+                                                                    message.temperature))
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
         subscribe_to(self, Odometry, 'odom', self._on_odometry)
-        subscribe_to(self, TwistStamped if self._stamped else Twist, 'cmd_vel', self._on_command)
+        subscribe_to(self, TwistStamped if self._is_velocity_stamped else Twist, 'cmd_vel',
+                     self._on_command)
         if self._values.calibration_drive:
-            self._learn_to_drive()  # calibrate reports a failure
+            self._offer_velocity()  # calibrate reports a failure
 
-    def _offer(self, name: str,
-               fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
-        answer_later(self.create_service(
+    def _offer_service(self, name: str,
+                       fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
+        allow_deferred_response(self.create_service(
             Trigger, f'~/{name}', lambda _, response: fill(response)))
 
-    def _set(self, values: SimpleNamespace) -> None:
+    def _use_parameters(self, values: SimpleNamespace) -> None:
         self._values = values
-        self._pipeline.set(values)
+        self._pipeline.use_parameters(values)
 
     # Subscriptions
 
     def _on_odometry(self, message: Odometry) -> None:
-        heading = heading_of(message.pose.pose.orientation)
-        self._pipeline.odometry(_stamp(message.header), heading, _velocity(message.twist.twist))
+        heading = quaternion_heading(message.pose.pose.orientation)
+        self._pipeline.add_odometry(_stamp_ns(message.header), heading,
+                                    _to_velocity(message.twist.twist))
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
-        self._pipeline.command(_velocity(message.twist if self._stamped else message))
-        self._answer_ended()
+        self._pipeline.add_command(
+            _to_velocity(message.twist if self._is_velocity_stamped else message))
+        self._answer_finished_run()
 
     def _on_imu(self, message: Imu) -> None:
         force = message.linear_acceleration.z
@@ -177,20 +183,20 @@ class CompensationNode(Node):
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:
             output = math.nan  # REP-145: the message has no rate
-        found = self._pipeline.sample(_stamp(message.header), output, known, self._receivers,
-                                      message.header.frame_id)
+        found = self._pipeline.add_sample(_stamp_ns(message.header), output, known,
+                                          self._receivers, message.header.frame_id)
         if found is not None:
             self._publish(message, found)
-        if self._waiting:
-            self._answer_ended()
+        if self._pending_answer:
+            self._answer_finished_run()
 
     # Publishers
 
-    def _publish(self, imu: Imu, found: Output) -> None:
+    def _publish(self, imu: Imu, corrected: CorrectedSample) -> None:
         """Publish the received message with its z corrected, and the heading."""
-        sec, nanosec = divmod(found.stamp, NSEC_PER_SEC)
+        sec, nanosec = divmod(corrected.stamp, NSEC_PER_SEC)
         imu.header.stamp.sec, imu.header.stamp.nanosec = sec, nanosec
-        imu.angular_velocity.z = found.rate
+        imu.angular_velocity.z = corrected.rate
         xx, xy, _, yx, yy, *_ = imu.angular_velocity_covariance.tolist()
         acceleration = imu.linear_acceleration
         if not math.isfinite(imu.angular_velocity.x + imu.angular_velocity.y + xx + xy + yx + yy):
@@ -202,92 +208,95 @@ class CompensationNode(Node):
         elif not (xx or yy):  # all zeros: not known
             xx = yy = self._assumed_variance
         imu.angular_velocity_covariance[:] = (xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0,
-                                              found.rate_variance)
+                                              corrected.rate_variance)
         covariance = imu.linear_acceleration_covariance.tolist()
         if not math.isfinite(acceleration.x + acceleration.y + acceleration.z + sum(covariance)):
             acceleration.x = acceleration.y = acceleration.z = 0.0
-            imu.linear_acceleration_covariance[:] = NO_COVARIANCE
+            imu.linear_acceleration_covariance[:] = NOT_REPORTED_COVARIANCE
         elif covariance[0] != NOT_REPORTED and min(covariance[::4]) < 0.0:
-            imu.linear_acceleration_covariance[:] = UNMEASURED
-        half = 0.5 * found.heading
+            imu.linear_acceleration_covariance[:] = UNMEASURED_COVARIANCE
+        half = 0.5 * corrected.heading
         turned = imu.orientation
         turned.x = turned.y = 0.0
         turned.z, turned.w = math.sin(half), math.cos(half)
-        imu.orientation_covariance[:] = along_z(found.heading_variance)
+        imu.orientation_covariance[:] = z_axis_covariance(corrected.heading_variance)
         self._imu.publish(imu)
-        if self._wanted[self._heading]:
+        if self._has_subscribers[self._heading]:
             pose = self._pose_message
             pose.header.stamp, pose.pose.pose.orientation = imu.header.stamp, turned
-            pose.pose.covariance[35] = found.heading_variance
+            pose.pose.covariance[35] = corrected.heading_variance
             self._heading.publish(pose)
-        if self._wanted[self._yaw_rate]:
+        if self._has_subscribers[self._yaw_rate]:
             rate = self._rate_message
-            rate.header, rate.twist.twist.angular.z = imu.header, found.rate
-            rate.twist.covariance[35] = found.rate_variance
+            rate.header, rate.twist.twist.angular.z = imu.header, corrected.rate
+            rate.twist.covariance[35] = corrected.rate_variance
             self._yaw_rate.publish(rate)
 
-    def _show_status(self) -> None:
+    def _publish_status(self) -> None:
         """Publish the latched state of the calibration."""
         status = calibration_status(self._pipeline.store, self._pipeline.session.run)
         self._status.publish(status_array(self, 'calibration', status))
 
-    def _watch(self) -> None:
+    def _poll_graph(self) -> None:
         """Poll publishers, receivers, clocks and the level of the report."""
         names = [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
                  for each in self.get_publishers_info_by_topic(self._samples.topic_name)]
-        self._pipeline.publishers(names)
-        self._wanted = {each: each.get_subscription_count() > 0 for each in self._wanted}
-        self._look_for_receivers()
-        if not self._pipeline.session.drives:  # else `_drive` does
-            self._pipeline.watch(self._receivers)
+        self._pipeline.update_publishers(names)
+        self._has_subscribers = ({
+            each: each.get_subscription_count() > 0 for each in self._has_subscribers
+        })
+        self._count_receivers()
+        if not self._pipeline.session.is_driving:  # else `_drive` does
+            self._pipeline.poll(self._receivers)
         elif hasattr(self, 'count_clients'):  # not in Humble
-            self._pipeline.session.see_callers(self.count_clients('~/calibrate'))
-        self._answer_ended()
+            self._pipeline.session.update_callers(self.count_clients('~/calibrate'))
+        self._answer_finished_run()
         if self._pipeline.session.run:
-            self._show_status()
-        self._watched += 1
-        second = self._watched % round(1.0 / _WATCH_INTERVAL) == 0
+            self._publish_status()
+        self._poll_count += 1
+        second = self._poll_count % round(1.0 / _GRAPH_POLL_INTERVAL) == 0
         if second:
-            self._pipeline.learn()
+            self._pipeline.run_periodic_tasks()
         if second or self._report.level() > (self._diagnostics.level or OK):
-            self._diagnostics.now()
+            self._diagnostics.publish()
 
     # Services
 
     def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
-        """Begin a run, which `_answer_ended` answers, or refuse with the reason."""
+        """Begin a run, which `_answer_finished_run` answers, or refuse with the reason."""
         session = self._pipeline.session
         obstacle = ''
         if self._values.calibration_drive:
-            obstacle = self._learn_to_drive() or self._pipeline.obstacle()
+            obstacle = self._offer_velocity() or self._pipeline.find_obstacle()
         if refusal := session.begin(kind, self._values, obstacle):
             return self._refuse(response, refusal)
-        if session.drives:
+        if session.is_driving:
             self._timer = call_every(self, Drive.INTERVAL, self._drive)
-        self._waiting = response, Future()
-        self._show_status()
-        return self._waiting[1]
+        self._pending_answer = response, Future()
+        self._publish_status()
+        return self._pending_answer[1]
 
-    def _answer_ended(self) -> None:
+    def _answer_finished_run(self) -> None:
         """Fit a run that has ended, use its calibration, and answer the service."""
         session = self._pipeline.session
-        if not self._waiting or session.run is None or session.run.reason is None:
+        if not self._pending_answer or session.run is None or session.run.end_reason is None:
             return
         if self._timer:
             self.destroy_timer(self._timer)
-        (response, future), self._waiting, self._timer = self._waiting, None, None
+        (response, future), self._pending_answer, self._timer = self._pending_answer, None, None
         success, message = session.conclude()
-        self._show_status()
-        future.set_result(self._fill(response, True, message) if success
+        self._publish_status()
+        future.set_result(self._fill_response(response, True, message) if success
                           else self._refuse(response, message))
 
     def _refuse(self, response: Trigger.Response, reason: str) -> Trigger.Response:
         journal = self._pipeline.journal
-        journal.refused += 1
-        journal.reasons.append(reason)
-        return self._fill(response, False, reason)
+        journal.refused_calibrations += 1
+        journal.refusal_reasons.append(reason)
+        return self._fill_response(response, False, reason)
 
-    def _fill(self, response: Trigger.Response, success: bool, text: str) -> Trigger.Response:
+    def _fill_response(self, response: Trigger.Response, success: bool,
+                       text: str) -> Trigger.Response:
         response.success, response.message = success, text if success else f'refused: {text}'
         self._pipeline.journal.event = response.message
         if success:  # rclpy wants each severity on a line of its own
@@ -298,15 +307,15 @@ class CompensationNode(Node):
 
     def _cancel(self, response: Trigger.Response) -> Trigger.Response:
         success, text = self._pipeline.session.cancel()
-        self._answer_ended()
-        return self._fill(response, success, text)
+        self._answer_finished_run()
+        return self._fill_response(response, success, text)
 
     # Driving
 
-    def _learn_to_drive(self) -> str:
+    def _offer_velocity(self) -> str:
         """Create the publisher of cmd_vel before the first drive; return why it failed, or ''."""
         if self._velocity is None:
-            kind = TwistStamped if self._stamped else Twist
+            kind = TwistStamped if self._is_velocity_stamped else Twist
             try:
                 self._velocity = publish_on(self, kind, 'cmd_vel', QoSProfile(depth=10))
             except RuntimeError as error:  # the policy of a secured graph may forbid it
@@ -315,25 +324,25 @@ class CompensationNode(Node):
                         'or set calibration.drive to false')
         return ''
 
-    def _look_for_receivers(self) -> None:
+    def _count_receivers(self) -> None:
         """Count the other nodes that receive cmd_vel; this node is a subscriber too."""
         count = self._velocity.get_subscription_count() if self._velocity else 0
         self._receivers = max(count - 1, 0)
 
     def _drive(self) -> None:
         """Send the next command and check the guards of a drive."""
-        self._look_for_receivers()
-        self._pipeline.watch(self._receivers)
-        self._answer_ended()
+        self._count_receivers()
+        self._pipeline.poll(self._receivers)
+        self._answer_finished_run()
 
-    def _command(self, rate: float) -> None:
+    def _publish_command(self, rate: float) -> None:
         """Publish a rate about z, rad/s."""
-        message = TwistStamped() if self._stamped else Twist()
-        twist = message.twist if self._stamped else message
-        if self._stamped:
+        message = TwistStamped() if self._is_velocity_stamped else Twist()
+        twist = message.twist if self._is_velocity_stamped else message
+        if self._is_velocity_stamped:
             message.header.stamp = self.get_clock().now().to_msg()
         twist.angular.z = rate
-        assert self._velocity is not None  # `_learn_to_drive` comes before a run
+        assert self._velocity is not None  # `_offer_velocity` comes before a run
         self._velocity.publish(message)
 
     def destroy_node(self) -> None:
@@ -342,30 +351,30 @@ class CompensationNode(Node):
             if self._pipeline.session.stop_robot():
                 assert self._velocity is not None
                 self._velocity.wait_for_all_acked(Duration(seconds=1.0))
-            self._pipeline.learn(ending=True)
+            self._pipeline.run_periodic_tasks(is_final=True)
         super().destroy_node()
 
 
-def _stamp(header: Any) -> int:
+def _stamp_ns(header: Any) -> int:
     """Return a stamp in ns."""
     return header.stamp.sec * NSEC_PER_SEC + header.stamp.nanosec
 
 
-def heading_of(turned: Quaternion) -> float:
+def quaternion_heading(orientation: Quaternion) -> float:
     """Return the yaw of an orientation, rad; nan if it is not valid."""
     # A power of a large number would raise OverflowError; a product is inf.
-    return math.atan2(2.0 * (turned.w * turned.z + turned.x * turned.y),
-                      1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z))
+    return math.atan2(2.0 * (orientation.w * orientation.z + orientation.x * orientation.y),
+                      1.0 - 2.0 * (orientation.y * orientation.y + orientation.z * orientation.z))
 
 
-def _velocity(twist: Twist) -> Velocity:
+def _to_velocity(twist: Twist) -> Velocity:
     linear, angular = twist.linear, twist.angular
     return Velocity((linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z))
 
 
 def main() -> int:
     """Run the node until SIGINT or SIGTERM."""
-    return run(CompensationNode)
+    return run_node(CompensationNode)
 
 
 if __name__ == '__main__':

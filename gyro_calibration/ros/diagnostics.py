@@ -43,7 +43,7 @@ class Diagnostics:
         Create the publisher of diagnostics with a status name, such as ``'gyro'``.
 
         `report` returns level, sentence and values by name. It is never called concurrently, and
-        must not call `now`.
+        must not call `publish`.
 
         """
         self.level: bytes | None = None
@@ -51,7 +51,7 @@ class Diagnostics:
         self._report, self._lock = report, threading.Lock()
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
-    def now(self) -> None:
+    def publish(self) -> None:
         """Make and publish a report; may be called from any thread."""
         with self._lock:
             report = self._report()

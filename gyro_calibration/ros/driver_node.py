@@ -23,20 +23,30 @@ import threading
 import time
 from types import SimpleNamespace
 
-from gyro_calibration.driver.connection import AUTO, Connection, Decimation, Mean, State
+from gyro_calibration.driver.connection import (
+    AUTO,
+    Connection,
+    ConnectionState,
+    Decimator,
+    SampleMean,
+)
 from gyro_calibration.driver.protocols import PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
-from gyro_calibration.driver.timestamps import NodeTime, read_together, steady
-from gyro_calibration.logs.cdr import along_z, NO_COVARIANCE, NSEC_PER_SEC
+from gyro_calibration.driver.timestamps import (
+    NodeTimeConverter,
+    read_clock_pair,
+    read_steady_clock,
+)
+from gyro_calibration.logs.cdr import NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, z_axis_covariance
 from gyro_calibration.ros.diagnostics import Diagnostics
 from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import Parameter
-from gyro_calibration.ros.runner import call_every, declare, publish_on, run
+from gyro_calibration.ros.runner import call_every, declare_parameters, publish_on, run_node
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, Temperature
 
 # not yes and no, which YAML reads as booleans
-_THREE_WAYS = {'default': None, 'always': True, 'never': False}
+_TRISTATE = {'default': None, 'always': True, 'never': False}
 
 PARAMETERS = (
     Parameter('port', '/dev/ttyUSB0',
@@ -52,10 +62,10 @@ PARAMETERS = (
     Parameter('axis', 'z', 'Axis to read of a gyro with three.', choices=('x', 'y', 'z')),
     Parameter('invert', 'default',
               'Whether the gyro counts clockwise turns positive; default is that of the protocol.',
-              choices=tuple(_THREE_WAYS)),
+              choices=tuple(_TRISTATE)),
     Parameter('increments', 'default',
               'Whether the gyro sends angles, not rates; default is that of the protocol.',
-              choices=tuple(_THREE_WAYS)),
+              choices=tuple(_TRISTATE)),
     Parameter('sensitivity', 0.0, 'Rate of one count of the gyro; 0 is that of the protocol.',
               'rad/s', (0.0, 100.0)),
     Parameter('sample_rate', 0.0,
@@ -71,8 +81,9 @@ PARAMETERS = (
 )
 
 _REPORT_INTERVAL = 1.0  # s
-_WATCH_INTERVAL = 0.5  # s; interval of checks that the thread runs
-_CLOCK_INTERVAL = 0.01  # s; interval of readings of the node's clock, each as costly as a message
+_THREAD_CHECK_INTERVAL = 0.5  # s; interval of checks that the thread runs
+# s; interval of readings of the node's clock, each as costly as a message
+_CLOCK_POLL_INTERVAL = 0.01
 
 
 class DriverNode(Node):
@@ -92,24 +103,25 @@ class DriverNode(Node):
     def __init__(self) -> None:
         super().__init__('driver_node')
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, name='reader')
-        values = declare(self, PARAMETERS)
-        self._settings = settings(values)
+        self._thread = threading.Thread(target=self._read_port, name='reader')
+        values = declare_parameters(self, PARAMETERS)
+        self._settings = settings_from_parameters(values)
         self._connection = Connection(
             values.port, values.protocol, values.baud, self._settings, self._on_change)
-        self._decimation = Decimation(values.samples_per_message)
-        self._messages = Messages(values.frame_id)
+        self._decimation = Decimator(values.samples_per_message)
+        self._messages = SampleMessages(values.frame_id)
         self._imu = publish_on(self, Imu, 'imu/data_raw')
         self._temperature = publish_on(self, Temperature, 'imu/temperature')
-        self._time, self._polled, self._problem = NodeTime(), 0.0, ''
-        self._report = DriverReport(self._connection, values.port, self._settings, steady)
+        self._node_time, self._last_clock_poll, self._last_problem = NodeTimeConverter(), 0.0, ''
+        self._report = DriverReport(self._connection, values.port, self._settings,
+                                    read_steady_clock)
         self._diagnostics = Diagnostics(self, 'gyro', self._report.make, values.port)
         if self.get_parameter('use_sim_time').value:
             self.get_logger().warning('use_sim_time is set: stamps follow the simulation, but the '
                                       'gyro on the port turns in real time')
         self._thread.start()
-        call_every(self, _REPORT_INTERVAL, self._diagnostics.now)
-        call_every(self, _WATCH_INTERVAL, self._watch)
+        call_every(self, _REPORT_INTERVAL, self._diagnostics.publish)
+        call_every(self, _THREAD_CHECK_INTERVAL, self._check_thread)
 
     def destroy_node(self) -> None:
         """Join the thread, which closes the port, and destroy the node."""
@@ -118,20 +130,20 @@ class DriverNode(Node):
             self._thread.join()
         super().destroy_node()
 
-    def _watch(self) -> None:
+    def _check_thread(self) -> None:
         if not self._thread.is_alive():
             raise RuntimeError('the thread that reads the port has ended; its error is above')
 
     # In the thread
 
-    def _work(self) -> None:
+    def _read_port(self) -> None:
         for chunk in self._connection.chunks(self._stop):
             self._poll_clock(chunk.arrival)
             self._report.add(chunk.samples)
             protocol, clock = self._connection.protocol, self._connection.clock
             assert protocol is not None and clock is not None  # they made the samples
-            self._messages.variance = protocol.variance(self._settings)
-            stamps = [self._time.of(stamp) for stamp in chunk.stamps]
+            self._messages.variance = protocol.sample_variance(self._settings)
+            stamps = [self._node_time.convert(stamp) for stamp in chunk.stamps]
             for mean in self._decimation.add(chunk.samples, stamps, clock.period):
                 self._publish(mean)
         self._flush()
@@ -140,37 +152,37 @@ class DriverNode(Node):
         for mean in self._decimation.flush():
             self._publish(mean)
 
-    def _publish(self, mean: Mean) -> None:
+    def _publish(self, mean: SampleMean) -> None:
         self._messages.fill(mean)
         if mean.sample.temperature is not None:
             self._temperature.publish(self._messages.temperature)
         self._imu.publish(self._messages.imu)
 
     def _poll_clock(self, arrival: float) -> None:
-        if arrival - self._polled < _CLOCK_INTERVAL:
+        if arrival - self._last_clock_poll < _CLOCK_POLL_INTERVAL:
             return
-        read = read_together(steady, self._now)
-        if read is None and self._polled:
+        read = read_clock_pair(read_steady_clock, self._read_node_clock)
+        if read is None and self._last_clock_poll:
             return
-        self._polled = arrival
-        step = self._time.watch(*(read or (arrival, self._now())))
+        self._last_clock_poll = arrival
+        step = self._node_time.update(*(read or (arrival, self._read_node_clock())))
         if step and not self.get_parameter('use_sim_time').value:
             self._report.add_clock_step(step)
 
-    def _now(self) -> float:
+    def _read_node_clock(self) -> float:
         """Return the time of the node, s; the system time before a simulation starts."""
         return self.get_clock().now().nanoseconds / NSEC_PER_SEC or time.time()
 
-    def _on_change(self, state: State) -> None:
+    def _on_change(self, state: ConnectionState) -> None:
         """Log each failure and recovery of the connection once, not each attempt."""
         if state.problem:
             self._flush()
             self._report.clear()
-        if state.problem and state.problem != self._problem:
-            self._problem = self._report.event = state.problem
+        if state.problem and state.problem != self._last_problem:
+            self._last_problem = self._report.event = state.problem
             self.get_logger().error(state.problem)
         elif state.name == 'reading':
-            self._problem = ''
+            self._last_problem = ''
             found = self._connection
             assert found.protocol is not None  # it is known before samples come
             detected = f' ({found.detected})' if found.detected else ''
@@ -179,10 +191,10 @@ class DriverNode(Node):
             self.get_logger().info(self._report.event)
         elif state.problem:
             return
-        self._diagnostics.now()
+        self._diagnostics.publish()
 
 
-class Messages:
+class SampleMessages:
     """
     Reusable messages of samples, whose values are set for each sample.
 
@@ -194,11 +206,11 @@ class Messages:
     def __init__(self, frame_id: str):
         self.imu, self.temperature, self.variance = Imu(), Temperature(), 0.0
         self.imu.header.frame_id = self.temperature.header.frame_id = frame_id
-        self.imu.orientation_covariance[:] = NO_COVARIANCE
-        self.imu.angular_velocity_covariance[:] = along_z(0.0)
+        self.imu.orientation_covariance[:] = NOT_REPORTED_COVARIANCE
+        self.imu.angular_velocity_covariance[:] = z_axis_covariance(0.0)
         self._has_force: bool | None = None
 
-    def fill(self, mean: Mean) -> None:
+    def fill(self, mean: SampleMean) -> None:
         """Set both messages to a sample, or a mean of several."""
         imu, sample = self.imu, mean.sample
         second, part = divmod(mean.stamp, 1.0)  # one product would lose 0.1 us
@@ -207,27 +219,27 @@ class Messages:
         for header in (imu.header, self.temperature.header):
             header.stamp.sec, header.stamp.nanosec = sec, nanosec
         imu.angular_velocity.z = sample.output
-        imu.angular_velocity_covariance[8] = self.variance / mean.size
+        imu.angular_velocity_covariance[8] = self.variance / mean.sample_count
         if sample.temperature is not None:
             self.temperature.temperature = sample.temperature
         force = sample.specific_force
         imu.linear_acceleration.z = force or 0.0
         if (force is not None) is not self._has_force:
             self._has_force = force is not None
-            imu.linear_acceleration_covariance[:] = (
-                along_z(ASSUMED_FORCE_NOISE ** 2) if self._has_force else NO_COVARIANCE)
+            imu.linear_acceleration_covariance[:] = (z_axis_covariance(ASSUMED_FORCE_NOISE ** 2) if
+                                                     self._has_force else NOT_REPORTED_COVARIANCE)
 
 
-def settings(values: SimpleNamespace) -> Settings:
+def settings_from_parameters(values: SimpleNamespace) -> Settings:
     """Return the settings of a gyro by the parameters; raise as `Settings` does."""
-    return Settings(values.sensitivity or None, _THREE_WAYS[values.invert], values.axis,
+    return Settings(values.sensitivity or None, _TRISTATE[values.invert], values.axis,
                     tuple(values.columns), values.full_scale or None,
-                    _THREE_WAYS[values.increments], values.sample_rate or None)
+                    _TRISTATE[values.increments], values.sample_rate or None)
 
 
 def main() -> int:
     """Run the node; returns the exit code."""
-    return run(DriverNode)
+    return run_node(DriverNode)
 
 
 if __name__ == '__main__':

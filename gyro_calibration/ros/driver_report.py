@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from gyro_calibration.driver.connection import Connection, Counts
+from gyro_calibration.driver.connection import Connection, ConnectionCounts
 from gyro_calibration.driver.protocols import Sample, Settings
 from gyro_calibration.ros.diagnostics import ERROR, OK, Report, WARN
 
-_LEAST_TIME = 0.5  # s; shortest time over which a sample rate is computed
-_OPENING = {'opening': 'opening the port', 'listening': 'listening for a protocol'}
+_MIN_RATE_DURATION = 0.5  # s; shortest time over which a sample rate is computed
+_STATE_MESSAGES = {'opening': 'opening the port', 'listening': 'listening for a protocol'}
 
 
 class DriverReport:
@@ -41,9 +41,9 @@ class DriverReport:
     def __init__(self, connection: Connection, port: str, settings: Settings,
                  clock: Callable[[], float]):
         self._connection, self._port, self._settings = connection, port, settings
-        self._clock, self._last, self._last_time = clock, Counts(), clock()
-        self._rate, self._steps = 0.0, 0
-        self._grown: dict[str, int] = {}
+        self._clock, self._last_counts, self._last_time = clock, ConnectionCounts(), clock()
+        self._rate, self._step_count = 0.0, 0
+        self._new_counts: dict[str, int] = {}
         self._clock_steps, self.event = '0', ''
         self._temperature: float | None = None
         self._health: dict[str, float] = {}
@@ -58,8 +58,8 @@ class DriverReport:
 
     def add_clock_step(self, step: float) -> None:
         """Count a step of the clock of the stamps, s."""
-        self._steps += 1
-        self._clock_steps = f'{self._steps}, last by {step:+.1f} s'
+        self._step_count += 1
+        self._clock_steps = f'{self._step_count}, last by {step:+.1f} s'
         self.event = f'the clock of this computer was set by {step:+.1f} s; the stamps follow it'
 
     def clear(self) -> None:
@@ -70,11 +70,11 @@ class DriverReport:
         """Return level, message and values."""
         counts, now, connection = self._connection.counts(), self._clock(), self._connection
         elapsed = now - self._last_time
-        if elapsed >= _LEAST_TIME:
-            self._grown = {name: count - getattr(self._last, name)
-                           for name, count in vars(counts).items()}
-            self._rate = self._grown.pop('samples') / elapsed
-            self._last, self._last_time = counts, now
+        if elapsed >= _MIN_RATE_DURATION:
+            self._new_counts = {name: count - getattr(self._last_counts, name)
+                                for name, count in vars(counts).items()}
+            self._rate = self._new_counts.pop('samples') / elapsed
+            self._last_counts, self._last_time = counts, now
         # The other thread may clear these meanwhile.
         last, clock, protocol = self._temperature, connection.clock, connection.protocol
         return *self._evaluate(), {
@@ -84,9 +84,9 @@ class DriverReport:
             'protocol': protocol.name if protocol else '',
             'baud': connection.baud,
             'detected': connection.detected,
-            'reopened': max(0, connection.openings - 1),
-            'waiting_s': f'{connection.state.waiting:.1f}',
-            'waited_s': f'{connection.waited:.1f}',
+            'reopened': max(0, connection.open_count - 1),
+            'waiting_s': f'{connection.state.retry_delay:.1f}',
+            'waited_s': f'{connection.waited_duration:.1f}',
             'last_error': connection.last_error,
             **vars(counts),
             'rate_hz': f'{self._rate:.1f}',
@@ -107,18 +107,19 @@ class DriverReport:
         if state.name == 'failed':
             return ERROR, state.problem
         if state.name != 'reading':
-            return WARN, _OPENING[state.name]
+            return WARN, _STATE_MESSAGES[state.name]
         grown = [f'{name.replace("_", " ")} {count}'
-                 for name, count in self._grown.items() if count > 0]
+                 for name, count in self._new_counts.items() if count > 0]
         warnings = [f'in the last second there were: {", ".join(grown)}'] if grown else []
         protocol, clock = self._connection.protocol, self._connection.clock
         if protocol is not None and clock is not None:
-            for name, (low, high) in protocol.good.items():
+            for name, (low, high) in protocol.normal_ranges.items():
                 value = self._health.get(name)
                 if value is not None and not low <= value <= high:
                     warnings.append(f'{name} is {value:.4g}, but should be from {low:g} to '
                                     f'{high:g}: check the supply, then have the gyro checked')
-            if clock.is_settled and (wrong := protocol.wrong_rate(self._settings, clock.period)):
+            if (clock.is_settled
+                    and (wrong := protocol.sample_rate_warning(self._settings, clock.period))):
                 warnings.append(wrong)
         return (WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (
             OK, 'samples come')

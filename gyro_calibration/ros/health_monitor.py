@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.files import LARGEST
+from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
@@ -32,51 +32,51 @@ from scipy.special import chdtr, chdtrc
 
 #: Duration of a stretch, of its parts in the test of steadiness, and of the blocks in the test of
 #: noise, s.
-STRETCH, _PART, _BLOCK = 10.0, 1.0, 0.05
+STRETCH_DURATION, _PART_DURATION, _BLOCK_DURATION = 10.0, 1.0, 0.05
 #: Longest interval between samples in a stretch, s.
-_GAP = 0.5
+_MAX_SAMPLE_INTERVAL = 0.5
 #: Largest accepted ratio of the noise to that of the model; figures are inexact and change.
-_TOLERANCE = 1.25
+_MAX_NOISE_RATIO = 1.25
 #: Largest accepted ratio of the noise of the model to the measured one: a filtered output has less
 #: noise in neighbouring blocks.
-_QUIET = 3.0
+_MAX_NOISE_REDUCTION = 3.0
 #: Largest ratio of the variance of parts to that by noise; with 9 degrees of freedom chance
 #: exceeds it once in a million stretches.
-_STEADY = 6.0
+_MAX_VARIANCE_RATIO = 6.0
 #: Probability of a false report that a calibration differs from the previous one.
-CHANCE = 1e-3
+FALSE_CHANGE_PROBABILITY = 1e-3
 #: Least number and duration, s, of equal values that count as repeated: a gyro with noise of 2
 #: steps of its output, _QUIET times less than in the model, repeats a value with probability 0.2.
-_REPEATS, _REPEATED = 20, 0.25
+_MIN_REPEATS, _MIN_REPEAT_DURATION = 20, 0.25
 #: Limit of -ln of the probability of as many repeats, beyond which a gyro with larger steps is
 #: dead too: e^-25 for a gyro that sends each sample four times.
-_IMPROBABLE = 100.0
+_MIN_REPEAT_EVIDENCE = 100.0
 #: Number of changes after which the step of the output is known.
-_CHANGES = 100
+_MIN_OUTPUT_CHANGES = 100
 #: Least rate of a turn by odometry, rad/s.
-_TURNS = 0.05
+_MIN_TURN_RATE = 0.05
 #: Largest angular deceleration of a robot, rad/s².
-_BRAKING = 20.0
+_MAX_DECELERATION = 20.0
 #: Number of successive stretches that decide in an unannounced rest: a robot on a straight path
 #: may vibrate for some time.
-_IN_A_ROW = 3
+_DECIDING_STRETCHES = 3
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestResult:
     """The result of one stretch at rest."""
 
     time: float  # of its end, s
     noise_ratio: float  # standard deviation of the noise over that of the model
-    noise_fits: bool  # within chance and tolerance
+    is_noise_normal: bool  # within chance and tolerance
     bias: float  # mean rate, rad/s
     sigmas: float  # of the mean, by the variance of the model; nan where unknown
-    bias_fits: bool  # within chance
+    is_bias_normal: bool  # within chance
     bias_deviation: float  # standard deviation of the mean by the noise of this stretch, rad/s
-    announced: bool
+    is_announced: bool
 
 
-class RepeatedOutput:
+class RepeatedOutputDetector:
     """
     Detector of a gyro that repeats one value: it is dead, saturated, or its driver has stopped.
 
@@ -89,30 +89,33 @@ class RepeatedOutput:
     def __init__(self, noise: Noise):
         """Start without samples; `noise` is that of the model."""
         self._noise, self._step, self._changes = noise, math.inf, 0
-        self._value, self._since, self._count, self._fell = math.nan, 0.0, 0, False
+        self._value, self._since, self._count, self._had_sudden_stop = math.nan, 0.0, 0, False
 
-    def add(self, time: float, output: float, turning: float) -> bool:
+    def add(self, time: float, output: float, odometry_rate: float) -> bool:
         """Add a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
         if output != self._value:
             step = abs(output - self._value)
             self._step = min(step, self._step)
-            self._fell = step > _TURNS + _BRAKING * abs(time - self._since)
+            self._had_sudden_stop = (step > _MIN_TURN_RATE
+                                     + _MAX_DECELERATION * abs(time - self._since))
             self._value, self._since, self._count = output, time, 0
             self._changes += 1
             return False
         self._count += 1
         lasts = time - self._since
-        if self._count < _REPEATS or lasts < _REPEATED:
+        if self._count < _MIN_REPEATS or lasts < _MIN_REPEAT_DURATION:
             return False
-        if lasts > _PART and abs(turning) > _TURNS and abs(output - turning) > 0.5 * abs(turning):
+        if (lasts > _PART_DURATION and abs(odometry_rate) > _MIN_TURN_RATE
+                and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
-        if output == 0.0 and not self._fell or self._changes <= _CHANGES or not sample:
+        if (output == 0.0 and not self._had_sudden_stop or self._changes <= _MIN_OUTPUT_CHANGES
+                or not sample):
             return False
         # probability of one more equal sample, for low noise around the value
-        repeats = math.erf(_QUIET * self._step / (2.0 * math.sqrt(2.0) * sample))
-        return (2.0 * _QUIET * self._step < sample
-                or -self._count * math.log(max(repeats, 1e-9)) > _IMPROBABLE)
+        repeats = math.erf(_MAX_NOISE_REDUCTION * self._step / (2.0 * math.sqrt(2.0) * sample))
+        return (2.0 * _MAX_NOISE_REDUCTION * self._step < sample
+                or -self._count * math.log(max(repeats, 1e-9)) > _MIN_REPEAT_EVIDENCE)
 
 
 class HealthMonitor:
@@ -121,45 +124,45 @@ class HealthMonitor:
 
     Attributes
     ----------
-    standing : means below this, rad/s, are rest; one above may be a steady turn, and counts only
-        if it is the same in several stretches
+    standstill_rate : means below this, rad/s, are rest; one above may be a steady turn, and counts
+        only if it is the same in several stretches
     noise_alarm, bias_alarm : one sentence each, '' without an alarm
-    last : the last stretch at rest, or None
-    examined : number of stretches at rest
+    last_rest : the last stretch at rest, or None
+    examined_count : number of stretches at rest
 
     """
 
-    def __init__(self, noise: Noise, false_alarms: float, standing: float = 0.0):
+    def __init__(self, noise: Noise, false_alarm_rate: float, standstill_rate: float = 0.0):
         """
         Start without samples.
 
         Parameters
         ----------
         noise : of the model; without an angle random walk the monitor is off
-        false_alarms : largest rate of false alarms at rest, 1/h; 0 switches the monitor off
-        standing : see above, rad/s
+        false_alarm_rate : largest rate of false alarms at rest, 1/h; 0 switches the monitor off
+        standstill_rate : see above, rad/s
 
         """
-        self._noise, self.standing = noise, standing
+        self._noise, self.standstill_rate = noise, standstill_rate
         # Four tests: noise and bias, upwards and downwards.
-        self._level = 0.25 * false_alarms * STRETCH / 3600.0
-        self._gathered: list[tuple[float, float, float]] = []
-        self._rests: list[Rest] = []
+        self._level = 0.25 * false_alarm_rate * STRETCH_DURATION / 3600.0
+        self._samples: list[tuple[float, float, float]] = []
+        self._rests: list[RestResult] = []
         self._step = math.inf
         self.noise_alarm = self.bias_alarm = ''
-        self.last: Rest | None = None
-        self.examined = 0
+        self.last_rest: RestResult | None = None
+        self.examined_count = 0
 
     @property
-    def works(self) -> bool:
+    def is_enabled(self) -> bool:
         """Return whether the monitor is on."""
         return self._noise.angle_random_walk > 0.0 and self._level > 0.0
 
     def restart(self) -> None:
         """Discard the samples so far, as after a gap."""
-        self._gathered = []
+        self._samples = []
 
-    def recalibrated(self) -> None:
+    def reset_biases(self) -> None:
         """Discard past biases after a new calibration."""
         self.restart()
         self._rests.clear()
@@ -169,15 +172,16 @@ class HealthMonitor:
         """
         Add a sample: its stamp, s, output and corrected rate, rad/s.
 
-        Return whether a stretch is complete and `examine` is to be called.
+        Return whether a stretch is complete and `examine_stretch` is to be called.
 
         """
-        if self._gathered and not 0.0 < time - self._gathered[-1][0] <= _GAP:
+        if self._samples and not 0.0 < time - self._samples[-1][0] <= _MAX_SAMPLE_INTERVAL:
             self.restart()
-        self._gathered.append((time, output, rate))
-        return time - self._gathered[0][0] >= STRETCH
+        self._samples.append((time, output, rate))
+        return time - self._samples[0][0] >= STRETCH_DURATION
 
-    def examine(self, bias_variance: float, age: float, announced: bool = False) -> Rest | None:
+    def examine_stretch(self, bias_variance: float, age: float,
+                        is_announced: bool = False) -> RestResult | None:
         """
         Test the complete stretch, and start the next one.
 
@@ -185,51 +189,51 @@ class HealthMonitor:
         ----------
         bias_variance : of the bias by its calibration, (rad/s)²; nan where it is not known
         age : of that calibration, s
-        announced : whether the rest was announced
+        is_announced : whether the rest was announced
 
         Returns
         -------
         the result; None where the rate is not steady, so that it is no rest
 
         """
-        time, output, rate = np.array(self._gathered).T
+        time, output, rate = np.array(self._samples).T
         self.restart()
         if np.ptp(output) > 0.0:
             self._step = min(self._step, quantization_step(output))
-        rest = examine(time, output, rate, self._noise, self._level, self._step, bias_variance,
-                       age, announced)
+        rest = examine_stretch(time, output, rate, self._noise, self._level, self._step,
+                               bias_variance, age, is_announced)
         if rest is not None:
-            self.last, self.examined = rest, self.examined + 1
-            self._rests = [*self._rests, rest][-_IN_A_ROW:]
+            self.last_rest, self.examined_count = rest, self.examined_count + 1
+            self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
             self._set_alarms(rest)
         return rest
 
-    def _set_alarms(self, rest: Rest) -> None:
-        last, several = self._rests, len(self._rests) == _IN_A_ROW
+    def _set_alarms(self, rest: RestResult) -> None:
+        last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
         biases = [each.bias for each in last]
         # the mean was the same in the last stretches, unlike in turns
         stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)
-        if rest.noise_fits:
+        if rest.is_noise_normal:
             self.noise_alarm = ''
-        elif rest.announced or several and not any(each.noise_fits for each in last):
+        elif rest.is_announced or several and not any(each.is_noise_normal for each in last):
             remedy = ('record a log at rest, and run allan or diagnose on it'
                       if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
-            shaken = ('' if rest.announced or rest.noise_ratio < 1.0
+            shaken = ('' if rest.is_announced or rest.noise_ratio < 1.0
                       else ', or the robot vibrates')
             self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
                                 f'model{shaken}: {remedy}')
-        if rest.bias_fits:
+        if rest.is_bias_normal:
             self.bias_alarm = ''
-        elif (rest.announced or abs(rest.bias) < self.standing
-              or several and stays and not any(each.bias_fits for each in last)):
+        elif (rest.is_announced or abs(rest.bias) < self.standstill_rate
+              or several and stays and not any(each.is_bias_normal for each in last)):
             self.bias_alarm = (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
                                f'{rest.sigmas:.0f} sigma of the model: calibrate, and if this '
                                'occurs again, diagnose a log')
 
 
-def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
-            step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0,
-            announced: bool = False) -> Rest | None:
+def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level: float,
+                    step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0,
+                    is_announced: bool = False) -> RestResult | None:
     """
     Test a stretch of samples against noise and bias of a model.
 
@@ -241,17 +245,17 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     noise : of the model
     level : probability of each of the four false alarms
     step : quantization step of the output, rad/s; inf where the output never changed
-    bias_variance, age, announced : as in `HealthMonitor.examine`
+    bias_variance, age, is_announced : as in `HealthMonitor.examine`
 
     Returns
     -------
     the result; None where the rate is not steady, samples are too few, or values are too large
 
     """
-    if max(np.abs(output).max(), np.abs(rate).max()) > LARGEST:
+    if max(np.abs(output).max(), np.abs(rate).max()) > MAX_MAGNITUDE:
         return None  # the squares may overflow
     interval = (time[-1] - time[0]) / (len(time) - 1)
-    size = max(1, round(_BLOCK / interval))
+    size = max(1, round(_BLOCK_DURATION / interval))
     if len(time) < 20 * size or step == math.inf:
         return None
     sample_variance = noise.allan_variance(interval)
@@ -262,56 +266,62 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     squares = (blocks[:, 1] - blocks[:, 0]) ** 2
     measured, claimed = 0.5 * float(np.mean(squares)), noise.allan_variance(size * interval)
     largest = max(measured, claimed + rounding)
-    if not _steady(time, rate, largest * size * interval, noise):
+    if not _is_steady(time, rate, largest * size * interval, noise):
         return None
     count = len(squares)
-    too_much = chdtrc(count, count * measured / ((claimed + rounding) * _TOLERANCE ** 2)) < level
-    too_little = not hidden and chdtr(count, count * measured * _QUIET ** 2 / claimed) < level
-    return Rest(float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
-                *_bias(time, rate, largest * size * interval, noise, level, bias_variance, age,
-                       0.5 * step if hidden else 0.0), announced)
+    too_much = (chdtrc(count, count * measured / ((claimed + rounding) * _MAX_NOISE_RATIO ** 2))
+                < level)
+    too_little = (not hidden
+                  and chdtr(count, count * measured * _MAX_NOISE_REDUCTION ** 2 / claimed) < level)
+    return RestResult(
+        float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
+        *_test_bias(time, rate, largest * size * interval, noise, level, bias_variance, age,
+                    0.5 * step if hidden else 0.0), is_announced)
 
 
-def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
-          bias_variance: float, age: float, unsure: float) -> tuple[float, float, bool, float]:
+def _test_bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
+               bias_variance: float, age: float,
+               rounding_error: float) -> tuple[float, float, bool, float]:
     """Return the mean rate, its number of sigmas, whether it fits, and its deviation by noise."""
     duration, mean = float(time[-1] - time[0]), float(rate.mean())
-    of_noise = spectrum / duration + unsure ** 2
-    variance = of_noise + noise.wander(age, duration) + bias_variance
-    sigmas = max(abs(mean) - unsure, 0.0) / math.sqrt(variance) if variance > 0.0 else math.nan
+    of_noise = spectrum / duration + rounding_error ** 2
+    variance = of_noise + noise.mean_change_variance(age, duration) + bias_variance
+    sigmas = (max(abs(mean) - rounding_error, 0.0)
+              / math.sqrt(variance) if variance > 0.0 else math.nan)
     fits = not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level
-    return mean, sigmas, fits, math.sqrt(of_noise + noise.wander(duration, duration))
+    return mean, sigmas, fits, math.sqrt(of_noise + noise.mean_change_variance(duration, duration))
 
 
-def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
+def _is_steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
     """Return whether parts of the stretch differ within noise; False for a single part."""
-    part = ((time - time[0]) / _PART).astype(int)
+    part = ((time - time[0]) / _PART_DURATION).astype(int)
     count = np.bincount(part)
     means = (np.bincount(part, rate) / np.maximum(count, 1))[count > 0.5 * count.max()]
-    explained = spectrum / _PART + noise.wander(STRETCH, _PART)
-    return len(means) > 1 and bool(means.var(ddof=1) <= _STEADY * explained)
+    explained = (spectrum / _PART_DURATION
+                 + noise.mean_change_variance(STRETCH_DURATION, _PART_DURATION))
+    return len(means) > 1 and bool(means.var(ddof=1) <= _MAX_VARIANCE_RATIO * explained)
 
 
-def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: float,
-            level: float = CHANCE) -> str:
+def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: Noise, age: float,
+                    level: float = FALSE_CHANGE_PROBABILITY) -> str:
     """
     Return a sentence on the change of a calibration beyond noise; '' within noise.
 
     Parameters
     ----------
-    before : previous calibration; an infinite variance is that of an unknown value
-    after : new calibration
+    previous : previous calibration; an infinite variance is that of an unknown value
+    current : new calibration
     noise : of the model, for the drift of the bias
     age : time between the two, s
     level : probability of a false report
 
     """
-    if before.covariance is None or after.covariance is None:
+    if previous.covariance is None or current.covariance is None:
         return ''
-    variances = (np.diagonal(before.covariance) + np.diagonal(after.covariance)
-                 + [0.0, noise.wander(age, STRETCH)])
-    differences = np.array([after.scale_factor_error - before.scale_factor_error,
-                            after.bias - before.bias])
+    variances = (np.diagonal(previous.covariance) + np.diagonal(current.covariance)
+                 + [0.0, noise.mean_change_variance(age, STRETCH_DURATION)])
+    differences = np.array([current.scale_factor_error - previous.scale_factor_error,
+                            current.bias - previous.bias])
     sigmas = np.abs(differences) / np.sqrt(variances)
     found = [f'the {name} changed by {text} ({size:.1f} sigma)' for name, text, size in zip(
         ('scale factor error', 'bias'),

@@ -18,7 +18,7 @@ import math
 import reprlib
 from types import SimpleNamespace
 
-_WORDS: dict[type, str] = {
+_TYPE_NAMES: dict[type, str] = {
     bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text',
     list: 'a list of strings'}
 
@@ -41,7 +41,7 @@ class Parameter:
         return self.name.replace('.', '_')
 
     @property
-    def allowed(self) -> str:
+    def choices_text(self) -> str:
         """Return the choices as text; '' if any value is allowed."""
         return f'{", ".join(self.choices[:-1])} or {self.choices[-1]}' if self.choices else ''
 
@@ -61,7 +61,8 @@ class Parameter:
         texts = value if isinstance(value, list) else [value]
         if (type(value) is not wanted
                 or several and not all(isinstance(each, str) for each in texts)):
-            self._refuse(value, self.allowed or f'{_WORDS[wanted]}, for example {self.default!r}')
+            self._refuse(value, self.choices_text or f'{_TYPE_NAMES[wanted]}, for example '
+                                                     f'{self.default!r}')
         if any('\0' in each for each in texts if isinstance(each, str)):
             self._refuse(value, 'without a zero byte')
         if isinstance(value, float) and not math.isfinite(value):
@@ -71,7 +72,7 @@ class Parameter:
             if not low <= value <= high:
                 self._refuse(value, f'from {low} to {high} {self.unit}'.rstrip())
         if self.choices and value not in self.choices:
-            self._refuse(value, self.allowed)
+            self._refuse(value, self.choices_text)
         return value
 
     def _refuse(self, value: object, wanted: str) -> None:
@@ -79,8 +80,8 @@ class Parameter:
             f'parameter {self.name} is {reprlib.repr(value)}, but must be {wanted}')
 
 
-def record(table: Sequence[Parameter], given: Mapping[str, object] | None = None
-           ) -> SimpleNamespace:
+def parameter_values(table: Sequence[Parameter],
+                     given: Mapping[str, object] | None = None) -> SimpleNamespace:
     """Return the values of a table by attribute: checked given values, else defaults."""
     given = given or {}
     return SimpleNamespace(**{

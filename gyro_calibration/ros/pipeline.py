@@ -31,7 +31,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
-from gyro_calibration.driver.timestamps import HostClock, read_together
+from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pair
 from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
@@ -40,12 +40,17 @@ from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.calibration_session import BLIND, CalibrationSession, REST, STANDING_TIME
+from gyro_calibration.ros.calibration_session import (
+    CalibrationSession,
+    DRIVE_SAMPLE_TIMEOUT,
+    REST,
+    ROS_TIME_PAUSED,
+)
 from gyro_calibration.ros.clock import Clock, RosTime, StampDelay
-from gyro_calibration.ros.health_monitor import HealthMonitor, RepeatedOutput
+from gyro_calibration.ros.health_monitor import HealthMonitor, RepeatedOutputDetector
 from gyro_calibration.ros.parameters import Parameter
 from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.ros.wheels import COMMAND, FRESH, ODOMETRY, Velocity, Wheels
+from gyro_calibration.ros.wheels import COMMAND, MAX_VELOCITY_AGE, ODOMETRY, Velocity, Wheels
 
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
@@ -93,29 +98,29 @@ _REST_FALSE_ALARMS = 0.1
 #: Rate of false alarms of the monitor of noise and bias, 1/h of rest.
 _HEALTH_FALSE_ALARMS = 0.001
 #: Silence after which the gyro may have been without power, s; its bias may have changed.
-_POWER_OFF = 10.0
+_POWER_OFF_SILENCE = 10.0
 #: Averaging time of the rate that must be zero before a drive, s.
-_LOOKED_BACK = 0.5
+_TURN_CHECK_DURATION = 0.5
 #: Least number of standard deviations of a mean rate that shows a turn.
-_SIGMAS = 4.0
+_TURN_LIMIT_SIGMAS = 4.0
 #: Largest angular acceleration of a turn between two samples, rad/s²: the default of Nav2's
 #: controllers.
-_ACCELERATION = 3.2
+_MAX_ANGULAR_ACCELERATION = 3.2
 #: Largest step of the temperature that is used at once, K; a larger one must be confirmed by the
 #: next.
-_LEAP = 5.0
+_MAX_TEMPERATURE_STEP = 5.0
 #: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill,
 #: and for how long, s.
-_CONTRADICTION, _DISTRUST = 1.0 * DEGREE, 600.0
+_MAX_HEADING_CHANGE_AT_REST, _ODOMETRY_DISTRUST_DURATION = 1.0 * DEGREE, 600.0
 #: Upper limit of ROS time, ns: `builtin_interfaces/Time` has 31 bits for seconds.
-_END_OF_TIME = NSEC_PER_SEC << 31
+_MAX_ROS_TIME = NSEC_PER_SEC << 31
 #: Time over which stamps and clock are compared, s; a deviation of 9 % exceeds the tolerance.
-_COMPARED = 30.0
+_CLOCK_COMPARISON_TIME = 30.0
 #: Two jumps back of the stamps within this time, s, show several publishers.
-_INTERLEAVED = 1.0
+_INTERLEAVING_WINDOW = 1.0
 
 
-class Output(NamedTuple):
+class CorrectedSample(NamedTuple):
     """
     A corrected sample: stamp, ns, heading, rad, rate, rad/s, and their variances.
 
@@ -131,8 +136,8 @@ class Output(NamedTuple):
     rate_variance: float
 
 
-COUNTED = ('samples', 'refused_samples', 'refused_temperatures', 'lost_samples',
-           'repeated_stamps', 'restarts', 'rebuilt', 'temperature_clipped', 'beyond_range')
+COUNT_NAMES = ('samples', 'refused_samples', 'refused_temperatures', 'lost_samples',
+               'repeated_stamps', 'restarts', 'rebuilt', 'temperature_clipped', 'beyond_range')
 
 
 @dataclass
@@ -140,15 +145,15 @@ class Journal:
     """Events and counts so far."""
 
     #: Time of the last sample, s of the steady clock.
-    received: float
+    last_received: float
     #: Counts of samples and of their faults.
-    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNT_NAMES, 0))
     #: The last event, and the steps of the host clock, as text.
     event: str = ''
     clock_steps: str = ''
     #: Number of refused calibrations, and the last reasons.
-    refused: int = 0
-    reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
+    refused_calibrations: int = 0
+    refusal_reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
     #: Further channels in the samples.
     channels: set[str] = field(default_factory=set)
 
@@ -170,9 +175,9 @@ class Pipeline:
     values : the parameters of the node
     store, estimator, monitor, wheels, session, journal, ros_time : its parts
     conflict : why samples cannot be used, in a sentence; ''
-    several : that the graph lists several publishers, in a sentence; ''
-    repeats : that the gyro repeats one value, in a sentence; ''
-    pace : that stamps and clock advance differently, in a sentence; ''
+    publisher_conflict : that the graph lists several publishers, in a sentence; ''
+    repeat_fault : that the gyro repeats one value, in a sentence; ''
+    clock_fault : that stamps and clock advance differently, in a sentence; ''
     odometry_fault : why odometry does not show standstill, in a sentence; ''
 
     """
@@ -192,40 +197,42 @@ class Pipeline:
         """
         self.values, self._clock = values, clock
         biases = calibration_file.with_name(f'{calibration_file.stem}_biases.yaml')
-        self._assumed = Assumptions(values.assumed_bias, values.assumed_scale_factor_error,
-                                    values.assumed_bias_temperature_coefficient)
+        self._assumptions = Assumptions(values.assumed_bias, values.assumed_scale_factor_error,
+                                        values.assumed_bias_temperature_coefficient)
         prior = Prior(coefficient=values.assumed_bias_temperature_coefficient)
         self.store = store = StateStore(values.model_file, calibration_file, biases, prior)
         noise = store.model.noise
-        self._tracking = _tracker_settings(values, noise)
-        self.estimator = HeadingEstimator(store.model, store.table, self._assumed,
-                                          self._tracking, TEMPERATURE_TIMEOUT, clock.date())
-        self.monitor = HealthMonitor(noise, _HEALTH_FALSE_ALARMS, self._tracking.threshold.rate)
+        self._tracking_settings = _tracker_settings(values, noise)
+        self.estimator = HeadingEstimator(store.model, store.table, self._assumptions,
+                                          self._tracking_settings, TEMPERATURE_TIMEOUT,
+                                          clock.date())
+        self.monitor = HealthMonitor(noise, _HEALTH_FALSE_ALARMS,
+                                     self._tracking_settings.threshold.rate)
         self.wheels, self.journal = Wheels(), Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
-        self.ros_time, self._host = RosTime(), HostClock()
+        self.ros_time, self._host_time = RosTime(), HostTimeConverter()
         self.conflict = ''
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
-        self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
-        self._last, self._interval = -math.inf, math.inf
-        self._newest, self._jumps = 0, deque[float](maxlen=2)
+        self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
+        self._last_time, self._usual_interval = -math.inf, math.inf
+        self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
         self._frame: str | None = None
-        self.several, self._switches = '', 0
+        self.publisher_conflict, self._interleaved_count = '', 0
         # For a driver that was restarted and may send faster: arrival of the last sample, s, and
         # the longest interval since a silence, ns.
-        self._same_name, self._arrived, self._longest = False, clock.steady(), 0
-        self._behind = 0.0  # delay of the last samples, ns
-        self._good = 0.0, 0.0
+        self._have_same_name, self._last_arrival, self._max_interval = False, clock.steady(), 0
+        self._backlog = 0.0  # delay of the last samples, ns
+        self._trusted_heading = 0.0, 0.0
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
-        self._standing: tuple[float, float] | None = None
-        self.repeats, self._repeated = '', RepeatedOutput(noise)
-        self.pace, self._pace_fault, self._stamps = '', '', StampDelay(
-            clock, _INTERLEAVED, _COMPARED)
-        self._suspect = math.nan  # a temperature, degC
+        self._stuck_stamp: tuple[float, float] | None = None
+        self.repeat_fault, self._repeat_detector = '', RepeatedOutputDetector(noise)
+        self.clock_fault, self._suspected_clock_fault, self._stamp_delay = '', '', StampDelay(
+            clock, _INTERLEAVING_WINDOW, _CLOCK_COMPARISON_TIME)
+        self._suspect_temperature = math.nan  # a temperature, degC
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
-        self._stood, self._contradicted = math.nan, -math.inf
-        self._recent, self._beginnings = deque[tuple[float, float]](), 0
+        self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
+        self._recent_rates, self._known_beginnings = deque[tuple[float, float]](), 0
 
     # Time
 
@@ -235,65 +242,70 @@ class Pipeline:
             self._epoch = stamp - stamp % NSEC_PER_SEC
         return 1e-9 * (stamp - self._epoch)
 
-    def _time(self, stamp: int) -> float:
+    def _message_time(self, stamp: int) -> float:
         """Return the time of a message other than a sample, s."""
         since = self._since_epoch(stamp)
-        return since if self._last == -math.inf else self._host.of_other(since, self._last)
+        return (since if self._last_time == -math.inf else self._host_time.convert_message(
+            since, self._last_time))
 
-    def _time_of_sample(self, stamp: int, silence: float) -> float:
+    def _sample_time(self, stamp: int, silence: float) -> float:
         """Return the time of a sample, s, after a silence, s."""
         since = self._since_epoch(stamp)
         if self._clock.simulated() is not None:
             return since
-        self._look_at_host_clock()
-        return self._host.of_sample(since, self._last, self._interval, silence)
+        self._update_host_clock()
+        return self._host_time.convert_sample(since, self._last_time, self._usual_interval,
+                                              silence)
 
-    def _look_at_host_clock(self) -> None:
+    def _update_host_clock(self) -> None:
         """Detect steps of the host clock, and correct stored dates by them."""
         clock, journal = self._clock, self.journal
-        read = read_together(clock.steady, clock.date)
-        if not read or not (step := self._host.watch(*read)):
+        read = read_clock_pair(clock.steady, clock.date)
+        if not read or not (step := self._host_time.update(*read)):
             return
         journal.event = (f'the clock of this computer was set by {step:+.1f} s; the heading '
                          'continues')
-        journal.clock_steps = f'{self._host.steps.count}, last by {step:+.1f} s'
-        self.estimator.clock_was_set(step)
-        if self.store.written is not None:
-            self.store.written += step
-        if self.estimator.calibrated_now and self.estimator.model.self_calibration:
-            self.store.keep(self.estimator.model.self_calibration)
+        journal.clock_steps = f'{self._host_time.steps.count}, last by {step:+.1f} s'
+        self.estimator.shift_clock(step)
+        if self.store.table_written_time is not None:
+            self.store.table_written_time += step
+        if self.estimator.is_calibrated_this_run and self.estimator.model.self_calibration:
+            self.store.store_calibration(self.estimator.model.self_calibration)
 
     # Inputs
 
-    def temperature(self, stamp: int, value: float) -> None:
+    def add_temperature(self, stamp: int, value: float) -> None:
         """Add a temperature, degC; a stamp far ahead of the samples is replaced by the last."""
-        time = self._time(stamp)
-        if time - self._last > TEMPERATURE_TIMEOUT and self._last > -math.inf:
-            time = self._last
+        time = self._message_time(stamp)
+        if time - self._last_time > TEMPERATURE_TIMEOUT and self._last_time > -math.inf:
+            time = self._last_time
         estimator, counts = self.estimator, self.journal.counts
-        refused, known = estimator.refused_temperatures, estimator.temperature
-        odd = (known is not None and not estimator.temperature_is_lost
-               and not abs(value - known) <= _LEAP and not abs(value - self._suspect) <= _LEAP)
-        self._suspect = value if odd else math.nan
+        refused, known = estimator.refused_temperature_count, estimator.temperature
+        odd = (known is not None and not estimator.is_temperature_lost
+               and not abs(value - known) <= _MAX_TEMPERATURE_STEP
+               and not abs(value - self._suspect_temperature) <= _MAX_TEMPERATURE_STEP)
+        self._suspect_temperature = value if odd else math.nan
         if not odd:
-            estimator.take_temperature(time, value)
-        if odd or estimator.refused_temperatures > refused:
+            estimator.add_temperature(time, value)
+        if odd or estimator.refused_temperature_count > refused:
             counts['refused_temperatures'] += 1
             self.journal.event = (f'a temperature of {value:g} degC is implausible'
                                   f'{f" after {known:g} degC" if odd else ""} and not used')
 
-    def odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
+    def add_odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Add a heading, rad, and a velocity by the odometry."""
-        now, rate, time = self._clock.steady(), velocity.angular[2], self._time(stamp)
-        if velocity.moves:
-            self._stood = math.nan
-        elif abs(math.remainder(heading - self._stood, math.tau)) > _CONTRADICTION:
-            self._contradicted, self._stood = now, heading
-            self._add_unknown_turn(_CONTRADICTION)
-        elif math.isnan(self._stood):
-            self._stood = heading
+        now, rate, time = self._clock.steady(), velocity.angular[2], self._message_time(stamp)
+        if velocity.is_moving:
+            self._heading_at_rest = math.nan
+        elif abs(math.remainder(heading - self._heading_at_rest,
+                                math.tau)) > _MAX_HEADING_CHANGE_AT_REST:
+            self._contradiction_time, self._heading_at_rest = now, heading
+            self._add_unknown_turn(_MAX_HEADING_CHANGE_AT_REST)
+        elif math.isnan(self._heading_at_rest):
+            self._heading_at_rest = heading
         # A late message is not used, and a contradictory one does not show standstill.
-        if not self._last - time > FRESH and (velocity.moves or not self.odometry_fault):
+        if (not self._last_time - time > MAX_VELOCITY_AGE
+                and (velocity.is_moving or not self.odometry_fault)):
             self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
             self.session.add_odometry(time, heading, rate)
@@ -301,18 +313,18 @@ class Pipeline:
     @property
     def odometry_fault(self) -> str:
         """Return why odometry does not show standstill, in a sentence; ''."""
-        if self._clock.steady() - self._contradicted > _DISTRUST:
+        if self._clock.steady() - self._contradiction_time > _ODOMETRY_DISTRUST_DURATION:
             return ''
         return ('odom turns by its headings while its rate is zero: check its twist, without '
                 'which it does not show that the robot stands')
 
-    def command(self, velocity: Velocity) -> None:
+    def add_command(self, velocity: Velocity) -> None:
         """Add a command from cmd_vel, also one of this node."""
         self.wheels.add(COMMAND, velocity, self._clock.steady())
         self.session.add_command(velocity)
 
-    def sample(self, stamp: int, output: float, specific_force: float | None = None,
-               receivers: int = 0, frame: str = '') -> Output | None:
+    def add_sample(self, stamp: int, output: float, specific_force: float | None = None,
+                   receivers: int = 0, frame: str = '') -> CorrectedSample | None:
         """
         Take a sample.
 
@@ -331,135 +343,140 @@ class Pipeline:
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
-        if not max(0, -self._delay) <= stamp < _END_OF_TIME - max(0, self._delay):
+        if not max(0, -self._stamp_offset) <= stamp < _MAX_ROS_TIME - max(0, self._stamp_offset):
             counts['refused_samples'] += 1
             journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
                              'time; the sample is not used')
             return None
-        if stamp < self._newest:
-            self._see_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
+        if stamp < self._last_stamp:
+            self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
         if frame != self._frame:
             before, self._frame = self._frame, frame
             if before is not None:
-                self._see_jump(now, f'samples of the frames {before} and {frame} alternate on '
-                                    'imu/data_raw')
-        if self.several:
-            self._look_for_switch(stamp)
-        self._longest = (0 if now - self._arrived > BLIND
-                         else max(self._longest, stamp - self._newest))
-        silence, self._newest, self._arrived = now - self._arrived, stamp, now
+                self._note_jump(now, f'samples of the frames {before} and {frame} alternate on '
+                                     'imu/data_raw')
+        if self.publisher_conflict:
+            self._detect_interleaving(stamp)
+        self._max_interval = (0 if now - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
+                              else max(self._max_interval, stamp - self._last_stamp))
+        silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
             return None
-        time = self._time_of_sample(stamp, silence)
-        if time == self._last:
+        time = self._sample_time(stamp, silence)
+        if time == self._last_time:
             counts['repeated_stamps'] += 1
-            first, fastest = self._standing or (now, 0.0)
-            self._standing = first, max(fastest, abs(output))
+            first, fastest = self._stuck_stamp or (now, 0.0)
+            self._stuck_stamp = first, max(fastest, abs(output))
             journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
             return None
-        if self._standing is not None:
-            (first, fastest), self._standing = self._standing, None
-            if now - first > BLIND:  # add the possible turn meanwhile
+        if self._stuck_stamp is not None:
+            (first, fastest), self._stuck_stamp = self._stuck_stamp, None
+            if now - first > DRIVE_SAMPLE_TIMEOUT:  # add the possible turn meanwhile
                 self._add_unknown_turn(min(fastest * (now - first), math.tau))
                 journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
                                  'came; turns in this time are not in the heading')
-        interval = time - self._last
+        interval = time - self._last_time
         if 0.0 < interval <= self.values.maximum_gap:
-            self._interval = min(interval, self.estimator.tracker.intervals.usual)
+            self._usual_interval = min(interval, self.estimator.tracker.intervals.usual_interval)
         # Perhaps a loss of power; after a mere delay the stamps continue.
-        if (now - journal.received > _POWER_OFF and interval < math.inf
-                and not 0.0 < interval < _POWER_OFF):
+        if (now - journal.last_received > _POWER_OFF_SILENCE and interval < math.inf
+                and not 0.0 < interval < _POWER_OFF_SILENCE):
             self.estimator.begin_run(self._clock.date())
-        self._last = time
+        self._last_time = time
         journal.channels = set() if specific_force is None else {'specific_force'}
-        return self._use(stamp, time, (interval, silence), output, specific_force, now, receivers)
+        return self._process_sample(stamp, time, (interval, silence), output, specific_force, now,
+                                    receivers)
 
-    def _see_jump(self, now: float, what: str) -> None:
+    def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
-        self._jumps.append(now)
-        if len(self._jumps) > 1 and now - self._jumps[0] < _INTERLEAVED:
+        self._jump_times.append(now)
+        if len(self._jump_times) > 1 and now - self._jump_times[0] < _INTERLEAVING_WINDOW:
             self._refuse_all(f'{what}, as with several gyros on one topic: give each gyro a topic '
                              'of its own')
 
-    def _use(self, stamp: int, time: float, since: tuple[float, float], output: float,
-             force: float | None, now: float, receivers: int) -> Output | None:
+    def _process_sample(self, stamp: int, time: float, since: tuple[float, float], output: float,
+                        force: float | None, now: float, receivers: int) -> CorrectedSample | None:
         """Compensate and integrate a sample; `since` is the interval by stamps and arrivals, s."""
-        estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
-        sources = _SOURCES[self.values.wheels]
-        moving = self.wheels.moving(now, sources) if sources else None
-        (interval, silence), received = since, self.journal.received
-        lost, unseen = estimator.tracker.intervals.lost, not 0.0 < interval <= BLIND
-        if unseen and not moving and not self.wheels.stood(received, now, sources):
+        estimator, counts, refused = (self.estimator, self.journal.counts,
+                                      self.estimator.refused_count)
+        sources = _WHEEL_SOURCES[self.values.wheels]
+        moving = self.wheels.is_moving(now, sources) if sources else None
+        (interval, silence), received = since, self.journal.last_received
+        lost, unseen = (estimator.tracker.intervals.lost_samples,
+                        not 0.0 < interval <= DRIVE_SAMPLE_TIMEOUT)
+        if unseen and not moving and not self.wheels.has_stood(received, now, sources):
             moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
-        if estimator.refused > refused:
+        if estimator.refused_count > refused:
             counts['refused_samples'] += 1
             self.journal.event = (f'a rate of {output:g} rad/s is beyond the range of this gyro: '
                                   'the sample is not used')
             return None
-        self.journal.received, tracker = now, estimator.tracker
-        counts['temperature_clipped'] += int(estimator.last.temperature_clipped)
-        counts['beyond_range'] += int(estimator.last.beyond_range)
-        counts['lost_samples'], counts['rebuilt'] = tracker.intervals.lost, tracker.rebuilt
+        self.journal.last_received, tracker = now, estimator.tracker
+        counts['temperature_clipped'] += int(estimator.last_compensated.temperature_clipped)
+        counts['beyond_range'] += int(estimator.last_compensated.beyond_range)
+        counts['lost_samples'], counts['rebuilt'] = (tracker.intervals.lost_samples,
+                                                     tracker.rebuild_count)
         if restarted:
             self._note_restart(restarted)
-        elif unseen and moving is not False and tracker.intervals.lost > lost:
-            turned = 0.25 * _ACCELERATION * interval ** 2
+        elif unseen and moving is not False and tracker.intervals.lost_samples > lost:
+            turned = 0.25 * _MAX_ANGULAR_ACCELERATION * interval ** 2
             if silence < 0.5 * interval:  # the stamps may have jumped without a loss
                 turned += abs(estimator.rate) * interval
             self._add_unknown_turn(turned)
-        self._stamps.add(time)
-        self._look_for_repeats(time, output, now)
-        if self.monitor.works and self.monitor.add(time, output, estimator.corrected):
+        self._stamp_delay.add(time)
+        self._check_repeats(time, output, now)
+        if self.monitor.is_enabled and self.monitor.add(time, output, estimator.corrected_rate):
             run = self.session.run
-            self.monitor.examine(estimator.bias_variance,
-                                 estimator.known_for(self._clock.date()),
-                                 run is not None and run.kind == REST)
+            self.monitor.examine_stretch(estimator.bias_variance,
+                                         estimator.bias_age(self._clock.date()),
+                                         run is not None and run.kind == REST)
         if self.session.run:
             self.session.add(time, output, receivers)
         known = self._noise_is_known
-        spread = 0.0 if known and self._interval < math.inf else self.values.assumed_bias ** 2
+        spread = (0.0
+                  if known and self._usual_interval < math.inf else self.values.assumed_bias ** 2)
         # After a reset the variance is that of one sample; zero would state an exact heading.
-        least = tracker.rate_variance * min(self._interval, 1.0) ** 2
-        found = Output(
-            stamp + self._delay, tracker.heading,
+        least = tracker.rate_variance * min(self._usual_interval, 1.0) ** 2
+        found = CorrectedSample(
+            stamp + self._stamp_offset, tracker.heading,
             max(tracker.variance, least) if known else UNMEASURED_VARIANCE, estimator.rate,
             tracker.rate_variance + spread)
         if not math.isfinite(found.heading + found.heading_variance + found.rate
                              + found.rate_variance):
             return None
-        if estimator.beginnings != self._beginnings:  # another calibration is in use
-            self._beginnings = estimator.beginnings
-            self._recent.clear()
-        self._recent.append((time, estimator.corrected))
-        while time - self._recent[0][0] > _LOOKED_BACK:
-            self._recent.popleft()
+        if estimator.restart_count != self._known_beginnings:  # another calibration is in use
+            self._known_beginnings = estimator.restart_count
+            self._recent_rates.clear()
+        self._recent_rates.append((time, estimator.corrected_rate))
+        while time - self._recent_rates[0][0] > _TURN_CHECK_DURATION:
+            self._recent_rates.popleft()
         return found
 
     def _add_unknown_turn(self, angle: float) -> None:
         """Add a turn that was not measured, rad, to the variance of the heading."""
         tracker = self.estimator.tracker
-        self.estimator.rewind(tracker.heading, tracker.variance + angle ** 2)
+        self.estimator.set_heading(tracker.heading, tracker.variance + angle ** 2)
 
-    def _look_for_repeats(self, time: float, output: float, now: float) -> None:
+    def _check_repeats(self, time: float, output: float, now: float) -> None:
         """Detect a repeated value, and add an unknown turn to the heading."""
-        if not self._repeated.add(time, output, self.wheels.turning(now)):
-            self.repeats = ''
-        elif not self.repeats:
-            self.repeats = (f'the gyro repeats the rate {output:g} rad/s: it is dead or '
-                            'saturated, or its driver has stopped')
-            self.journal.event = self.repeats
+        if not self._repeat_detector.add(time, output, self.wheels.turn_rate(now)):
+            self.repeat_fault = ''
+        elif not self.repeat_fault:
+            self.repeat_fault = (f'the gyro repeats the rate {output:g} rad/s: it is dead or '
+                                 'saturated, or its driver has stopped')
+            self.journal.event = self.repeat_fault
             self._add_unknown_turn(math.tau)
-            if self.session.drives:
-                self.session.end(self.repeats)
+            if self.session.is_driving:
+                self.session.end(self.repeat_fault)
 
     def _note_restart(self, reason: str) -> None:
         self.monitor.restart()
         self.journal.counts['restarts'] += 1
         self.journal.event = f'{reason}: integration was restarted'
-        self._stamps = StampDelay(self._clock, _INTERLEAVED, _COMPARED)
-        self._recent.clear()
+        self._stamp_delay = StampDelay(self._clock, _INTERLEAVING_WINDOW, _CLOCK_COMPARISON_TIME)
+        self._recent_rates.clear()
         self.session.interrupt(reason)
 
     # Conflicts and obstacles
@@ -468,29 +485,30 @@ class Pipeline:
         """Refuse all samples, and restore the heading from before the conflict."""
         if not self.conflict:
             # Turns are unknown until only one gyro sends: add the variance of a full turn.
-            heading, variance = self._good
-            self.estimator.rewind(heading, variance + math.tau ** 2)
+            heading, variance = self._trusted_heading
+            self.estimator.set_heading(heading, variance + math.tau ** 2)
             self.journal.event = conflict
         self.conflict = conflict
-        self.session.watch(self.values, 0, conflict=conflict)
+        self.session.poll(self.values, 0, conflict=conflict)
 
-    def publishers(self, names: Sequence[str]) -> None:
+    def update_publishers(self, names: Sequence[str]) -> None:
         """Take the names of the nodes that publish samples; called a few times per second."""
-        self.several = '' if len(names) < 2 else (
+        self.publisher_conflict = '' if len(names) < 2 else (
             f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), and '
             'their samples cannot be distinguished: give each gyro a topic of its own')
-        self._same_name = len(names) > len(set(names)) == 1
-        if not self.several:
-            self._switches = 0
-        if self._switches > 1:
-            self._refuse_all(self.several)
-        elif not self._jumps or self._clock.steady() - self._jumps[-1] > _INTERLEAVED:
+        self._have_same_name = len(names) > len(set(names)) == 1
+        if not self.publisher_conflict:
+            self._interleaved_count = 0
+        if self._interleaved_count > 1:
+            self._refuse_all(self.publisher_conflict)
+        elif (not self._jump_times
+                or self._clock.steady() - self._jump_times[-1] > _INTERLEAVING_WINDOW):
             self.conflict = ''
-        if not self.conflict and not self._switches:
+        if not self.conflict and not self._interleaved_count:
             tracker = self.estimator.tracker
-            self._good = tracker.heading, tracker.variance
+            self._trusted_heading = tracker.heading, tracker.variance
 
-    def _look_for_switch(self, stamp: int) -> None:
+    def _detect_interleaving(self, stamp: int) -> None:
         """
         Count samples that follow too soon to be of the same publisher.
 
@@ -500,77 +518,87 @@ class Pipeline:
         caught up.
 
         """
-        usual, interval = (NSEC_PER_SEC * self.estimator.tracker.intervals.usual,
-                           stamp - self._newest)
-        behind, begins = self._behind, self._clock.steady() - self._arrived > BLIND
-        self._behind = 0.0 if begins else min(max(behind + interval - usual, 0.0),
-                                              NSEC_PER_SEC * BLIND)
-        if self._same_name:
-            usual = min(usual, self._longest)
+        usual, interval = (NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval,
+                           stamp - self._last_stamp)
+        behind, begins = (self._backlog, self._clock.steady() - self._last_arrival
+                          > DRIVE_SAMPLE_TIMEOUT)
+        self._backlog = 0.0 if begins else min(max(behind + interval - usual, 0.0),
+                                               NSEC_PER_SEC * DRIVE_SAMPLE_TIMEOUT)
+        if self._have_same_name:
+            usual = min(usual, self._max_interval)
         if not (2.0 * interval > usual or behind):
-            self._switches += 1
-        if self._switches > 1:
-            self._refuse_all(self.several)
+            self._interleaved_count += 1
+        if self._interleaved_count > 1:
+            self._refuse_all(self.publisher_conflict)
 
-    def obstacle(self) -> str:
+    def find_obstacle(self) -> str:
         """Return why the robot must not be driven now; '' if it may."""
         now = self._clock.steady()
-        if self.ros_time.standing > BLIND:
-            return STANDING_TIME
-        if fault := self.conflict or self.several or self.repeats or self.pace:
+        if self.ros_time.paused_duration > DRIVE_SAMPLE_TIMEOUT:
+            return ROS_TIME_PAUSED
+        if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
+                or self.clock_fault):
             return fault
-        if not self._recent or now - self.journal.received > 1.0:
+        if not self._recent_rates or now - self.journal.last_received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
-        if self.wheels.moving(now):
+        if self.wheels.is_moving(now):
             return 'odom or cmd_vel shows that the robot moves: stop it, and run again'
         bias, deviation = self.estimator.tracker.bias
-        rate = sum(each for _, each in self._recent) / max(len(self._recent), 1) - bias
-        noise = self.store.model.noise.angle_random_walk / math.sqrt(_LOOKED_BACK)
-        if abs(rate) > _SIGMAS * math.hypot(deviation, noise, self._tracking.threshold.rate):
+        rate = sum(each for _, each in self._recent_rates) / max(len(self._recent_rates), 1) - bias
+        noise = self.store.model.noise.angle_random_walk / math.sqrt(_TURN_CHECK_DURATION)
+        if abs(rate) > _TURN_LIMIT_SIGMAS * math.hypot(deviation, noise,
+                                                       self._tracking_settings.threshold.rate):
             return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: stop the robot, or, if '
                     'it stands, call calibrate_bias first')
         return ''
 
     # Periodic calls
 
-    def set(self, values: SimpleNamespace) -> None:  # noqa: A003
+    def use_parameters(self, values: SimpleNamespace) -> None:  # noqa: A003
         """Continue with other values of the parameters."""
         self.values = values
         tracking = _tracker_settings(values, self.store.model.noise)
-        if tracking != self._tracking:
-            self._tracking = tracking
-            self.estimator.set(tracking)
-            self.monitor.standing = tracking.threshold.rate
+        if tracking != self._tracking_settings:
+            self._tracking_settings = tracking
+            self.estimator.configure(tracking)
+            self.monitor.standstill_rate = tracking.threshold.rate
 
-    def watch(self, receivers: int) -> None:
+    def poll(self, receivers: int) -> None:
         """Check that time and samples advance; to be called several times per second."""
         self.ros_time.poll(self._clock)
         # A drive ends where several publishers exist, before their samples mix.
-        conflict = self.conflict or (self.several if self.session.drives else '')
-        self.session.watch(self.values, receivers, self.ros_time.standing > BLIND, conflict)
+        conflict = self.conflict or (self.publisher_conflict if self.session.is_driving else '')
+        self.session.poll(self.values, receivers, self.ros_time.paused_duration
+                          > DRIVE_SAMPLE_TIMEOUT, conflict)
 
-    def learn(self, ending: bool = False) -> None:
+    def run_periodic_tasks(self, is_final: bool = False) -> None:
         """Update bias table and files; to be called once per second, and at the end."""
         if self._clock.simulated() is None:
-            self._look_at_host_clock()
+            self._update_host_clock()
         # Two faults in a row: delayed samples come in a burst, and are late until then.
-        before, self._pace_fault = self._pace_fault, self._stamps.fault()
-        self.pace = before and self._pace_fault
-        if self.pace:
+        before, self._suspected_clock_fault = (self._suspected_clock_fault,
+                                               self._stamp_delay.find_fault())
+        self.clock_fault = before and self._suspected_clock_fault
+        if self.clock_fault:
             self._add_unknown_turn(math.tau)
         date = self._clock.date()
-        if event := self.estimator.learn(date, ending):
+        if event := self.estimator.update_table(date, is_final):
             self.journal.event = event
-        self.store.keep_table(date, ending)
+        self.store.store_table(date, is_final)
         self.store.poll()
 
-    def reset(self) -> str:
+    def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
-        self._good = 0.0, 0.0
-        if self.conflict or self.repeats:  # turns are not measured now
-            self.estimator.rewind(0.0, math.tau ** 2)
+        self._trusted_heading = 0.0, 0.0
+        if self.conflict or self.repeat_fault:  # turns are not measured now
+            self.estimator.set_heading(0.0, math.tau ** 2)
         return 'the heading is zero here and now'
 
 
-_SOURCES = {'none': (), 'odom': (ODOMETRY,), 'cmd_vel': (COMMAND,), 'both': (ODOMETRY, COMMAND)}
+_WHEEL_SOURCES = {
+    'none': (),
+    'odom': (ODOMETRY, ),
+    'cmd_vel': (COMMAND, ),
+    'both': (ODOMETRY, COMMAND)
+}

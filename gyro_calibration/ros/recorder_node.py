@@ -27,8 +27,8 @@ import threading
 import time
 from typing import Any
 
-from gyro_calibration.driver.timestamps import steady
-from gyro_calibration.logs.cdr import LINE, NSEC_PER_SEC
+from gyro_calibration.driver.timestamps import read_steady_clock
+from gyro_calibration.logs.cdr import DEFINITION_SEPARATOR, NSEC_PER_SEC
 from gyro_calibration.logs.log import LogError
 from gyro_calibration.logs.ros_bag import Message
 from gyro_calibration.ros.runner import call_every, SENSOR_QOS
@@ -39,10 +39,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-_LAST = 10.0  # s; longest time for the messages in the queues when a recorder is stopped
+_DRAIN_TIMEOUT = 10.0  # s; longest time for the messages in the queues when a recorder is stopped
 _POLL_INTERVAL = 0.3  # s; interval of queries of the graph
-_LARGEST_DOMAIN = 232  # beyond it UDP ports exceed 65535, and Fast DDS ends the process
-_WORDS = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
+_MAX_DOMAIN_ID = 232  # beyond it UDP ports exceed 65535, and Fast DDS ends the process
+_TYPE_ALIASES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
 
 
 class RecorderNode(Node):
@@ -52,14 +52,14 @@ class RecorderNode(Node):
     Parameters
     ----------
     topics : sequence of str
-    everything : whether all other topics are recorded too
-    take : is called with each message and its definition
+    all_topics : whether all other topics are recorded too
+    on_message : is called with each message and its definition
 
     Attributes
     ----------
     topics : full names of the requested topics
-    unknown : topics whose type is not installed, and the reason
-    taken : number of received messages
+    unknown_topics : topics whose type is not installed, and the reason
+    message_count : number of received messages
 
     Raises
     ------
@@ -67,71 +67,74 @@ class RecorderNode(Node):
 
     """
 
-    def __init__(self, topics: Sequence[str], everything: bool,
-                 take: Callable[[Message, str], None], context: rclpy.Context):
+    def __init__(self, topics: Sequence[str], all_topics: bool,
+                 on_message: Callable[[Message, str], None], context: rclpy.Context):
         super().__init__('gyro_calibration_recorder', context=context,
                          start_parameter_services=False, enable_rosout=False)
-        self.topics = tuple(_resolved(self, topic) for topic in topics)
-        self.unknown: dict[str, str] = {}
-        self.taken = 0
-        self._everything, self._take = everything, take
+        self.topics = tuple(_resolve_topic(self, topic) for topic in topics)
+        self.unknown_topics: dict[str, str] = {}
+        self.message_count = 0
+        self._all_topics, self._on_message = all_topics, on_message
         self._subscriptions_of: dict[str, tuple] = {}
-        self._begin = time.time_ns() - round(steady() * NSEC_PER_SEC)
+        self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         self.poll()
         call_every(self, _POLL_INTERVAL, self.poll)
 
     @property
-    def missing(self) -> list[str]:
+    def missing_topics(self) -> list[str]:
         """Return the requested topics without a publisher so far."""
         return [topic for topic in self.topics if topic not in self._subscriptions_of]
 
-    def known(self) -> list[str]:
+    def known_topics(self) -> list[str]:
         """Return the topics in the graph."""
         return sorted(name for name, _ in self.get_topic_names_and_types())
 
     def poll(self) -> None:
         """Subscribe to new topics in the graph."""
         for topic, kinds in self.get_topic_names_and_types():
-            wanted = topic in self.topics or self._everything
+            wanted = topic in self.topics or self._all_topics
             publishers = self.get_publishers_info_by_topic(topic) if wanted else []
-            if publishers and topic not in self.unknown:
-                self._subscribe(topic, kinds[0], _quality(publishers))
+            if publishers and topic not in self.unknown_topics:
+                self._subscribe(topic, kinds[0], _compatible_qos(publishers))
 
-    def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> None:
-        offered = quality.reliability, quality.durability
+    def _subscribe(self, topic: str, kind: str, qos: QoSProfile) -> None:
+        offered = qos.reliability, qos.durability
         before = self._subscriptions_of.get(topic)
         if before is not None:
             if before[0] == offered:
                 return
             self.destroy_subscription(before[1])
         try:
-            definition = _definition_of(kind)
+            definition = _build_definition(kind)
         except (ImportError, AttributeError) as error:
-            self.unknown[topic] = f'{kind} is not installed here ({error})'
+            self.unknown_topics[topic] = f'{kind} is not installed here ({error})'
             return
 
         # By the steady clock, so that times of receipt do not jump when the clock is set.
         def take(data: bytes) -> None:
-            self.taken += 1
-            self._take(Message(topic, kind, self._begin + round(steady() * NSEC_PER_SEC),
-                               bytes(data)), definition)
+            self.message_count += 1
+            self._on_message(
+                Message(topic,
+                        kind, self._clock_offset + round(read_steady_clock() * NSEC_PER_SEC),
+                        bytes(data)), definition)
         self._subscriptions_of[topic] = offered, self.create_subscription(
-            load(kind), topic, take, quality, raw=True)
+            load_message_class(kind), topic, take, qos, raw=True)
 
 
-def _resolved(node: Node, topic: str) -> str:
+def _resolve_topic(node: Node, topic: str) -> str:
     try:
         return str(node.resolve_topic_name(topic))
     except (RuntimeError, ValueError) as error:
-        raise LogError(f'{topic} is no topic name ({_reason(error)}); give another') from None
+        raise LogError(f'{topic} is no topic name ({_describe_error(error)}); give '
+                       'another') from None
 
 
-def _reason(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     """Return the text of an error of rclpy, without the place in its source."""
     return str(error).partition(', at /')[0]
 
 
-def _quality(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
+def _compatible_qos(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
     """Return a QoS compatible with all publishers; transient local only if all offer it."""
     best_effort = any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
                       for each in publishers)
@@ -143,7 +146,7 @@ def _quality(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
-def load(kind: str) -> Any:
+def load_message_class(kind: str) -> Any:
     """
     Return the class of a message type such as ``sensor_msgs/msg/Imu``.
 
@@ -156,37 +159,40 @@ def load(kind: str) -> Any:
     return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
-def _definition_of(kind: str) -> str:
+def _build_definition(kind: str) -> str:
     """Return the definition of a type with its nested types, in the format of ROS 2."""
     kinds, parts = [kind], []
     for each in kinds:
-        fields = load(each).get_fields_and_field_types()
-        head = '' if each == kind else f'{LINE}\nMSG: {each.replace("/msg/", "/")}\n'
-        parts.append(head + ''.join(f'{_field(text)} {name}\n' for name, text in fields.items()))
+        fields = load_message_class(each).get_fields_and_field_types()
+        head = ('' if each == kind else
+                f'{DEFINITION_SEPARATOR}\nMSG: {each.replace("/msg/", "/")}\n')
+        parts.append(head + ''.join(f'{_format_field_type(text)} {name}\n'
+                                    for name, text in fields.items()))
         inner = [re.sub(r'^sequence<|[,>\[].*$', '', text).replace('/', '/msg/')
                  for text in fields.values()]
         kinds += [found for found in dict.fromkeys(inner) if '/' in found and found not in kinds]
     return ''.join(parts)
 
 
-def _field(text: str) -> str:
+def _format_field_type(text: str) -> str:
     """Return the type of a field in a definition: ``float64[<=3]`` for ``sequence<double, 3>``."""
     if text.startswith('sequence<'):
         inner, _, most = text.removeprefix('sequence<').removesuffix('>').partition(', ')
-        return f'{_field(inner)}[{f"<={most}" if most else ""}]'
+        return f'{_format_field_type(inner)}[{f"<={most}" if most else ""}]'
     word, bracket, length = text.partition('[')
     word = re.sub(r'<(\d+)>', r'<=\1', word)
-    return _WORDS.get(word, word) + bracket + length
+    return _TYPE_ALIASES.get(word, word) + bracket + length
 
 
-def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Message, str], None],
+def take_messages(topics: Sequence[str], all_topics: bool, on_message: Callable[[Message, str],
+                                                                                None],
                   tick: Callable[[RecorderNode], None], stop: threading.Event) -> None:
     """
     Receive the messages of topics until stopped.
 
     Parameters
     ----------
-    topics, everything, take : as for `RecorderNode`
+    topics, all_topics, on_message : as for `RecorderNode`
     tick : is called at least every 50 ms, with the node
     stop : event that ends the recording
 
@@ -198,22 +204,22 @@ def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Messa
     """
     context = rclpy.Context()
     domain = os.environ.get('ROS_DOMAIN_ID', '')
-    if domain.isdecimal() and int(domain) > _LARGEST_DOMAIN:
-        raise LogError(f'ROS_DOMAIN_ID is {domain}, but must be from 0 to {_LARGEST_DOMAIN}')
+    if domain.isdecimal() and int(domain) > _MAX_DOMAIN_ID:
+        raise LogError(f'ROS_DOMAIN_ID is {domain}, but must be from 0 to {_MAX_DOMAIN_ID}')
     try:
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     except (RuntimeError, ValueError) as error:
-        raise LogError(f'ROS 2 cannot be started ({_reason(error)}); '
+        raise LogError(f'ROS 2 cannot be started ({_describe_error(error)}); '
                        'check its environment variables') from None
     executor = SingleThreadedExecutor(context=context)
     try:
-        node = RecorderNode(topics, everything, take, context)
+        node = RecorderNode(topics, all_topics, on_message, context)
         executor.add_node(node)
         try:
             while not stop.is_set():
                 executor.spin_once(timeout_sec=0.05)
                 tick(node)
-            _take_what_came(executor, node)
+            _drain_queues(executor, node)
         finally:
             executor.remove_node(node)
             node.destroy_node()
@@ -222,10 +228,10 @@ def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Messa
         rclpy.shutdown(context=context)
 
 
-def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> None:
+def _drain_queues(executor: SingleThreadedExecutor, node: RecorderNode) -> None:
     """Receive the messages that were in the queues when the recorder was stopped."""
-    deadline, idle = time.monotonic() + _LAST, 0
+    deadline, idle = time.monotonic() + _DRAIN_TIMEOUT, 0
     while idle < 3 and time.monotonic() < deadline:  # a call may also serve a timer
-        before = node.taken
+        before = node.message_count
         executor.spin_once(timeout_sec=0.0)
-        idle = 0 if node.taken > before else idle + 1
+        idle = 0 if node.message_count > before else idle + 1

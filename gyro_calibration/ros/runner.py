@@ -30,7 +30,7 @@ import threading
 from types import SimpleNamespace
 from typing import Any
 
-from gyro_calibration.ros.parameters import Parameter, record
+from gyro_calibration.ros.parameters import Parameter, parameter_values
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -73,11 +73,11 @@ LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 _UNWATCHED_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
 _UNWATCHED_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
 
-ENDING = 10.0
+SHUTDOWN_TIMEOUT = 10.0
 """Longest time of the shutdown of a node, s; then it is killed."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SIGNAL_SEEN = 0.2  # s; longest time until a signal is handled
+_SIGNAL_LATENCY = 0.2  # s; longest time until a signal is handled
 
 
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:
@@ -95,8 +95,9 @@ def subscribe_to(node: Node, kind: type, topic: str, callback: Callable[..., Non
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
-def declare(node: Node, table: Sequence[Parameter],
-            changed: Callable[[SimpleNamespace], None] | None = None) -> SimpleNamespace:
+def declare_parameters(
+        node: Node, table: Sequence[Parameter],
+        on_change: Callable[[SimpleNamespace], None] | None = None) -> SimpleNamespace:
     """
     Declare the parameters of a table and return their values as one record.
 
@@ -104,7 +105,7 @@ def declare(node: Node, table: Sequence[Parameter],
     ----------
     node : Node
     table : sequence of Parameter
-    changed : is called with the record of all values after a change
+    on_change : is called with the record of all values after a change
 
     Raises
     ------
@@ -113,23 +114,23 @@ def declare(node: Node, table: Sequence[Parameter],
     """
     known = {each.name: each for each in table}
 
-    def current(given: Sequence[rclpy.Parameter] = ()) -> SimpleNamespace:
+    def read_values(given: Sequence[rclpy.Parameter] = ()) -> SimpleNamespace:
         values = {name: node.get_parameter(name).value for name in known}
         values.update({each.name: each.value for each in given if each.name in known})
-        return record(table, values)
+        return parameter_values(table, values)
 
     def check(given: Sequence[rclpy.Parameter]) -> SetParametersResult:
         try:
-            values = current(given)
+            values = read_values(given)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        if not after and changed:
-            changed(values)
+        if not after and on_change:
+            on_change(values)
         return SetParametersResult(successful=True)
 
     def use(given: Sequence[rclpy.Parameter]) -> None:
-        if changed and any(each.name in known for each in given):
-            changed(current())
+        if on_change and any(each.name in known for each in given):
+            on_change(read_values())
 
     for each in table:
         # first with any type: rclpy refuses 100 for 100.0, with a message of several sentences
@@ -144,7 +145,7 @@ def declare(node: Node, table: Sequence[Parameter],
     node.add_on_set_parameters_callback(check)
     if after:
         node.add_post_set_parameters_callback(use)
-    return current()
+    return read_values()
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -152,7 +153,7 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     unit = f' Unit: {parameter.unit}.' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         description=parameter.description + unit, read_only=not parameter.dynamic,
-        additional_constraints=parameter.allowed,
+        additional_constraints=parameter.choices_text,
         # a whole number may be set for a float
         dynamic_typing=isinstance(parameter.default, float))
     if parameter.range and isinstance(parameter.default, float):
@@ -175,7 +176,7 @@ def call_every(node: Node, period: float, callback: Callable[[], None]) -> Timer
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def run(node_class: Callable[[], Node]) -> int:
+def run_node(node_class: Callable[[], Node]) -> int:
     """
     Start a node, spin it until SIGINT or SIGTERM, and return the exit code of the process.
 
@@ -207,7 +208,7 @@ def run(node_class: Callable[[], Node]) -> int:
             signal.signal(number, signal.SIG_IGN)
 
 
-def answer_later(service: Service) -> None:
+def allow_deferred_response(service: Service) -> None:
     """
     Allow the callback of a service to return a `Future`; its response is sent when it is done.
 
@@ -240,7 +241,7 @@ def spin(node: Node, stop: threading.Event) -> None:
     try:
         # The timers of a node end the wait of SingleThreadedExecutor, for which a time-out would
         # be one more timer at each message; EventsExecutor returns only with a time-out.
-        timeout = None if isinstance(serving, SingleThreadedExecutor) else _SIGNAL_SEEN
+        timeout = None if isinstance(serving, SingleThreadedExecutor) else _SIGNAL_LATENCY
         while not stop.is_set():
             serving.spin_once(timeout_sec=timeout)
     except ExternalShutdownException:
@@ -249,6 +250,6 @@ def spin(node: Node, stop: threading.Event) -> None:
         serving.shutdown()
         # Fast DDS 2.14 can deadlock, with the GIL held, when two nodes end at the same time, as
         # after Ctrl-C.
-        faulthandler.dump_traceback_later(ENDING, exit=True)
+        faulthandler.dump_traceback_later(SHUTDOWN_TIMEOUT, exit=True)
         node.destroy_node()
         faulthandler.cancel_dump_traceback_later()

@@ -21,15 +21,21 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from gyro_calibration.files import plain, reason, remedy, remove_leftovers, version
+from gyro_calibration.files import (
+    describe_error,
+    file_version,
+    remedy,
+    remove_leftovers,
+    to_printable,
+)
 from gyro_calibration.heading.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
 from gyro_calibration.model.gyro_model import (
     GyroModel,
-    same_effects,
+    have_same_effects,
     SelfCalibration,
     with_self_calibration,
 )
-from gyro_calibration.model.model_file import ModelError, ModelMissing, read_model, write_model
+from gyro_calibration.model.model_file import ModelError, ModelNotFound, read_model, write_model
 
 
 class StateStore:
@@ -41,10 +47,10 @@ class StateStore:
     model : the model with its self-calibration; an empty one if it cannot be read
     table : biases at rest
     problem : why the rates are uncalibrated, in a sentence; '' if they are calibrated
-    hint : fault of the calibration file; '' without
+    calibration_hint : fault of the calibration file; '' without
     table_hint : fault of the bias table; '' without
     shared_hint : that another process has written to a file; '' without
-    written : time when the bias table was last written, s since 1970; None before
+    table_written_time : time when the bias table was last written, s since 1970; None before
 
     """
 
@@ -53,29 +59,29 @@ class StateStore:
         for file in (calibration_file, bias_file):
             remove_leftovers(file)
         self._calibration_file, self._bias_file = calibration_file, bias_file
-        self.problem = self.hint = ''
-        self.written: float | None = None
-        self.model = self._stored(model_file)
+        self.problem = self.calibration_hint = ''
+        self.table_written_time: float | None = None
+        self.model = self._load_model(model_file)
         self.table, self.table_hint = BiasTable(self.model, prior), ''
         if not self.problem:
             self.table, self.table_hint = read_bias_table(bias_file, self.model, prior)
-        self.shared_hint, self._seen = '', {file: _version(file)
-                                            for file in (calibration_file, bias_file)}
+        self.shared_hint, self._file_versions = '', {file: _existing_version(file)
+                                                     for file in (calibration_file, bias_file)}
 
     def poll(self) -> None:
         """Check whether another process has written to the files; to be called periodically."""
-        for file, seen in self._seen.items():
-            found = _version(file)
+        for file, seen in self._file_versions.items():
+            found = _existing_version(file)
             if found is not None and found != seen:
-                self.shared_hint = plain(
+                self.shared_hint = to_printable(
                     f'{file} was written by another process, and the next writer replaces it: '
                     'give each node a calibration_file of its own, or restart this one to use '
                     'that file')
 
-    def _written(self, file: Path, version: tuple[int, int]) -> None:
-        self.shared_hint, self._seen[file] = '', version
+    def _note_written(self, file: Path, version: tuple[int, int]) -> None:
+        self.shared_hint, self._file_versions[file] = '', version
 
-    def _stored(self, model_file: str) -> GyroModel:
+    def _load_model(self, model_file: str) -> GyroModel:
         model = GyroModel()
         if model_file:
             try:
@@ -85,48 +91,52 @@ class StateStore:
                 return model
         try:
             stored = read_model(self._calibration_file)
-        except ModelMissing:
+        except ModelNotFound:
             return model
         except ModelError as error:
-            self.hint = f'the last self-calibration is not used: {error}'
+            self.calibration_hint = f'the last self-calibration is not used: {error}'
             return model
-        if fault := _fault(stored, model):
-            self.hint = plain(f'the self-calibration in {self._calibration_file} is not used: '
-                              f'{fault}; calibrate again')
+        if fault := _describe_mismatch(stored, model):
+            self.calibration_hint = to_printable('the self-calibration in '
+                                                 f'{self._calibration_file} is not used: '
+                                                 f'{fault}; calibrate again')
             return model
         return with_self_calibration(model, stored.self_calibration)
 
-    def keep(self, calibration: SelfCalibration) -> str:
+    def store_calibration(self, calibration: SelfCalibration) -> str:
         """Use and store a calibration; return the fault of the storage, '' without one."""
-        self.model, self.hint = with_self_calibration(self.model, calibration), ''
+        self.model, self.calibration_hint = with_self_calibration(self.model, calibration), ''
         try:
-            self._written(self._calibration_file, write_model(self._calibration_file, self.model))
+            self._note_written(self._calibration_file,
+                               write_model(self._calibration_file, self.model))
         except (OSError, ArithmeticError) as error:
             wanted = (remedy(error, self._calibration_file) if isinstance(error, OSError)
                       else 'check the rates')
-            self.hint = plain(f'the calibration is in use but NOT STORED ({reason(error)}): '
-                              f'{wanted}, and calibrate again')
-        return self.hint
+            self.calibration_hint = to_printable('the calibration is in use but NOT STORED '
+                                                 f'({describe_error(error)}): '
+                                                 f'{wanted}, and calibrate again')
+        return self.calibration_hint
 
-    def keep_table(self, now: float, ending: bool = False) -> None:
+    def store_table(self, now: float, is_final: bool = False) -> None:
         """Write the bias table if it is due, and at the end; `now` in s since 1970."""
-        if self.problem or not self.table.due(now, ending):
+        if self.problem or not self.table.is_write_due(now, is_final):
             return
         try:
             self.table_hint, written = write_bias_table(self._bias_file, self.table, now)
-            self.written = now
-            self._written(self._bias_file, written)
+            self.table_written_time = now
+            self._note_written(self._bias_file, written)
         except OSError as error:
-            self.table.not_kept(now)
-            self.table_hint = plain(f'the bias table cannot be written ({reason(error)}): '
-                                    f'{remedy(error, self._bias_file)}')
+            self.table.mark_write_failed(now)
+            self.table_hint = to_printable('the bias table cannot be written '
+                                           f'({describe_error(error)}): '
+                                           f'{remedy(error, self._bias_file)}')
 
 
-def _fault(stored: GyroModel, model: GyroModel) -> str:
+def _describe_mismatch(stored: GyroModel, model: GyroModel) -> str:
     """Return why a stored self-calibration does not fit a model; '' if it does."""
     if stored.self_calibration is None:
         return 'the file has none; it may be truncated'
-    if not same_effects(stored, model):
+    if not have_same_effects(stored, model):
         return 'it belongs to another model'
     theirs, ours = (each.gyro.get('serial_number', '') for each in (stored, model))
     if theirs == ours:
@@ -136,9 +146,9 @@ def _fault(stored: GyroModel, model: GyroModel) -> str:
     return f'it belongs to {of}, and the model to {ours or "one without"}'
 
 
-def _version(file: Path) -> tuple[int, int] | None:
+def _existing_version(file: Path) -> tuple[int, int] | None:
     """Return the version of a file; None where there is none."""
     try:
-        return version(file)
+        return file_version(file)
     except OSError:
         return None

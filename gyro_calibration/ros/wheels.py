@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import math
 
 #: Largest age of a velocity that is used, s.
-FRESH = 1.0
+MAX_VELOCITY_AGE = 1.0
 #: Longest motion after the last command to move, s.
-COASTING = 0.5
+COASTING_DURATION = 0.5
 #: Largest speeds of wheels at standstill, m/s and rad/s.
-LINEAR, _ANGULAR = 0.001, 0.0002
+STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
 
 
@@ -38,10 +38,10 @@ class Velocity:
         return all(math.isfinite(part) for part in (*self.linear, *self.angular))
 
     @property
-    def moves(self) -> bool:
+    def is_moving(self) -> bool:
         """Tell whether it exceeds the speeds at standstill."""
-        return (any(abs(part) > LINEAR for part in self.linear)
-                or any(abs(part) > _ANGULAR for part in self.angular))
+        return (any(abs(part) > STANDSTILL_SPEED for part in self.linear)
+                or any(abs(part) > _STANDSTILL_RATE for part in self.angular))
 
 
 class Wheels:
@@ -51,37 +51,39 @@ class Wheels:
         """Start without velocities."""
         self._last: dict[str, tuple[float, Velocity]] = {}
         # begin of uninterrupted standstill by each source, s
-        self._standing: dict[str, float] = {}
-        self._commanded = -math.inf
+        self._standing_since: dict[str, float] = {}
+        self._last_motion_command = -math.inf
 
     def add(self, source: str, velocity: Velocity, now: float) -> None:
         """Add a velocity at its time of arrival, s; one that is not finite is ignored."""
         if not velocity.is_finite:
             return
         then, _ = self._last.get(source, (-math.inf, None))
-        if velocity.moves or now - then > FRESH:
-            self._standing[source] = now
+        if velocity.is_moving or now - then > MAX_VELOCITY_AGE:
+            self._standing_since[source] = now
         self._last[source] = now, velocity
-        if velocity.moves and source == COMMAND:
-            self._commanded = now
+        if velocity.is_moving and source == COMMAND:
+            self._last_motion_command = now
 
-    def moving(self, now: float, sources: Collection[str] = (ODOMETRY, COMMAND)) -> bool | None:
+    def is_moving(self, now: float, sources: Collection[str] = (ODOMETRY, COMMAND)) -> bool | None:
         """Return whether the robot moves by these sources; None without recent data."""
-        fresh = [velocity.moves for source, (then, velocity) in self._last.items()
-                 if source in sources and now - then <= FRESH]
+        fresh = [velocity.is_moving for source, (then, velocity) in self._last.items()
+                 if source in sources and now - then <= MAX_VELOCITY_AGE]
         if not fresh:
             return None
-        return any(fresh) or COMMAND in sources and now - self._commanded < COASTING
+        return (any(fresh)
+                or COMMAND in sources and now - self._last_motion_command < COASTING_DURATION)
 
-    def stood(self, since: float, now: float, sources: Collection[str]) -> bool:
+    def has_stood(self, since: float, now: float, sources: Collection[str]) -> bool:
         """Tell whether one of these sources has shown standstill since a time, s."""
-        return self.moving(now, sources) is False and any(
-            self._standing[source] <= since for source in sources if source in self._standing)
+        return self.is_moving(now, sources) is False and any(self._standing_since[source] <= since
+                                                             for source in sources
+                                                             if source in self._standing_since)
 
-    def turning(self, now: float) -> float:
+    def turn_rate(self, now: float) -> float:
         """Return the rate about z by odometry, rad/s; 0 without recent data."""
         then, velocity = self._last.get(ODOMETRY, (-math.inf, Velocity()))
-        return velocity.angular[2] if now - then <= FRESH else 0.0
+        return velocity.angular[2] if now - then <= MAX_VELOCITY_AGE else 0.0
 
     def age(self, now: float) -> float:
         """Return the age of the last velocity, s."""

@@ -11,9 +11,9 @@
 """
 Logs with hidden effects, made independently of the package: nothing of it is imported here.
 
-`hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE` those that
-are not in it; `twin` and `part` make the logs on which two causes are confounded, and on which
-they are distinguishable; `oracle_gain` is the improvement with the truth known.
+`hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE_CATALOGUE`
+those that are not in it; `twin` and `part` make the logs on which two causes are confounded, and
+on which they are distinguishable; `oracle_gain` is the improvement with the truth known.
 
 A size is a multiple of the minimum detectable effect beside a bias of each recording and one scale
 (`size`), with these exceptions: faults of samples are counted, and three are just detectable;
@@ -37,13 +37,15 @@ from gyro_calibration_bench.hidden.log import (
            record,
            Truth,
 )
-from gyro_calibration_bench.hidden.motion import described, Session, session
+from gyro_calibration_bench.hidden.motion import Session, session, session_from_motion
 from gyro_calibration_bench.hidden.noise import KINDS, NoiseFigures
 from gyro_calibration_bench.hidden.oracle import oracle_gain, OracleGain
-from gyro_calibration_bench.hidden.outside import OUTSIDE
-from gyro_calibration_bench.hidden.size import DETECTABLE
-from gyro_calibration_bench.hidden.twins import part, twin, TWINS
+from gyro_calibration_bench.hidden.outside import OUTSIDE_CATALOGUE
+from gyro_calibration_bench.hidden.size import DETECTION_SIGMAS
+from gyro_calibration_bench.hidden.twins import hide_look_alike, LOOK_ALIKES, record_separating
 
-__all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'TWINS', 'Cause', 'Gyro', 'HiddenLog',
-           'NoiseFigures', 'OracleGain', 'Session', 'Truth', 'described', 'draw_gyro', 'hide',
-           'oracle_gain', 'part', 'record', 'session', 'twin']
+__all__ = [
+    'ALL', 'DETECTION_SIGMAS', 'FORMS', 'KINDS', 'OUTSIDE_CATALOGUE', 'LOOK_ALIKES', 'Cause',
+    'Gyro', 'HiddenLog', 'NoiseFigures', 'OracleGain', 'Session', 'Truth', 'session_from_motion',
+    'draw_gyro', 'hide', 'oracle_gain', 'record_separating', 'record', 'session', 'hide_look_alike'
+]

@@ -12,10 +12,10 @@
 Physics of the hidden effects, as in the catalogue of effects.
 
 Symbols: w rate, psi heading, t time since power-on, T temperature, y output. Each effect is a
-`Form`: how its shapes are drawn, and what it adds for a size of its leading parameter. Forms state
-where in the chain they act: on the signal before all else ('signal'), added to it ('sum'), on the
-finished output ('output'), on the reference ('reference'), on single samples ('samples'), on the
-unit ('unit'), on the noise ('noise').
+`EffectForm`: how its shapes are drawn, and what it adds for a size of its leading parameter. Forms
+state where in the chain they act: on the signal before all else ('signal'), added to it ('sum'),
+on the finished output ('output'), on the reference ('reference'), on single samples ('samples'),
+on the unit ('unit'), on the noise ('noise').
 
 """
 
@@ -36,18 +36,18 @@ REFERENCE_SUPPLY = 5.0
 Shapes = dict[str, float]
 
 #: Effects that are findings only if a model differs from them.
-AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk',
-                   'bias_instability', 'rate_random_walk')
+MODEL_FINDINGS = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk',
+                  'bias_instability', 'rate_random_walk')
 #: Counted effects, and the number that is just detectable: more than occur by chance.
-COUNTED = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
+COUNTED_FAULTS = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
 #: Quantization, whose added variance is just detectable by a test of the variance.
-STEPPED = ('quantization', 'reference_quantization')
+STEP_EFFECTS = ('quantization', 'reference_quantization')
 #: Effects without a column.
-WITHOUT_COLUMN = {*AGAINST_A_MODEL, *COUNTED, *STEPPED, 'unit_error'}
+WITHOUT_COLUMN = {*MODEL_FINDINGS, *COUNTED_FAULTS, *STEP_EFFECTS, 'unit_error'}
 
 
 @dataclass(frozen=True)
-class Form:
+class EffectForm:
     """
     How an effect is drawn and what it adds.
 
@@ -58,10 +58,10 @@ class Form:
     unit : of the leading parameter, which is named like the effect
     shapes : (sessions, generator) -> the other parameters
     stage : where it acts
-    linear : the error is in proportion to the size
-    signed : the size may be negative
-    most : (sessions) -> the largest reasonable size
-    once : it is in one of several recordings only; `shapes` has its number as 'run'
+    is_linear : the error is in proportion to the size
+    is_signed : the size may be negative
+    max_size : (sessions) -> the largest reasonable size
+    is_single_event : it is in one of several recordings only; `shapes` has its number as 'run'
 
     """
 
@@ -69,10 +69,10 @@ class Form:
     unit: str
     shapes: Callable[[list[Session], np.random.Generator], Shapes] = lambda sessions, generator: {}
     stage: str = 'sum'
-    linear: bool = True
-    signed: bool = True
-    most: Callable[[list[Session]], float] = lambda sessions: math.inf
-    once: bool = False
+    is_linear: bool = True
+    is_signed: bool = True
+    max_size: Callable[[list[Session]], float] = lambda sessions: math.inf
+    is_single_event: bool = False
 
 
 def top_rate(sessions: list[Session]) -> float:
@@ -84,29 +84,29 @@ def _log_uniform(generator: np.random.Generator, low: float, high: float) -> flo
     return math.exp(generator.uniform(math.log(low), math.log(high)))
 
 
-def _column(formula: Callable[[Session, np.ndarray, Shapes], np.ndarray]) -> Callable[[
+def _linear_error(formula: Callable[[Session, np.ndarray, Shapes], np.ndarray]) -> Callable[[
         Session, np.ndarray, float, Shapes], np.ndarray]:
     return lambda session, w, size, shapes: size * formula(session, w, shapes)
 
 
-def _phase(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+def _draw_phase(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     return {'phase': generator.uniform(-math.pi, math.pi)}
 
 
-def _time_constant(low: float, high: float) -> Callable[[list[Session], np.random.Generator],
-                                                        Shapes]:
+def _time_constant_drawer(low: float,
+                          high: float) -> Callable[[list[Session], np.random.Generator], Shapes]:
     def draw(sessions: list[Session], generator: np.random.Generator) -> Shapes:
         duration = sessions[0].time[-1]
         return {'time_constant': _log_uniform(generator, low * duration, high * duration)}
     return draw
 
 
-def _frequency(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+def _draw_tone(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     return {'frequency': _log_uniform(generator, 0.2, 0.45 / sessions[0].interval),
-            **_phase(sessions, generator)}
+            **_draw_phase(sessions, generator)}
 
 
-def _step_time(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+def _draw_step_time(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     run = int(generator.integers(len(sessions)))
     return {'run': run, 'step_time': float(generator.uniform(0.15, 0.85) * sessions[run].time[-1])}
 
@@ -116,7 +116,7 @@ def temperature_rate(session: Session) -> np.ndarray:
     return np.gradient(session.temperature, session.interval)
 
 
-def branch(session: Session, threshold: float = 5e-4) -> np.ndarray:
+def thermal_branch(session: Session, threshold: float = 5e-4) -> np.ndarray:
     """Return +1 while heating, -1 while cooling; below the threshold, K/s, the last; 0 before."""
     speed = temperature_rate(session)
     known = np.where(np.abs(speed) > threshold, np.arange(len(speed)), -1)
@@ -129,20 +129,21 @@ def vibration_power(session: Session) -> np.ndarray:
     return uniform_filter1d(session.vibration ** 2, round(1.0 / session.interval))
 
 
-def _sine(session: Session, w: np.ndarray, k: float, shapes: Shapes) -> np.ndarray:
+def _sine_error(session: Session, w: np.ndarray, k: float, shapes: Shapes) -> np.ndarray:
     return np.sin(k * w) / k - w
 
 
-def _dead_zone(session: Session, w: np.ndarray, half_width: float, shapes: Shapes) -> np.ndarray:
+def _dead_zone_error(session: Session, w: np.ndarray, half_width: float,
+                     shapes: Shapes) -> np.ndarray:
     return np.where(np.abs(w) < half_width, -w, 0.0)
 
 
-def _saturation(session: Session, w: np.ndarray, limit: float, shapes: Shapes) -> np.ndarray:
+def _saturation_error(session: Session, w: np.ndarray, limit: float, shapes: Shapes) -> np.ndarray:
     return np.clip(w, -limit, limit) - w
 
 
-def seen(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0,
-         bandwidth: float = 0.0) -> np.ndarray:
+def sensed_rate(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0,
+                bandwidth: float = 0.0) -> np.ndarray:
     """Return the rate that a gyro with delay, bandwidth and clock rate error senses."""
     if not bandwidth:
         return session.motion.rate((1.0 + clock_rate) * session.time - time_offset)
@@ -152,11 +153,11 @@ def seen(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0,
     return lag(rate, session.interval / finer, bandwidth)[::finer]
 
 
-def _signal(name: str) -> Callable[[Session, np.ndarray, float, Shapes], np.ndarray]:
-    return lambda session, w, size, shapes: seen(session, **{name: size}) - session.rate
+def _signal_error(name: str) -> Callable[[Session, np.ndarray, float, Shapes], np.ndarray]:
+    return lambda session, w, size, shapes: sensed_rate(session, **{name: size}) - session.rate
 
 
-def _slips(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+def _draw_slips(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     """Draw one to three moments of strong acceleration, at least a second apart."""
     run = int(generator.integers(len(sessions)))
     session = sessions[run]
@@ -168,13 +169,13 @@ def _slips(sessions: list[Session], generator: np.random.Generator) -> Shapes:
             **{f'slip_time_{number}': float(at) for number, at in enumerate(kept)}}
 
 
-def _slip(session: Session, shapes: Shapes) -> np.ndarray:
+def _slip_rate(session: Session, shapes: Shapes) -> np.ndarray:
     """Return the rate of slips by 1 rad each, smooth in time, rad/s."""
     return np.sum([norm.pdf(session.time, at, shapes['width']) for at in _slip_times(shapes)],
                   axis=0)
 
 
-def slipped(session: Session, shapes: Shapes) -> np.ndarray:
+def slip_angle(session: Session, shapes: Shapes) -> np.ndarray:
     """Return the integral of the rate of slips by 1 rad each, rad."""
     return np.sum([norm.cdf(session.time, at, shapes['width']) for at in _slip_times(shapes)],
                   axis=0)
@@ -184,86 +185,97 @@ def _slip_times(shapes: Shapes) -> list[float]:
     return [value for name, value in shapes.items() if name.startswith('slip_time')]
 
 
-def _eccentric(session: Session, shapes: Shapes) -> np.ndarray:
+def _eccentricity_rate(session: Session, shapes: Shapes) -> np.ndarray:
     return session.rate * np.sin(session.heading + shapes['phase'])
 
 
-def _samples(session: Session, w: np.ndarray, size: float, shapes: Shapes) -> np.ndarray:
+def _no_column(session: Session, w: np.ndarray, size: float, shapes: Shapes) -> np.ndarray:
     raise NotImplementedError('faults of samples have no column')
 
 
-FORMS: Mapping[str, Form] = {
-    'bias': Form(_column(lambda session, w, shapes: np.ones_like(w)), 'rad/s'),
-    'scale_factor_error': Form(_column(lambda session, w, shapes: w), '1'),
-    'scale_factor_asymmetry': Form(_column(lambda session, w, shapes: np.abs(w)), '1'),
-    'quadratic_nonlinearity': Form(_column(lambda session, w, shapes: w ** 2), 's/rad'),
-    'cubic_nonlinearity': Form(_column(lambda session, w, shapes: w ** 3), 's²/rad²'),
-    'sine_response': Form(_sine, 's', linear=False, signed=False,
-                          most=lambda sessions: 1.5 / top_rate(sessions)),
-    'bias_temperature': Form(_column(lambda session, w, shapes: session.temperature
-                                     - REFERENCE_TEMPERATURE), 'rad/s/K'),
-    'bias_temperature_quadratic': Form(
-        _column(lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) ** 2),
-        'rad/s/K²'),
-    'scale_factor_temperature': Form(_column(
-        lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) * w), '1/K'),
-    'bias_temperature_rate': Form(_column(lambda session, w, shapes: temperature_rate(session)),
-                                  'rad/s/(K/s)'),
-    'thermal_lag': Form(_column(lambda session, w, shapes: lag(
-        session.temperature, session.interval, shapes['time_constant']) - session.temperature),
-                        'rad/s/K', _time_constant(0.03, 0.3)),
-    'thermal_hysteresis': Form(_column(lambda session, w, shapes: branch(session)), 'rad/s'),
-    'warm_up': Form(
-        _column(lambda session, w, shapes: np.exp(-session.time / shapes['time_constant'])),
-        'rad/s', _time_constant(0.03, 0.35)),
-    'rate_ramp': Form(_column(lambda session, w, shapes: session.time), 'rad/s²'),
-    'bias_step': Form(
-        _column(lambda session, w, shapes: (session.time >= shapes['step_time']).astype(float)),
-        'rad/s', _step_time, once=True),
-    'heading_sensitivity': Form(_column(
-        lambda session, w, shapes: np.sin(session.heading + shapes['phase'])), 'rad/s', _phase),
-    'acceleration_sensitivity': Form(_column(lambda session, w, shapes: session.specific_force),
-                                     '(rad/s)/(m/s²)'),
-    'vibration_rectification': Form(_column(lambda session, w, shapes: vibration_power(session)),
-                                    '(rad/s)/(m/s²)²'),
-    'supply_sensitivity': Form(
-        _column(lambda session, w, shapes: session.supply - REFERENCE_SUPPLY), 'rad/s/V'),
-    'interference_tone': Form(_column(lambda session, w, shapes: np.sin(
-        2.0 * math.pi * shapes['frequency'] * session.time + shapes['phase'])),
-                              'rad/s', _frequency, signed=False),
-    'bandwidth': Form(_signal('bandwidth'), 's', stage='signal', linear=False, signed=False,
-                      most=lambda sessions: 1.0),
-    'time_offset': Form(_signal('time_offset'), 's', stage='signal', linear=False,
-                        most=lambda sessions: 0.5),
-    'clock_rate': Form(_signal('clock_rate'), '1', stage='signal', linear=False,
-                       most=lambda sessions: 0.01),
-    'dead_zone': Form(_dead_zone, 'rad/s', linear=False, signed=False,
-                      most=lambda sessions: 0.3 * top_rate(sessions)),
-    'saturation': Form(_saturation, 'rad/s', stage='output', linear=False, signed=False,
-                       most=top_rate),
-    'quantization': Form(_samples, 'rad/s', stage='output', signed=False),
-    'outliers': Form(_samples, '1', stage='samples', signed=False),
-    'stuck_samples': Form(_samples, '1', stage='samples', signed=False),
-    'dropped_samples': Form(_samples, '1', stage='samples', signed=False),
-    'reference_once_per_rev': Form(
-        lambda session, w, size, shapes: -size * _eccentric(session, shapes), '1', _phase,
-        stage='reference', signed=False),
-    'reference_scale': Form(lambda session, w, size, shapes: -size * session.rate, '1',
-                            stage='reference'),
-    'reference_slip': Form(lambda session, w, size, shapes: -size * _slip(session, shapes), 'rad',
-                           _slips, stage='reference', once=True),
-    'reference_quantization': Form(_samples, 'rad', stage='reference', signed=False),
-    'unit_error': Form(_samples, '1', stage='unit', signed=False),
-    'angle_random_walk': Form(_samples, 'rad/√s', stage='noise'),
-    'bias_instability': Form(_samples, 'rad/s', stage='noise', signed=False),
-    'rate_random_walk': Form(_samples, 'rad/s/√s', stage='noise', signed=False),
+FORMS: Mapping[str, EffectForm] = {
+    'bias': EffectForm(_linear_error(lambda session, w, shapes: np.ones_like(w)), 'rad/s'),
+    'scale_factor_error': EffectForm(_linear_error(lambda session, w, shapes: w), '1'),
+    'scale_factor_asymmetry': EffectForm(_linear_error(lambda session, w, shapes: np.abs(w)), '1'),
+    'quadratic_nonlinearity': EffectForm(_linear_error(lambda session, w, shapes: w ** 2),
+                                         's/rad'),
+    'cubic_nonlinearity': EffectForm(_linear_error(lambda session, w, shapes: w ** 3), 's²/rad²'),
+    'sine_response': EffectForm(_sine_error, 's', is_linear=False, is_signed=False,
+                                max_size=lambda sessions: 1.5 / top_rate(sessions)),
+    'bias_temperature': EffectForm(
+        _linear_error(lambda session, w, shapes: session.temperature - REFERENCE_TEMPERATURE),
+        'rad/s/K'),
+    'bias_temperature_quadratic': EffectForm(
+        _linear_error(lambda session, w, shapes:
+                      (session.temperature - REFERENCE_TEMPERATURE) ** 2), 'rad/s/K²'),
+    'scale_factor_temperature': EffectForm(
+        _linear_error(lambda session, w, shapes:
+                      (session.temperature - REFERENCE_TEMPERATURE) * w), '1/K'),
+    'bias_temperature_rate': EffectForm(
+        _linear_error(lambda session, w, shapes: temperature_rate(session)), 'rad/s/(K/s)'),
+    'thermal_lag': EffectForm(
+        _linear_error(lambda session, w, shapes: lag(session.temperature, session.interval, shapes[
+            'time_constant']) - session.temperature), 'rad/s/K', _time_constant_drawer(0.03, 0.3)),
+    'thermal_hysteresis': EffectForm(
+        _linear_error(lambda session, w, shapes: thermal_branch(session)), 'rad/s'),
+    'warm_up': EffectForm(
+        _linear_error(lambda session, w, shapes: np.exp(-session.time / shapes['time_constant'])),
+        'rad/s', _time_constant_drawer(0.03, 0.35)),
+    'rate_ramp': EffectForm(_linear_error(lambda session, w, shapes: session.time), 'rad/s²'),
+    'bias_step': EffectForm(
+        _linear_error(lambda session, w, shapes:
+                      (session.time >= shapes['step_time']).astype(float)), 'rad/s',
+        _draw_step_time, is_single_event=True),
+    'heading_sensitivity': EffectForm(
+        _linear_error(lambda session, w, shapes: np.sin(session.heading + shapes['phase'])),
+        'rad/s', _draw_phase),
+    'acceleration_sensitivity': EffectForm(
+        _linear_error(lambda session, w, shapes: session.specific_force), '(rad/s)/(m/s²)'),
+    'vibration_rectification': EffectForm(
+        _linear_error(lambda session, w, shapes: vibration_power(session)), '(rad/s)/(m/s²)²'),
+    'supply_sensitivity': EffectForm(
+        _linear_error(lambda session, w, shapes: session.supply - REFERENCE_SUPPLY), 'rad/s/V'),
+    'interference_tone': EffectForm(
+        _linear_error(lambda session, w, shapes: np.sin(2.0 * math.pi * shapes[
+            'frequency'] * session.time + shapes['phase'])), 'rad/s', _draw_tone, is_signed=False),
+    'bandwidth': EffectForm(_signal_error('bandwidth'), 's', stage='signal', is_linear=False,
+                            is_signed=False, max_size=lambda sessions: 1.0),
+    'time_offset': EffectForm(_signal_error('time_offset'), 's', stage='signal', is_linear=False,
+                              max_size=lambda sessions: 0.5),
+    'clock_rate': EffectForm(_signal_error('clock_rate'), '1', stage='signal', is_linear=False,
+                             max_size=lambda sessions: 0.01),
+    'dead_zone': EffectForm(_dead_zone_error, 'rad/s', is_linear=False, is_signed=False,
+                            max_size=lambda sessions: 0.3 * top_rate(sessions)),
+    'saturation': EffectForm(_saturation_error, 'rad/s', stage='output', is_linear=False,
+                             is_signed=False, max_size=top_rate),
+    'quantization': EffectForm(_no_column, 'rad/s', stage='output', is_signed=False),
+    'outliers': EffectForm(_no_column, '1', stage='samples', is_signed=False),
+    'stuck_samples': EffectForm(_no_column, '1', stage='samples', is_signed=False),
+    'dropped_samples': EffectForm(_no_column, '1', stage='samples', is_signed=False),
+    'reference_once_per_rev': EffectForm(
+        lambda session, w, size, shapes: -size * _eccentricity_rate(session, shapes), '1',
+        _draw_phase, stage='reference', is_signed=False),
+    'reference_scale': EffectForm(lambda session, w, size, shapes: -size * session.rate, '1',
+                                  stage='reference'),
+    'reference_slip': EffectForm(
+        lambda session, w, size, shapes: -size * _slip_rate(session, shapes), 'rad', _draw_slips,
+        stage='reference', is_single_event=True),
+    'reference_quantization': EffectForm(_no_column, 'rad', stage='reference', is_signed=False),
+    'unit_error': EffectForm(_no_column, '1', stage='unit', is_signed=False),
+    'angle_random_walk': EffectForm(_no_column, 'rad/√s', stage='noise'),
+    'bias_instability': EffectForm(_no_column, 'rad/s', stage='noise', is_signed=False),
+    'rate_random_walk': EffectForm(_no_column, 'rad/s/√s', stage='noise', is_signed=False),
 }
 
 
-def errors(form: Form, size: float, shapes: Shapes, sessions: list[Session]) -> list[np.ndarray]:
+def effect_errors(form: EffectForm, size: float, shapes: Shapes,
+                  sessions: list[Session]) -> list[np.ndarray]:
     """Return the addition of an effect to output less reference of each recording, rad/s."""
-    return [form.error(each, each.rate, size, shapes) if not form.once or shapes['run'] == run
-            else np.zeros(len(each.time)) for run, each in enumerate(sessions)]
+    return [
+        form.error(each, each.rate, size, shapes)
+        if not form.is_single_event or shapes['run'] == run else np.zeros(len(each.time))
+        for run, each in enumerate(sessions)
+    ]
 
 
 #: What a wrong unit multiplies the output by; and delays, in samples.

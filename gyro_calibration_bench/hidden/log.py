@@ -28,14 +28,14 @@ from pathlib import Path
 from typing import Any
 
 from gyro_calibration_bench.hidden.effects import (
-    COUNTED,
-    errors,
-    Form,
+    COUNTED_FAULTS,
+    effect_errors,
+    EffectForm,
     FORMS,
-    seen,
+    sensed_rate,
     Shapes,
-    slipped,
-    STEPPED,
+    slip_angle,
+    STEP_EFFECTS,
     top_rate,
     UNIT_DELAYS,
     UNIT_FACTORS,
@@ -43,19 +43,24 @@ from gyro_calibration_bench.hidden.effects import (
 )
 from gyro_calibration_bench.hidden.likeness import Likeness
 from gyro_calibration_bench.hidden.motion import Session, session
-from gyro_calibration_bench.hidden.noise import draw_figures, make, NoiseFigures
-from gyro_calibration_bench.hidden.outside import OUTSIDE
-from gyro_calibration_bench.hidden.size import DETECTABLE, Metric, solve_noise, solve_size
+from gyro_calibration_bench.hidden.noise import draw_figures, generate_noise, NoiseFigures
+from gyro_calibration_bench.hidden.outside import OUTSIDE_CATALOGUE
+from gyro_calibration_bench.hidden.size import (
+    DETECTION_SIGMAS,
+    InformationMetric,
+    solve_noise,
+    solve_size,
+)
 import numpy as np
 
 #: Recordings -> name of an effect -> what of it is not to be random.
-Given = Callable[[list[Session]], Mapping[str, Shapes]]
-ALL: Mapping[str, Form] = {**FORMS, **OUTSIDE}
+FixedParts = Callable[[list[Session]], Mapping[str, Shapes]]
+ALL: Mapping[str, EffectForm] = {**FORMS, **OUTSIDE_CATALOGUE}
 #: Largest share of an outside effect that one in the catalogue may explain, and draws for that.
-MOST_ALIKE = 0.25
-DRAWS = 30
+MAX_LIKENESS = 0.25
+MAX_DRAWS = 30
 #: Bias of a gyro and its power-on to power-on scatter, rad/s, and the largest scale factor error.
-BIAS, BIAS_SPREAD, SCALE = 3e-3, 3e-4, 0.02
+BIAS_DEVIATION, BIAS_SPREAD, MAX_SCALE_FACTOR_ERROR = 3e-3, 3e-4, 0.02
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ class Cause:
     @property
     def standard_deviation(self) -> float:
         """Least standard deviation of an estimate of the size, if the effect is linear in it."""
-        return self.minimum_detectable / DETECTABLE
+        return self.minimum_detectable / DETECTION_SIGMAS
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -130,7 +135,7 @@ class Gyro:
         return (self.biases[run] if run < len(self.biases)
                 else float(generator.normal(np.mean(self.biases), self.bias_spread)))
 
-    def value(self, name: str) -> float:
+    def size_of(self, name: str) -> float:
         """Return the size of a hidden effect, 0 where it is not hidden."""
         return next((cause.size for cause in self.causes if cause.name == name), 0.0)
 
@@ -153,11 +158,11 @@ class Truth:
         angle_random_walk, bias_instability, rate_random_walk, in SI; for effects that are findings
         only against a model
     rate, heading : true, rad/s and rad, at the rows of the log
-    added : by all effects, bias and scale included, to the true rate; without noise, rad/s
+    added_rate : by all effects, bias and scale included, to the true rate; without noise, rad/s
     reference : rate that the reference states, rad/s
     noise : the noise that was added, rad/s
     prediction : the output predicted with all but the noise known, rad/s
-    good : False at rows whose sample is an outlier or repeated
+    is_good : False at rows whose sample is an outlier or repeated
 
     """
 
@@ -168,11 +173,11 @@ class Truth:
     expected: Mapping[str, float]
     rate: np.ndarray
     heading: np.ndarray
-    added: np.ndarray
+    added_rate: np.ndarray
     reference: np.ndarray
     noise: np.ndarray
     prediction: np.ndarray
-    good: np.ndarray
+    is_good: np.ndarray
 
     def __getitem__(self, name: str) -> Cause:
         return next(cause for cause in self.gyro.causes if cause.name == name)
@@ -202,13 +207,14 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float],
          reference: str = 'rate', duration: float = 900.0, sample_rate: float = 50.0,
          runs: int = 1, encoder_step: float = 0.0,
          figures: NoiseFigures | None = None, conditions: Mapping[str, Any] | None = None,
-         given: Given | None = None, against_a_model: bool = False) -> list[HiddenLog]:
+         fixed_parts: FixedParts | None = None, against_a_model: bool = False) -> list[HiddenLog]:
     """
     Hide effects in recordings of a random gyro under random conditions.
 
     Parameters
     ----------
-    names : of effects in `FORMS` or `OUTSIDE`; without any, bias, scale error and noise alone
+    names : of effects in `FORMS` or `OUTSIDE_CATALOGUE`; without any, bias, scale error and noise
+        alone
     multiple : of the minimum detectable effect, one for all or by name
     generator : source of all that is random
     noise : white, walk, flicker, gauss_markov or mixed (random walk, Gauss-Markov process, and
@@ -219,7 +225,7 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float],
     encoder_step : of a reference heading, rad; 0 is a heading without steps
     figures : the noise instead of a random one
     conditions : words for `session`: motion, temperature, supply, force, top_rate
-    given : recordings -> name of an effect -> its parts that are not random: its shapes, its
+    fixed_parts : recordings -> name of an effect -> its parts that are not random: its shapes, its
         'sign', or its 'size' in SI, which determines the multiple
     against_a_model : a model with bias and scale is known, so that they hide nothing
 
@@ -231,16 +237,17 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float],
     sessions = [session(generator, duration, sample_rate, **(conditions or {}))
                 for _ in range(runs)]
     expected = figures or draw_figures(noise, generator)
-    gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step, given(sessions)
-                     if given else {}, ('bias', 'scale') if against_a_model else ())
+    gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step,
+                     fixed_parts(sessions) if fixed_parts else {},
+                     ('bias', 'scale') if against_a_model else ())
     return [record(gyro, each, generator, expected=expected, reference=reference,
                    encoder_step=encoder_step, run=run) for run, each in enumerate(sessions)]
 
 
 def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float],
               generator: np.random.Generator, sessions: list[Session], expected: NoiseFigures,
-              encoder_step: float = 0.0, given: Mapping[str, Shapes] | None = None,
-              known: tuple[str, ...] = ()) -> Gyro:
+              encoder_step: float = 0.0, fixed_parts: Mapping[str, Shapes] | None = None,
+              known_nuisances: tuple[str, ...] = ()) -> Gyro:
     """Draw a gyro whose hidden effects have these multiples of the minimum detectable effect."""
     multiples = dict.fromkeys(names, multiple) if not isinstance(multiple, Mapping) else multiple
     figures, causes = expected, []
@@ -248,16 +255,18 @@ def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float],
         if FORMS.get(name) and FORMS[name].stage == 'noise':
             cause, figures = _draw_noise(name, multiples[name], generator, sessions, figures)
             causes.append(cause)
-    biases = generator.normal(generator.normal(0.0, BIAS), BIAS_SPREAD, len(sessions))
-    scale = generator.uniform(-SCALE, SCALE)
+    biases = generator.normal(generator.normal(0.0, BIAS_DEVIATION), BIAS_SPREAD, len(sessions))
+    scale = generator.uniform(-MAX_SCALE_FACTOR_ERROR, MAX_SCALE_FACTOR_ERROR)
     if 'unit_error' in names:  # a scale factor error would be taken for a part of it
         scale, biases = 0.0, 0.0 * biases
     gyro = Gyro((), figures, scale, tuple(biases.tolist()), BIAS_SPREAD)
-    metric = Metric(sessions, figures, encoder_step)
-    sizing = _Sizing(sessions, gyro, metric, known)
-    causes += [_draw_cause(name, multiples[name], generator, sizing, (given or {}).get(name, {}))
-               for name in names if ALL[name].stage != 'noise']
-    return replace(gyro, causes=_apart(causes, sizing))
+    metric = InformationMetric(sessions, figures, encoder_step)
+    sizing = _Sizing(sessions, gyro, metric, known_nuisances)
+    causes += [
+        _draw_cause(name, multiples[name], generator, sizing, (fixed_parts or {}).get(name, {}))
+        for name in names if ALL[name].stage != 'noise'
+    ]
+    return replace(gyro, causes=_with_remaining_multiples(causes, sizing))
 
 
 @dataclass(frozen=True)
@@ -266,13 +275,13 @@ class _Sizing:
 
     sessions: list[Session]
     gyro: Gyro
-    metric: Metric
-    known: tuple[str, ...]
+    metric: InformationMetric
+    known_nuisances: tuple[str, ...]
 
     def errors(self, name: str, size: float, shapes: Shapes) -> list[np.ndarray]:
         """Return an effect's addition to each recording, to the output after bias and scale."""
         if ALL[name].stage != 'output':
-            return errors(ALL[name], size, shapes, self.sessions)
+            return effect_errors(ALL[name], size, shapes, self.sessions)
         outputs = [(1.0 + self.gyro.scale_factor_error) * each.rate + bias
                    for each, bias in zip(self.sessions, self.gyro.biases)]
         return [ALL[name].error(each, output, size, shapes)
@@ -282,52 +291,53 @@ class _Sizing:
         """Return how many standard deviations an effect is."""
         of_the_same = {'bias': ('bias',), 'scale_factor_error': ('scale',),
                        'reference_scale': ('scale',)}.get(name, ())
-        return self.metric.norm(self.errors(name, size, shapes), (*self.known, *of_the_same))
+        return self.metric.norm(self.errors(name, size, shapes),
+                                (*self.known_nuisances, *of_the_same))
 
 
 def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing,
-                given: Shapes) -> Cause:
+                fixed_parts: Shapes) -> Cause:
     form, sessions = ALL[name], sizing.sessions
-    if name in COUNTED or name in STEPPED or name == 'unit_error':
-        return _draw_uncommon(name, multiple, generator, sizing)
-    if name in OUTSIDE:
+    if name in COUNTED_FAULTS or name in STEP_EFFECTS or name == 'unit_error':
+        return _draw_without_column(name, multiple, generator, sizing)
+    if name in OUTSIDE_CATALOGUE:
         return _draw_outside(name, multiple, generator, sizing)
-    shapes = ({key: value for key, value in given.items() if key not in ('size', 'sign')}
+    shapes = ({key: value for key, value in fixed_parts.items() if key not in ('size', 'sign')}
               or form.shapes(sessions, generator))
-    sign = given.get('sign', float(generator.choice([-1.0, 1.0])) if form.signed else 1.0)
-    if 'size' in given:
-        return Cause(name, given['size'], shapes, form.unit, math.nan,
-                     sizing.norm(name, given['size'], shapes) / DETECTABLE)
-    if form.linear:
-        least = DETECTABLE / sizing.norm(name, 1.0, shapes)
+    sign = fixed_parts.get('sign', float(generator.choice([-1.0, 1.0])) if form.is_signed else 1.0)
+    if 'size' in fixed_parts:
+        return Cause(name, fixed_parts['size'], shapes, form.unit, math.nan,
+                     sizing.norm(name, fixed_parts['size'], shapes) / DETECTION_SIGMAS)
+    if form.is_linear:
+        least = DETECTION_SIGMAS / sizing.norm(name, 1.0, shapes)
         return Cause(name, sign * multiple * least, shapes, form.unit, least, multiple)
     if name == 'saturation':
         return _draw_saturation(multiple, sizing)
-    most = form.most(sessions)
+    most = form.max_size(sessions)
 
     def norm(size: float) -> float:
         return sizing.norm(name, sign * size, shapes)
-    least = solve_size(norm, DETECTABLE, 1e-3 * most, most)
-    size = solve_size(norm, DETECTABLE * multiple, min(least * multiple, most), most)
-    return Cause(name, sign * size, shapes, form.unit, least, norm(size) / DETECTABLE)
+    least = solve_size(norm, DETECTION_SIGMAS, 1e-3 * most, most)
+    size = solve_size(norm, DETECTION_SIGMAS * multiple, min(least * multiple, most), most)
+    return Cause(name, sign * size, shapes, form.unit, least, norm(size) / DETECTION_SIGMAS)
 
 
 def _draw_outside(name: str, multiple: float, generator: np.random.Generator,
                   sizing: _Sizing) -> Cause:
     """Draw shapes until no catalogued effect explains much of it, or keep the least explained."""
-    form, likeness = OUTSIDE[name], Likeness(sizing.sessions, sizing.gyro.figures)
+    form, likeness = OUTSIDE_CATALOGUE[name], Likeness(sizing.sessions, sizing.gyro.figures)
     drawn: list[tuple[float, int, Shapes, list[np.ndarray]]] = []
-    for _ in range(DRAWS):
+    for _ in range(MAX_DRAWS):
         shapes = form.shapes(sizing.sessions, generator)
-        column = errors(form, 1.0, shapes, sizing.sessions)
-        drawn.append((max(likeness.shares(column).values()), len(drawn), shapes, column))
-        if drawn[-1][0] < MOST_ALIKE:
+        column = effect_errors(form, 1.0, shapes, sizing.sessions)
+        drawn.append((max(likeness.explained_shares(column).values()), len(drawn), shapes, column))
+        if drawn[-1][0] < MAX_LIKENESS:
             break
     share, _, shapes, column = min(drawn, key=lambda each: each[:2])
-    least = DETECTABLE / sizing.norm(name, 1.0, shapes)
+    least = DETECTION_SIGMAS / sizing.norm(name, 1.0, shapes)
     size = float(generator.choice([-1.0, 1.0])) * multiple * least
     return Cause(name, size, shapes, form.unit, least, multiple, likeness=share,
-                 likeness_of_three=likeness.together(column))
+                 likeness_of_three=likeness.joint_explained_share(column))
 
 
 def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:
@@ -337,41 +347,41 @@ def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:
 
     def norm(below: float) -> float:
         return sizing.norm('saturation', top - below, {})
-    below = solve_size(norm, DETECTABLE, 1e-3 * top, 0.9 * top)
-    further = solve_size(norm, DETECTABLE * multiple, below, 0.9 * top)
+    below = solve_size(norm, DETECTION_SIGMAS, 1e-3 * top, 0.9 * top)
+    further = solve_size(norm, DETECTION_SIGMAS * multiple, below, 0.9 * top)
     return Cause('saturation', top - further, {}, FORMS['saturation'].unit, top - below,
-                 norm(further) / DETECTABLE)
+                 norm(further) / DETECTION_SIGMAS)
 
 
-def _apart(causes: list[Cause], sizing: _Sizing) -> tuple[Cause, ...]:
+def _with_remaining_multiples(causes: list[Cause], sizing: _Sizing) -> tuple[Cause, ...]:
     """Return the causes with the multiples that are independent of the other causes."""
     shown = [cause for cause in causes if cause.name not in WITHOUT_COLUMN]
     if not shown:
         return tuple(causes)
     columns = [sizing.errors(cause.name, cause.size, cause.shapes) for cause in shown]
-    gram = sizing.metric.gram(columns, sizing.known)
+    gram = sizing.metric.gram(columns, sizing.known_nuisances)
     scale = np.sqrt(np.diag(gram))
     left = 1.0 / np.sqrt(np.diag(np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-12,
                                                 hermitian=True)))
-    apart = {cause.name: float(length * share) / DETECTABLE
+    apart = {cause.name: float(length * share) / DETECTION_SIGMAS
              for cause, length, share in zip(shown, scale, left)}
     return tuple(replace(cause, apart=apart.get(cause.name, math.nan)) for cause in causes)
 
 
-def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator,
-                   sizing: _Sizing) -> Cause:
+def _draw_without_column(name: str, multiple: float, generator: np.random.Generator,
+                         sizing: _Sizing) -> Cause:
     """Draw what has no column: counted faults, steps, and wrong units."""
     form, interval = FORMS[name], sizing.sessions[0].interval
-    if name in COUNTED:
-        return Cause(name, float(max(1, round(COUNTED[name] * multiple))), {}, form.unit,
-                     COUNTED[name], multiple)
+    if name in COUNTED_FAULTS:
+        return Cause(name, float(max(1, round(COUNTED_FAULTS[name] * multiple))), {}, form.unit,
+                     COUNTED_FAULTS[name], multiple)
     if name == 'unit_error':
         kind = str(generator.choice([*UNIT_FACTORS, *UNIT_DELAYS]))
         shapes = {'delay': UNIT_DELAYS.get(kind, 0.0) * interval}
         return Cause(name, UNIT_FACTORS.get(kind, 1.0), shapes, form.unit, math.nan, math.nan)
     count = sum(len(each.time) for each in sizing.sessions)
-    extra = (
-        DETECTABLE * math.sqrt(2.0 / count) * sizing.gyro.figures.sample_deviation(interval) ** 2)
+    extra = (DETECTION_SIGMAS * math.sqrt(2.0 / count)
+             * sizing.gyro.figures.sample_deviation(interval) ** 2)
     # a step q adds q² / 12 to the variance; differences of headings twice that / interval²
     least = (math.sqrt(12.0 * extra) if name == 'quantization'
              else math.sqrt(6.0 * extra) * interval)
@@ -382,63 +392,68 @@ def _draw_noise(name: str, multiple: float, generator: np.random.Generator,
                 sessions: list[Session], expected: NoiseFigures) -> tuple[Cause, NoiseFigures]:
     """Change a noise figure until the spectrum shows it; white noise up or down, others up."""
     start, sign = getattr(expected, name), 1.0
-    if name == 'angle_random_walk' and multiple * DETECTABLE / math.sqrt(
+    if name == 'angle_random_walk' and multiple * DETECTION_SIGMAS / math.sqrt(
             2.0 * len(sessions[0].time)) < 0.5:
         sign = float(generator.choice([-1.0, 1.0]))
 
     def changed(change: float) -> NoiseFigures:
         return replace(expected, **{name: start + sign * change})
     guess = 1e-2 * (start or expected.angle_random_walk)
-    least = solve_noise(changed, expected, DETECTABLE, sessions, guess)
-    change = solve_noise(changed, expected, DETECTABLE * multiple, sessions, least)
+    least = solve_noise(changed, expected, DETECTION_SIGMAS, sessions, guess)
+    change = solve_noise(changed, expected, DETECTION_SIGMAS * multiple, sessions, least)
     return (Cause(name, start + sign * change, {}, FORMS[name].unit, least, multiple),
             changed(change))
 
 
-def record(gyro: Gyro, each: Session, generator: np.random.Generator, *,
+def record(gyro: Gyro, conditions: Session, generator: np.random.Generator, *,
            expected: NoiseFigures | None = None, reference: str = 'rate',
            encoder_step: float = 0.0, run: int = 0) -> HiddenLog:
     """Record a gyro under a session's conditions, perhaps not those its effects were sized for."""
     bias = gyro.bias_of(run, generator)
     delay = next((cause.shapes['delay'] for cause in gyro.causes if cause.name == 'unit_error'),
                  0.0)
-    w = seen(each, gyro.value('time_offset') + delay, gyro.value('clock_rate'),
-             gyro.value('bandwidth'))
-    prediction = w + _sum(gyro, each, w, bias, run)
-    white, slow = make(gyro.figures, len(w), each.interval, generator)
-    output, wanted = _finish(gyro, prediction + white + slow), _finish(gyro, prediction)
-    reference_rate, reference_heading = _reference(gyro, each, run)
-    columns = {'time_s': each.time, 'gyro_rad_s': output, **_conditions(each, generator)}
+    w = sensed_rate(conditions, gyro.size_of('time_offset') + delay, gyro.size_of('clock_rate'),
+                    gyro.size_of('bandwidth'))
+    prediction = w + _sum_of_errors(gyro, conditions, w, bias, run)
+    white, slow = generate_noise(gyro.figures, len(w), conditions.interval, generator)
+    output, wanted = (_finish_output(gyro,
+                                     prediction + white + slow), _finish_output(gyro, prediction))
+    reference_rate, reference_heading = _stated_reference(gyro, conditions, run)
+    columns = {
+        'time_s': conditions.time,
+        'gyro_rad_s': output,
+        **_measured_conditions(conditions, generator)
+    }
     columns |= _reference_columns(gyro, reference_rate, reference_heading, reference, encoder_step)
-    columns, good, kept = _faults(gyro, columns, generator, each)
+    columns, good, kept = _add_sample_faults(gyro, columns, generator, conditions)
     rows = np.flatnonzero(kept)
     truth = Truth(gyro, tuple(cause.name for cause in gyro.causes), bias, gyro.scale_factor_error,
-                  _expected(gyro, bias, expected), each.rate[rows], each.heading[rows],
-                  (prediction - each.rate)[rows], reference_rate[rows], (white + slow)[rows],
-                  wanted[rows], good[rows])
-    return HiddenLog(columns, truth, each)
+                  _expected_model(gyro, bias, expected), conditions.rate[rows],
+                  conditions.heading[rows], (prediction - conditions.rate)[rows],
+                  reference_rate[rows], (white + slow)[rows], wanted[rows], good[rows])
+    return HiddenLog(columns, truth, conditions)
 
 
-def _sum(gyro: Gyro, each: Session, w: np.ndarray, bias: float, run: int) -> np.ndarray:
+def _sum_of_errors(gyro: Gyro, each: Session, w: np.ndarray, bias: float, run: int) -> np.ndarray:
     """Return what adds to the resulting rate, without noise, rad/s."""
     total = bias + gyro.scale_factor_error * w
     for cause in gyro.causes:
         form = ALL[cause.name]
-        if form.stage == 'sum' and not (form.once and cause.shapes['run'] != run):
+        if form.stage == 'sum' and not (form.is_single_event and cause.shapes['run'] != run):
             total = total + form.error(each, w, cause.size, cause.shapes)
     return total
 
 
-def _finish(gyro: Gyro, signal: np.ndarray) -> np.ndarray:
+def _finish_output(gyro: Gyro, signal: np.ndarray) -> np.ndarray:
     """Clip, round, and take the wrong unit."""
     if gyro.has('saturation'):
-        signal = np.clip(signal, -gyro.value('saturation'), gyro.value('saturation'))
+        signal = np.clip(signal, -gyro.size_of('saturation'), gyro.size_of('saturation'))
     if gyro.has('quantization'):
-        signal = np.round(signal / gyro.value('quantization')) * gyro.value('quantization')
-    return signal * gyro.value('unit_error') if gyro.has('unit_error') else signal
+        signal = np.round(signal / gyro.size_of('quantization')) * gyro.size_of('quantization')
+    return signal * gyro.size_of('unit_error') if gyro.has('unit_error') else signal
 
 
-def _reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndarray]:
+def _stated_reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndarray]:
     """Return rate and heading stated by the reference, true or wrong, without encoder steps."""
     rate, heading = each.rate, each.heading
     for cause in gyro.causes:
@@ -448,25 +463,25 @@ def _reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndar
         if cause.name == 'reference_scale':
             heading = heading + cause.size * each.heading
         form = ALL[cause.name]
-        if form.stage == 'reference' and cause.name not in STEPPED and not (
-                form.once and cause.shapes['run'] != run):
+        if form.stage == 'reference' and cause.name not in STEP_EFFECTS and not (
+                form.is_single_event and cause.shapes['run'] != run):
             wrong = -form.error(each, each.rate, cause.size, cause.shapes)
             rate = rate + wrong
             if cause.name == 'reference_slip':
-                heading = heading + cause.size * slipped(each, cause.shapes)
+                heading = heading + cause.size * slip_angle(each, cause.shapes)
     return rate, heading
 
 
 def _reference_columns(gyro: Gyro, rate: np.ndarray, heading: np.ndarray, kind: str,
                        encoder_step: float) -> dict[str, np.ndarray]:
-    step = gyro.value('reference_quantization') or encoder_step
+    step = gyro.size_of('reference_quantization') or encoder_step
     if step:
         return {'reference_heading_rad': np.round(heading / step) * step}
     both = {'reference_rate_rad_s': rate, 'reference_heading_rad': heading}
     return {name: column for name, column in both.items() if kind == 'both' or kind in name}
 
 
-def _conditions(each: Session, generator: np.random.Generator) -> dict[str, np.ndarray]:
+def _measured_conditions(each: Session, generator: np.random.Generator) -> dict[str, np.ndarray]:
     """Return the other measurements; the thermometer has fine steps, or some noise, or neither."""
     temperature = each.temperature
     kind = generator.integers(4)
@@ -483,24 +498,24 @@ def _conditions(each: Session, generator: np.random.Generator) -> dict[str, np.n
             'moving': each.moving.astype(float)}
 
 
-def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Generator,
-            each: Session) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+def _add_sample_faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Generator,
+                       each: Session) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Make outliers, repeats and gaps; return the columns, good true rows, and kept rows."""
     output = columns['gyro_rad_s'].copy()
     count = len(output)
     good, kept = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
     if gyro.has('outliers'):
-        rows = generator.choice(count, int(gyro.value('outliers')), replace=False)
+        rows = generator.choice(count, int(gyro.size_of('outliers')), replace=False)
         size = gyro.figures.sample_deviation(each.interval) * generator.uniform(10.0, 40.0,
                                                                                 len(rows))
         output[rows] += size * generator.choice([-1.0, 1.0], len(rows))
         good[rows] = False
     if gyro.has('stuck_samples'):
-        for start in _turning_rows(each, int(gyro.value('stuck_samples')), generator):
+        for start in _turning_rows(each, int(gyro.size_of('stuck_samples')), generator):
             repeated = slice(start + 1, start + int(generator.integers(4, 20)))
             output[repeated], good[repeated] = output[start], False
     if gyro.has('dropped_samples'):
-        for start in _turning_rows(each, int(gyro.value('dropped_samples')), generator):
+        for start in _turning_rows(each, int(gyro.size_of('dropped_samples')), generator):
             kept[start:start + int(generator.integers(1, 6))] = False
     columns = {**columns, 'gyro_rad_s': output}
     return {name: column[kept] for name, column in columns.items()}, good, kept
@@ -519,9 +534,13 @@ def _turning_rows(each: Session, count: int, generator: np.random.Generator,
     return chosen
 
 
-def _expected(gyro: Gyro, bias: float, expected: NoiseFigures | None) -> dict[str, float]:
+def _expected_model(gyro: Gyro, bias: float, expected: NoiseFigures | None) -> dict[str, float]:
     """Return the values of a model without the hidden effects."""
     figures = expected or gyro.figures
-    return {'bias': bias, 'scale_factor_error': gyro.scale_factor_error,
-            'angle_random_walk': figures.angle_random_walk,
-            'bias_instability': figures.floor, 'rate_random_walk': figures.rate_random_walk}
+    return {
+        'bias': bias,
+        'scale_factor_error': gyro.scale_factor_error,
+        'angle_random_walk': figures.angle_random_walk,
+        'bias_instability': figures.equivalent_floor,
+        'rate_random_walk': figures.rate_random_walk
+    }

@@ -21,7 +21,7 @@ from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter1d
 
 #: Knots of the rate, s. A cubic B-spline through them is zero at rest, and its integral is exact.
-KNOT = 0.05
+KNOT_INTERVAL = 0.05
 GRAVITY = 9.81
 
 
@@ -94,23 +94,24 @@ def session(generator: np.random.Generator, duration: float = 900.0, sample_rate
     """
     time = np.arange(round(duration * sample_rate)) / sample_rate
     top = np.exp(generator.uniform(np.log(1.0), np.log(5.0))) if top_rate is None else top_rate
-    turning = spline(MOTIONS[motion](generator, duration, top))
+    turning = motion_from_knots(MOTIONS[motion](generator, duration, top))
     degc = TEMPERATURES[temperature](generator, time)
-    return assemble(generator, time, turning, degc, supply, force)
+    return assemble_session(generator, time, turning, degc, supply, force)
 
 
-def described(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray,
-              temperature: np.ndarray | None = None,
-              supply: str = 'rich', force: str = 'rich') -> Session:
+def session_from_motion(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray,
+                        temperature: np.ndarray | None = None,
+                        supply: str = 'rich', force: str = 'rich') -> Session:
     """Make a recording of a given motion and temperature at evenly spaced times."""
-    knots = np.interp(np.arange(time[0], time[-1] + KNOT, KNOT), time, rate)
+    knots = np.interp(np.arange(time[0], time[-1] + KNOT_INTERVAL, KNOT_INTERVAL), time, rate)
     degc = np.full(len(time), 25.0) if temperature is None else lag(temperature, time[1] - time[0],
                                                                     5.0)
-    return assemble(generator, time - time[0], spline(knots), degc, supply, force)
+    return assemble_session(generator, time - time[0], motion_from_knots(knots), degc, supply,
+                            force)
 
 
-def assemble(generator: np.random.Generator, time: np.ndarray, motion: Motion,
-             temperature: np.ndarray, supply: str, force: str) -> Session:
+def assemble_session(generator: np.random.Generator, time: np.ndarray, motion: Motion,
+                     temperature: np.ndarray, supply: str, force: str) -> Session:
     """Add supply, tilt and vibration to a motion and a temperature."""
     rate = motion.rate(time)
     moving = gaussian_filter1d((np.abs(rate) > 1e-9).astype(float), 0.25 / time[1]) > 1e-3
@@ -119,11 +120,11 @@ def assemble(generator: np.random.Generator, time: np.ndarray, motion: Motion,
                    SUPPLIES[supply](generator, time, temperature), tilt_force, vibration, moving)
 
 
-def spline(knots: np.ndarray) -> Motion:
-    """Return the motion whose rate has these coefficients every `KNOT` s; outside, it rests."""
+def motion_from_knots(knots: np.ndarray) -> Motion:
+    """Return the motion whose rate has these coefficients every `KNOT_INTERVAL` s, else 0."""
     margin = 4
     coefficients = np.concatenate([np.zeros(margin), knots, np.zeros(margin)])
-    places = KNOT * (np.arange(len(coefficients) + 4) - margin - 2)
+    places = KNOT_INTERVAL * (np.arange(len(coefficients) + 4) - margin - 2)
     rate = BSpline(places, coefficients, 3)
     heading = rate.antiderivative()
     first, last = places[3], places[-4]
@@ -132,10 +133,10 @@ def spline(knots: np.ndarray) -> Motion:
                   lambda time: heading(np.clip(time, first, last)) - start)
 
 
-def _rich(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+def _rich_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
     """Draw pieces of all kinds between two rests until the time is full, and round the corners."""
-    count = round(duration / KNOT)
-    pieces = [_rest(generator, top, 10.0, 30.0)]
+    count = round(duration / KNOT_INTERVAL)
+    pieces = [_rest_piece(generator, top, 10.0, 30.0)]
     length = len(pieces[0])
     kinds = list(PIECES)
     while length < count:
@@ -144,113 +145,133 @@ def _rich(generator: np.random.Generator, duration: float, top: float) -> np.nda
         for number in order:
             pieces.append(PIECES[kinds[number]](generator, top))
             if generator.random() < 0.4:
-                pieces.append(_rest(generator, top))
+                pieces.append(_rest_piece(generator, top))
         length = sum(len(piece) for piece in pieces)
-    knots = gaussian_filter1d(np.concatenate(pieces)[:count], generator.uniform(0.1, 0.3) / KNOT)
-    knots[-round(5.0 / KNOT):] = 0.0
-    return gaussian_filter1d(knots, 0.1 / KNOT)
+    knots = gaussian_filter1d(
+        np.concatenate(pieces)[:count],
+        generator.uniform(0.1, 0.3) / KNOT_INTERVAL)
+    knots[-round(5.0 / KNOT_INTERVAL):] = 0.0
+    return gaussian_filter1d(knots, 0.1 / KNOT_INTERVAL)
 
 
-def _length(generator: np.random.Generator, low: float, high: float) -> int:
-    return round(generator.uniform(low, high) / KNOT)
+def _draw_length(generator: np.random.Generator, low: float, high: float) -> int:
+    return round(generator.uniform(low, high) / KNOT_INTERVAL)
 
 
-def _speed(generator: np.random.Generator, top: float) -> float:
+def _draw_speed(generator: np.random.Generator, top: float) -> float:
     """Draw a speed with a sign, as often slow as fast."""
     fast = (generator.uniform(0.3, 1.0) if generator.random() < 0.5
             else np.exp(generator.uniform(np.log(0.01), np.log(0.5))))
     return float(generator.choice([-1.0, 1.0]) * top * fast)
 
 
-def _rest(generator: np.random.Generator, top: float, low: float = 3.0,
-          high: float = 12.0) -> np.ndarray:
-    return np.zeros(_length(generator, low, high))
+def _rest_piece(generator: np.random.Generator, top: float, low: float = 3.0,
+                high: float = 12.0) -> np.ndarray:
+    return np.zeros(_draw_length(generator, low, high))
 
 
-def _turn(generator: np.random.Generator, top: float) -> np.ndarray:
-    return np.full(_length(generator, 3.0, 15.0), _speed(generator, top))
+def _turn_piece(generator: np.random.Generator, top: float) -> np.ndarray:
+    return np.full(_draw_length(generator, 3.0, 15.0), _draw_speed(generator, top))
 
 
-def _staircase(generator: np.random.Generator, top: float) -> np.ndarray:
+def _staircase_piece(generator: np.random.Generator, top: float) -> np.ndarray:
     """Several speeds one after another, both ways."""
-    return np.concatenate([np.full(_length(generator, 1.5, 4.0), _speed(generator, top))
+    return np.concatenate([np.full(_draw_length(generator, 1.5, 4.0), _draw_speed(generator, top))
                            for _ in range(6)])
 
 
-def _ramp(generator: np.random.Generator, top: float) -> np.ndarray:
+def _ramp_piece(generator: np.random.Generator, top: float) -> np.ndarray:
     """From one speed through zero to another."""
-    high = abs(_speed(generator, top))
-    return np.linspace(-high, high, _length(generator, 8.0, 20.0)) * generator.choice([-1.0, 1.0])
+    high = abs(_draw_speed(generator, top))
+    return (np.linspace(-high, high, _draw_length(generator, 8.0, 20.0))
+            * generator.choice([-1.0, 1.0]))
 
 
-def _slow_sweep(generator: np.random.Generator, top: float) -> np.ndarray:
+def _slow_sweep_piece(generator: np.random.Generator, top: float) -> np.ndarray:
     high = top * np.exp(generator.uniform(np.log(0.002), np.log(0.1)))
-    return np.linspace(-high, high, _length(generator, 10.0, 25.0)) * generator.choice([-1.0, 1.0])
+    return (np.linspace(-high, high, _draw_length(generator, 10.0, 25.0))
+            * generator.choice([-1.0, 1.0]))
 
 
-def _reversals(generator: np.random.Generator, top: float) -> np.ndarray:
-    high, half = generator.uniform(0.3, 1.0) * top, _length(generator, 0.5, 1.5)
+def _reversal_piece(generator: np.random.Generator, top: float) -> np.ndarray:
+    high, half = generator.uniform(0.3, 1.0) * top, _draw_length(generator, 0.5, 1.5)
     return np.tile(np.repeat([high, -high], half), 3)
 
 
-def _swing(generator: np.random.Generator, top: float) -> np.ndarray:
-    time = KNOT * np.arange(_length(generator, 8.0, 20.0))
+def _swing_piece(generator: np.random.Generator, top: float) -> np.ndarray:
+    time = KNOT_INTERVAL * np.arange(_draw_length(generator, 8.0, 20.0))
     return generator.uniform(0.2,
                              1.0) * top * np.sin(2.0 * np.pi * generator.uniform(0.1, 1.0) * time)
 
 
-def _wander(generator: np.random.Generator, top: float) -> np.ndarray:
+def _wander_piece(generator: np.random.Generator, top: float) -> np.ndarray:
     """Random motion, as by hand."""
-    shape = gaussian_filter1d(generator.standard_normal(_length(generator, 10.0, 20.0)),
-                              generator.uniform(0.3, 1.0) / KNOT)
+    shape = gaussian_filter1d(generator.standard_normal(_draw_length(generator, 10.0, 20.0)),
+                              generator.uniform(0.3, 1.0) / KNOT_INTERVAL)
     return generator.uniform(0.5, 1.0) * top * shape / np.abs(shape).max()
 
 
-def _eighths(generator: np.random.Generator, top: float) -> np.ndarray:
+def _eighth_turn_piece(generator: np.random.Generator, top: float) -> np.ndarray:
     """Eighths of a turn with a stop after each."""
-    steps = 1 + int(0.25 * np.pi / (0.3 * top) / KNOT)
-    move = np.full(steps, 0.25 * np.pi / (steps * KNOT)) * generator.choice([-1.0, 1.0])
-    return np.tile(np.concatenate([move, np.zeros(_length(generator, 1.0, 2.5))]), 8)
+    steps = 1 + int(0.25 * np.pi / (0.3 * top) / KNOT_INTERVAL)
+    move = np.full(steps, 0.25 * np.pi / (steps * KNOT_INTERVAL)) * generator.choice([-1.0, 1.0])
+    return np.tile(np.concatenate([move, np.zeros(_draw_length(generator, 1.0, 2.5))]), 8)
 
 
-PIECES = {'rest': _rest, 'turn': _turn, 'staircase': _staircase, 'ramp': _ramp,
-          'slow_sweep': _slow_sweep, 'reversals': _reversals,
-          'swing': _swing, 'wander': _wander, 'eighths': _eighths}
+PIECES = {
+    'rest': _rest_piece,
+    'turn': _turn_piece,
+    'staircase': _staircase_piece,
+    'ramp': _ramp_piece,
+    'slow_sweep': _slow_sweep_piece,
+    'reversals': _reversal_piece,
+    'swing': _swing_piece,
+    'wander': _wander_piece,
+    'eighths': _eighth_turn_piece
+}
 
 
-def _one_speed(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
-    return np.full(round(duration / KNOT), top)
+def _one_speed_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+    return np.full(round(duration / KNOT_INTERVAL), top)
 
 
-def _two_way(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+def _two_way_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
     """Draw rests and turns of one speed both ways, with short ramps."""
     pieces, length = [], 0
-    while length < duration / KNOT:
+    while length < duration / KNOT_INTERVAL:
         for sign in (1.0, -1.0):
-            pieces += [_rest(generator, top, 20.0, 40.0),
-                       np.full(_length(generator, 30.0, 60.0), sign * top)]
+            pieces += [_rest_piece(generator, top, 20.0, 40.0),
+                       np.full(_draw_length(generator, 30.0, 60.0), sign * top)]
         length = sum(len(piece) for piece in pieces)
     return gaussian_filter1d(
-        np.concatenate([*pieces[:-1], _rest(generator, top)])[:round(duration / KNOT)], 2.0)
+        np.concatenate([*pieces[:-1], _rest_piece(generator,
+                                                  top)])[:round(duration / KNOT_INTERVAL)], 2.0)
 
 
-def _slow(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
-    return _rich(generator, duration, 0.3)
+def _slow_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+    return _rich_motion(generator, duration, 0.3)
 
 
-def _smooth(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+def _smooth_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
     """Swing so slowly that lag and delay cannot be distinguished."""
-    shape = gaussian_filter1d(generator.standard_normal(round(duration / KNOT)), 6.0 / KNOT)
-    edge = 0.5 - 0.5 * np.cos(np.pi * np.minimum(1.0, np.arange(len(shape)) * KNOT / 30.0))
+    shape = gaussian_filter1d(generator.standard_normal(round(duration / KNOT_INTERVAL)),
+                              6.0 / KNOT_INTERVAL)
+    edge = (0.5 - 0.5 * np.cos(np.pi * np.minimum(1.0,
+                                                  np.arange(len(shape)) * KNOT_INTERVAL / 30.0)))
     return top * shape / np.abs(shape).max() * edge * edge[::-1]
 
 
-MOTIONS = {'rich': _rich, 'one_speed': _one_speed, 'two_way': _two_way, 'slow': _slow,
-           'smooth': _smooth}
+MOTIONS = {
+    'rich': _rich_motion,
+    'one_speed': _one_speed_motion,
+    'two_way': _two_way_motion,
+    'slow': _slow_motion,
+    'smooth': _smooth_motion
+}
 
 
-def _chamber(generator: np.random.Generator, time: np.ndarray, corners: np.ndarray,
-             degc: np.ndarray) -> np.ndarray:
+def _chamber_temperature(generator: np.random.Generator, time: np.ndarray, corners: np.ndarray,
+                         degc: np.ndarray) -> np.ndarray:
     """Follow a plan of straight lines with the lag of a heat capacity."""
     return lag(np.interp(time, corners, degc), time[1] - time[0], generator.uniform(15.0, 40.0))
 
@@ -263,25 +284,26 @@ def _warm_up_and_cycles(generator: np.random.Generator, time: np.ndarray) -> np.
     swing = generator.uniform(3.0, 12.0, len(corners)) * (-1.0) ** np.arange(
         len(corners)) * generator.choice([-1.0, 1.0])
     warm_up = generator.uniform(0.0, 8.0) * -np.exp(-time / generator.uniform(60.0, 250.0))
-    return generator.uniform(18.0, 35.0) + warm_up + _chamber(generator, time, corners, swing)
+    return (generator.uniform(18.0, 35.0) + warm_up
+            + _chamber_temperature(generator, time, corners, swing))
 
 
-def _one_ramp(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+def _ramp_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
     return generator.uniform(15.0, 25.0) + generator.uniform(8.0, 20.0) * time / time[-1]
 
 
-def _cold_start(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+def _cold_start_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
     return generator.uniform(30.0, 40.0) - generator.uniform(8.0, 15.0) * np.exp(
         -time / (0.2 * time[-1]))
 
 
-def _triangle(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+def _triangle_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
     turn = generator.uniform(0.4, 0.6) * time[-1]
     speed = generator.uniform(0.02, 0.04)
     return 20.0 + speed * (turn - np.abs(time - turn))
 
 
-def _triangles(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+def _triangles_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
     phase = (time / time[-1] * generator.integers(3, 6) + generator.random()) % 1.0
     return 20.0 + 24.0 * np.abs(phase - 0.5)
 
@@ -295,13 +317,19 @@ def _constant_temperature(generator: np.random.Generator, time: np.ndarray) -> n
     return np.full(len(time), generator.uniform(20.0, 30.0))
 
 
-TEMPERATURES = {'rich': _warm_up_and_cycles, 'ramp': _one_ramp, 'cold_start': _cold_start,
-                'triangle': _triangle, 'triangles': _triangles, 'smooth': _smooth_temperature,
-                'constant': _constant_temperature}
+TEMPERATURES = {
+    'rich': _warm_up_and_cycles,
+    'ramp': _ramp_temperature,
+    'cold_start': _cold_start_temperature,
+    'triangle': _triangle_temperature,
+    'triangles': _triangles_temperature,
+    'smooth': _smooth_temperature,
+    'constant': _constant_temperature
+}
 
 
-def _steps_and_wander(generator: np.random.Generator, time: np.ndarray,
-                      temperature: np.ndarray) -> np.ndarray:
+def _stepped_supply(generator: np.random.Generator, time: np.ndarray,
+                    temperature: np.ndarray) -> np.ndarray:
     """Draw a supply that is switched between levels some times, and wanders by some millivolts."""
     interval = time[1] - time[0]
     edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(12, 25)))
@@ -321,7 +349,7 @@ def _constant_supply(generator: np.random.Generator, time: np.ndarray,
     return np.full(len(time), 5.0)
 
 
-SUPPLIES = {'rich': _steps_and_wander, 'heating': _heating_supply, 'constant': _constant_supply}
+SUPPLIES = {'rich': _stepped_supply, 'heating': _heating_supply, 'constant': _constant_supply}
 
 
 def _rich_force(generator: np.random.Generator, time: np.ndarray,
@@ -334,17 +362,18 @@ def _rich_force(generator: np.random.Generator, time: np.ndarray,
     starts = np.sort(generator.uniform(0.0, time[-1], generator.integers(10, 25)))
     levels = generator.choice([0.0, 1.0],
                               len(starts) + 1) * generator.uniform(0.3, 2.0, len(starts) + 1)
-    return GRAVITY * np.cos(angle), _vibration(generator, time,
-                                               levels[np.searchsorted(starts, time)])
+    return GRAVITY * np.cos(angle), _random_vibration(generator, time,
+                                                      levels[np.searchsorted(starts, time)])
 
 
-def _vibration(generator: np.random.Generator, time: np.ndarray, level: np.ndarray) -> np.ndarray:
+def _random_vibration(generator: np.random.Generator, time: np.ndarray,
+                      level: np.ndarray) -> np.ndarray:
     """Vibrate at random with this root mean square, m/s², that comes and goes within 0.5 s."""
     return generator.standard_normal(len(time)) * lag(level, time[1] - time[0], 0.2)
 
 
-def _one_pose(generator: np.random.Generator, time: np.ndarray,
-              rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _one_pose_force(generator: np.random.Generator, time: np.ndarray,
+                    rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.full(len(time), GRAVITY), np.zeros(len(time))
 
 
@@ -355,10 +384,10 @@ def _turning_force(generator: np.random.Generator, time: np.ndarray,
             generator.choice([-1.0, 1.0], len(time)) * np.sqrt(np.abs(rate)))
 
 
-def _off_axis(generator: np.random.Generator, time: np.ndarray,
-              rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _off_axis_force(generator: np.random.Generator, time: np.ndarray,
+                    rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return GRAVITY + 0.15 * rate ** 2, np.zeros(len(time))
 
 
-FORCES = {'rich': _rich_force, 'one_pose': _one_pose, 'turning': _turning_force,
-          'off_axis': _off_axis}
+FORCES = {'rich': _rich_force, 'one_pose': _one_pose_force, 'turning': _turning_force,
+          'off_axis': _off_axis_force}

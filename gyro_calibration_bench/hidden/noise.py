@@ -29,10 +29,10 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 #: Between the time constants of the ladder that makes flicker.
-STEP_OF_LADDER = 4.0
+TIME_CONSTANT_RATIO = 4.0
 #: Bias instability B whose Allan floor equals the peak of a Gauss-Markov process of standard
 #: deviation 1: 0.437 sqrt(2) / 0.664.
-FLOOR_OF_GAUSS_MARKOV = 0.437 * math.sqrt(2.0) / math.sqrt(2.0 * math.log(2.0) / math.pi)
+GAUSS_MARKOV_FLOOR = 0.437 * math.sqrt(2.0) / math.sqrt(2.0 * math.log(2.0) / math.pi)
 KINDS = ('white', 'walk', 'flicker', 'gauss_markov', 'mixed')
 
 
@@ -58,9 +58,9 @@ class NoiseFigures:
     correlation_time: float = 60.0
 
     @property
-    def floor(self) -> float:
+    def equivalent_floor(self) -> float:
         """Bias instability without a Gauss-Markov process, at equal worst deviation, rad/s."""
-        return math.hypot(self.bias_instability, FLOOR_OF_GAUSS_MARKOV * self.correlated)
+        return math.hypot(self.bias_instability, GAUSS_MARKOV_FLOOR * self.correlated)
 
     def sample_deviation(self, interval: float) -> float:
         """Return the standard deviation of the white noise of one sample, rad/s."""
@@ -83,54 +83,54 @@ def draw_figures(kind: str, generator: np.random.Generator) -> NoiseFigures:
                            math.sqrt(3.0) * white / crossing[1],
                            white / math.sqrt(crossing[2]) * generator.uniform(1.0, 2.5),
                            math.exp(generator.uniform(math.log(5.0), math.log(150.0))))
-    absent = {'white': ('bias_instability', 'rate_random_walk', 'correlated'),
-              'walk': ('bias_instability', 'correlated'),
-              'flicker': ('rate_random_walk', 'correlated'),
-              'gauss_markov': ('bias_instability', 'rate_random_walk'),
-              'mixed': ('bias_instability',) if generator.random() < 0.5 else ()}[kind]
-    return replace(figures, **dict.fromkeys(absent, 0.0))
+    absent_figures = {'white': ('bias_instability', 'rate_random_walk', 'correlated'),
+                      'walk': ('bias_instability', 'correlated'),
+                      'flicker': ('rate_random_walk', 'correlated'),
+                      'gauss_markov': ('bias_instability', 'rate_random_walk'),
+                      'mixed': ('bias_instability',) if generator.random() < 0.5 else ()}[kind]
+    return replace(figures, **dict.fromkeys(absent_figures, 0.0))
 
 
 @dataclass(frozen=True)
-class Markov:
+class MarkovProcess:
     """x[k] = factor x[k-1] + innovations of a standard deviation, from a first x of its own."""
 
     factor: float
     innovation: float
-    first: float
+    first_deviation: float
 
 
-def processes(figures: NoiseFigures, count: int, interval: float) -> list[Markov]:
+def markov_processes(figures: NoiseFigures, count: int, interval: float) -> list[MarkovProcess]:
     """Return the first-order processes that the noise has beside the white one."""
     found = []
     if figures.rate_random_walk:
         step = figures.rate_random_walk * math.sqrt(interval)
-        found.append(Markov(1.0, step, step))
+        found.append(MarkovProcess(1.0, step, step))
     if figures.correlated:
         found.append(_stationary(figures.correlated, figures.correlation_time, interval))
     if figures.bias_instability:
         # processes of variance v per factor e of the time constant have the spectrum v / (2 f)
-        each = figures.bias_instability * math.sqrt(math.log(STEP_OF_LADDER) / math.pi)
-        rungs = math.ceil(math.log(16.0 * count) / math.log(STEP_OF_LADDER))
-        found += [_stationary(each, 0.5 * interval * STEP_OF_LADDER ** rung, interval)
+        each = figures.bias_instability * math.sqrt(math.log(TIME_CONSTANT_RATIO) / math.pi)
+        rungs = math.ceil(math.log(16.0 * count) / math.log(TIME_CONSTANT_RATIO))
+        found += [_stationary(each, 0.5 * interval * TIME_CONSTANT_RATIO ** rung, interval)
                   for rung in range(rungs)]
     return found
 
 
-def _stationary(deviation: float, time_constant: float, interval: float) -> Markov:
+def _stationary(deviation: float, time_constant: float, interval: float) -> MarkovProcess:
     factor = math.exp(-interval / time_constant)
-    return Markov(factor, deviation * math.sqrt(-math.expm1(-2.0 * interval / time_constant)),
-                  deviation)
+    return MarkovProcess(
+        factor, deviation * math.sqrt(-math.expm1(-2.0 * interval / time_constant)), deviation)
 
 
-def make(figures: NoiseFigures, count: int, interval: float,
-         generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def generate_noise(figures: NoiseFigures, count: int, interval: float,
+                   generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the white part and the slow part of noise, rad/s."""
     white = figures.sample_deviation(interval) * generator.standard_normal(count)
     slow = np.zeros(count)
-    for process in processes(figures, count, interval):
+    for process in markov_processes(figures, count, interval):
         innovations = process.innovation * generator.standard_normal(count)
-        innovations[0] *= process.first / process.innovation
+        innovations[0] *= process.first_deviation / process.innovation
         slow += autoregression(innovations, process.factor)
     return white, slow
 
@@ -149,55 +149,57 @@ class Whitening:
     def __init__(self, figures: NoiseFigures, count: int, interval: float,
                  encoder_step: float = 0.0):
         self._variance = figures.sample_deviation(interval) ** 2
-        slow = processes(figures, count, interval)
-        self._slow, self._encoder = len(slow), encoder_step > 0.0
-        self._states, self._count, self._interval = len(slow) + self._encoder, count, interval
-        if self._states:
+        slow = markov_processes(figures, count, interval)
+        self._slow_count, self._has_encoder = len(slow), encoder_step > 0.0
+        self._state_count, self._count, self._interval = (
+            len(slow) + self._has_encoder, count, interval)
+        if self._state_count:
             self._factor = cholesky_banded(self._precision(slow, encoder_step), overwrite_ab=True,
                                            check_finite=False)
 
-    def _precision(self, slow: list[Markov], encoder_step: float) -> np.ndarray:
+    def _precision(self, slow: list[MarkovProcess], encoder_step: float) -> np.ndarray:
         """Return P + H' H / v, upper banded, the states of one sample side by side."""
-        width, count, information = self._states, self._count, 1.0 / self._variance
+        width, count, information = self._state_count, self._count, 1.0 / self._variance
         # band[width - d, k, j]: with the state d places before state j of sample k
         band = np.zeros((width + 1, count, width))
         for place, process in enumerate(slow):
             inner = 1.0 / process.innovation ** 2
             band[width, :, place] = inner * (1.0 + process.factor ** 2)
-            band[width, 0, place] = 1.0 / process.first ** 2 + inner * process.factor ** 2
+            band[width, 0,
+                 place] = (1.0 / process.first_deviation ** 2 + inner * process.factor ** 2)
             band[width, -1, place] = inner
             band[0, 1:, place] = -inner * process.factor
-        for later in range(self._slow):
+        for later in range(self._slow_count):
             for earlier in range(later + 1):
                 band[width - later + earlier, :, later] += information
-        if self._encoder:
+        if self._has_encoder:
             self._add_encoder(band, encoder_step, information)
         return band.reshape(width + 1, count * width)
 
     def _add_encoder(self, band: np.ndarray, step: float, information: float) -> None:
         """Add the heading error e of the reference: residual -(e[k] - e[k-1]) / interval."""
-        width, last, rate = self._states, self._states - 1, 1.0 / self._interval
+        width, last, rate = self._state_count, self._state_count - 1, 1.0 / self._interval
         band[width, :, last] += 12.0 / step ** 2
         band[width, 1:, last] += information * rate ** 2
         band[width, :-1, last] += information * rate ** 2
         band[0, 1:, last] -= information * rate ** 2
-        for place in range(self._slow):
+        for place in range(self._slow_count):
             band[width - last + place, 1:, last] -= information * rate  # with e of the same sample
             band[width - 1 - place, 1:, place] += information * rate  # of the sample before
 
     def solve(self, signal: np.ndarray) -> np.ndarray:
         """Return S^-1 times a signal of shape (n,)."""
-        if not self._states:
+        if not self._state_count:
             return signal / self._variance
-        seen = np.zeros((self._count, self._states))
-        seen[:, :self._slow] = signal[:, None]
-        if self._encoder:
+        seen = np.zeros((self._count, self._state_count))
+        seen[:, :self._slow_count] = signal[:, None]
+        if self._has_encoder:
             seen[1:, -1] -= signal[1:] / self._interval
             seen[:-1, -1] += signal[1:] / self._interval
         states = cho_solve_banded((self._factor, False), seen.ravel(),
-                                  check_finite=False).reshape(self._count, self._states)
-        explained = states[:, :self._slow].sum(axis=1)
-        if self._encoder:
+                                  check_finite=False).reshape(self._count, self._state_count)
+        explained = states[:, :self._slow_count].sum(axis=1)
+        if self._has_encoder:
             explained[1:] -= np.diff(states[:, -1]) / self._interval
         return (signal - explained / self._variance) / self._variance
 
@@ -206,7 +208,7 @@ def spectrum(figures: NoiseFigures, count: int, interval: float) -> np.ndarray:
     """Return the variances of the noise at k / (2 T), k = 1 to n - 1, scaled as of white noise."""
     angle = math.pi * np.arange(1, count) / count
     total = np.full(count - 1, figures.sample_deviation(interval) ** 2)
-    for process in processes(figures, count, interval):
+    for process in markov_processes(figures, count, interval):
         total += process.innovation ** 2 / (1.0 - 2.0 * process.factor * np.cos(angle)
                                             + process.factor ** 2)
     return total

@@ -51,20 +51,20 @@ def oracle_gain(log: HiddenLog, rows: slice | np.ndarray = slice(None),
 
     """
     truth, time = log.truth, log.columns['time_s'][rows]
-    output, good = log.columns['gyro_rad_s'], truth.good
+    output, good = log.columns['gyro_rad_s'], truth.is_good
     design = np.column_stack([np.ones_like(output), truth.reference])
     simple = design @ np.linalg.lstsq(design[good], output[good], rcond=None)[0]
     before, after = (np.where(good, output - each, 0.0)[rows]
                      for each in (simple, truth.prediction))
     return OracleGain(_rms(before), _rms(after),
-                      *(_rms(_over_windows(time, each, window)) for each in (before, after)))
+                      *(_rms(_window_changes(time, each, window)) for each in (before, after)))
 
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values ** 2))) if len(values) else float('nan')
 
 
-def _over_windows(time: np.ndarray, rate_error: np.ndarray, window: float) -> np.ndarray:
+def _window_changes(time: np.ndarray, rate_error: np.ndarray, window: float) -> np.ndarray:
     """Return the change of the integral over windows that follow one another."""
     angle = np.concatenate([[0.0], np.cumsum(np.diff(time) * rate_error[1:])])
     edges = np.searchsorted(time, np.arange(time[0], time[-1], window))

@@ -32,35 +32,36 @@ import numpy as np
 
 #: White noise of a fix, side slip at rest and its growth with the rate, rad, rad and s, and time
 #: over which it wanders, s.
-FIX, SLIP, GROWTH, WANDERS = math.radians(0.3), math.radians(0.3), 2.0, 3.0
+FIX_NOISE, SIDE_SLIP, SIDE_SLIP_GROWTH, SIDE_SLIP_TIME = (
+    math.radians(0.3), math.radians(0.3), 2.0, 3.0)
 
 
 @dataclass(frozen=True)
-class Imperfect:
+class ImperfectReference:
     """A kind of reference and the size of its error."""
 
     kind: str
     size: float
 
-    def sizing(self, angle_random_walk: float, sample_rate: float) -> tuple[float, float]:
+    def sizing_noise(self, angle_random_walk: float, sample_rate: float) -> tuple[float, float]:
         """Return the angle random walk, and the step of an encoder, that hide as much as it."""
         if self.kind == 'rate':
             return angle_random_walk * math.hypot(1.0, self.size), 0.0
         if self.kind == 'course':
             # neighbouring fixes err alike by side slip: as many as are independent
-            slip = SLIP * math.sqrt(2.0 * WANDERS * sample_rate)
-            noise = math.hypot(FIX * math.sqrt(sample_rate / self.size), slip)
+            slip = SIDE_SLIP * math.sqrt(2.0 * SIDE_SLIP_TIME * sample_rate)
+            noise = math.hypot(FIX_NOISE * math.sqrt(sample_rate / self.size), slip)
             return angle_random_walk, noise * math.sqrt(12.0)
         step = math.radians(self.size)
         return angle_random_walk, step if self.kind == 'encoder' else step * math.sqrt(12.0)
 
 
-def hide_beside(names: Sequence[str], multiple: float, generator: np.random.Generator,
-                reference: Imperfect, noise: str = 'mixed', duration: float = 600.0,
-                sample_rate: float = 25.0) -> HiddenLog:
+def hide_with_reference(names: Sequence[str], multiple: float, generator: np.random.Generator,
+                        reference: ImperfectReference, noise: str = 'mixed',
+                        duration: float = 600.0, sample_rate: float = 25.0) -> HiddenLog:
     """Hide effects in a log whose reference errs; sizes are for who knows its noise."""
     each, figures = session(generator, duration, sample_rate), draw_figures(noise, generator)
-    walk, step = reference.sizing(figures.angle_random_walk, sample_rate)
+    walk, step = reference.sizing_noise(figures.angle_random_walk, sample_rate)
     gyro = replace(draw_gyro(names, multiple, generator, [each],
                              replace(figures, angle_random_walk=walk), step), figures=figures)
     made = record(gyro, each, generator, expected=figures, reference='both')
@@ -76,13 +77,13 @@ def hide_beside(names: Sequence[str], multiple: float, generator: np.random.Gene
         size = math.radians(reference.size)
         columns['reference_heading_rad'] = np.floor(heading / size) * size
     else:
-        factor = math.exp(-1.0 / (WANDERS * sample_rate))
-        slip = SLIP * autoregression(math.sqrt(1.0 - factor ** 2) * white, factor)
-        slip *= 1.0 + GROWTH * np.abs(rate)
+        factor = math.exp(-1.0 / (SIDE_SLIP_TIME * sample_rate))
+        slip = SIDE_SLIP * autoregression(math.sqrt(1.0 - factor ** 2) * white, factor)
+        slip *= 1.0 + SIDE_SLIP_GROWTH * np.abs(rate)
         delay = generator.uniform(-0.2, 0.7)
         fixes = np.arange(time[0], time[-1], 1.0 / reference.size)
         course = (np.interp(fixes - delay, time, heading + slip)
-                  + FIX * generator.standard_normal(len(fixes)))
+                  + FIX_NOISE * generator.standard_normal(len(fixes)))
         course = np.interp(time, fixes, course)
         course[np.interp(time - delay, time, columns['moving']) < 0.5] = np.nan
         columns['reference_heading_rad'] = course

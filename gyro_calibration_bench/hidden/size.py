@@ -12,9 +12,9 @@
 The minimum detectable effect, and the size at a multiple of it.
 
 ``I = x' S^-1 x - x' S^-1 Z (Z' S^-1 Z)^-1 Z' S^-1 x`` for an effect's column x, with the nuisances
-Z, a bias of each recording and one scale; its standard deviation is 1 / sqrt(I), and `DETECTABLE`
-of them are detected. A nonlinear effect has the size at which its whole finite error x has the
-norm `DETECTABLE`: sqrt(x' S^-1 x - ...).
+Z, a bias of each recording and one scale; its standard deviation is 1 / sqrt(I), and
+`DETECTION_SIGMAS` of them are detected. A nonlinear effect has the size at which its whole finite
+error x has the norm `DETECTION_SIGMAS`: sqrt(x' S^-1 x - ...).
 
 """
 
@@ -29,12 +29,12 @@ import numpy as np
 from scipy.optimize import brentq
 
 #: Standard deviations: the level corrected for some 31 columns, and the power.
-DETECTABLE = 4.8
+DETECTION_SIGMAS = 4.8
 
 Columns = list[np.ndarray]  # of each recording, shape (n,)
 
 
-class Metric:
+class InformationMetric:
     """
     Information of recordings of one gyro on an effect, beside a bias of each and one scale.
 
@@ -58,7 +58,9 @@ class Metric:
                                           for number, each in enumerate(sessions)]
                           for run in range(len(sessions))}
         self.nuisances['scale'] = [each.rate for each in sessions]
-        self.nuisances = {name: thinned(columns, thin) for name, columns in self.nuisances.items()}
+        self.nuisances = ({
+            name: block_averages(columns, thin) for name, columns in self.nuisances.items()
+        })
         self._solved = {name: self.solve(columns) for name, columns in self.nuisances.items()}
 
     def solve(self, columns: Columns) -> Columns:
@@ -68,13 +70,14 @@ class Metric:
     def gram(self, several: list[Columns], without: Sequence[str] = ()) -> np.ndarray:
         """Return the inner products of several columns, less the nuisances, shape (m, m)."""
         names = [name for name in self.nuisances if name.split()[0] not in without]
-        several = [thinned(columns, self._thin) for columns in several]
+        several = [block_averages(columns, self._thin) for columns in several]
         solved = [self.solve(columns) for columns in several]
-        full = np.array([[_inner(a, b) for b in solved] for a in several])
+        full = np.array([[_inner_product(a, b) for b in solved] for a in several])
         if not names:
             return full
-        beside = np.array([[_inner(self.nuisances[name], b) for b in solved] for name in names])
-        among = np.array([[_inner(self.nuisances[a], self._solved[b]) for b in names]
+        beside = np.array(
+            [[_inner_product(self.nuisances[name], b) for b in solved] for name in names])
+        among = np.array([[_inner_product(self.nuisances[a], self._solved[b]) for b in names]
                           for a in names])
         scale = np.sqrt(np.diag(among))
         beside, among = beside / scale[:, None], among / np.outer(scale, scale)
@@ -85,17 +88,18 @@ class Metric:
         return math.sqrt(max(float(self.gram([columns], without)[0, 0]), 0.0))
 
 
-def thinned(columns: Columns, factor: int) -> Columns:
+def block_averages(columns: Columns, factor: int) -> Columns:
     """Return means of so many samples each."""
     return columns if factor == 1 else [column[:len(column) // factor * factor].reshape(
         -1, factor).mean(axis=1) for column in columns]
 
 
-def _inner(a: Columns, b: Columns) -> float:
+def _inner_product(a: Columns, b: Columns) -> float:
     return float(sum(x @ y for x, y in zip(a, b)))
 
 
-def solve_size(norm: Callable[[float], float], wanted: float, first: float, most: float) -> float:
+def solve_size(norm: Callable[[float], float], wanted: float, guess_size: float,
+               max_size: float) -> float:
     """
     Return the size at which a norm that grows with it has a wanted value, or the largest size.
 
@@ -103,17 +107,17 @@ def solve_size(norm: Callable[[float], float], wanted: float, first: float, most
     ----------
     norm : size -> norm
     wanted : its value
-    first : a guess of the size
-    most : the largest size
+    guess_size : a guess of the size
+    max_size : the largest size
 
     """
-    guess = min(first, most)
-    quick = _by_powers(norm, wanted, guess, most)
-    return quick if quick is not None else _by_brackets(norm, wanted, guess, most)
+    guess = min(guess_size, max_size)
+    quick = _solve_by_powers(norm, wanted, guess, max_size)
+    return quick if quick is not None else _solve_by_brackets(norm, wanted, guess, max_size)
 
 
-def _by_powers(norm: Callable[[float], float], wanted: float, size: float,
-               most: float) -> float | None:
+def _solve_by_powers(norm: Callable[[float], float], wanted: float, size: float,
+                     most: float) -> float | None:
     """Go along a power of the size, the first for most effects; None if the norm is not smooth."""
     value, power = norm(size), 1.0
     for _ in range(6):
@@ -121,18 +125,19 @@ def _by_powers(norm: Callable[[float], float], wanted: float, size: float,
             return size
         if not value:
             return None
-        further = min(most, size * (wanted / value) ** (1.0 / power))
-        if further == size:
+        next_size = min(most, size * (wanted / value) ** (1.0 / power))
+        if next_size == size:
             return size
-        farther = norm(further)
-        power = float(np.clip(math.log((farther + 1e-300) / value) / math.log(further / size), 0.5,
-                              4.0))
-        size, value = further, farther
+        next_value = norm(next_size)
+        power = float(
+            np.clip(
+                math.log((next_value + 1e-300) / value) / math.log(next_size / size), 0.5, 4.0))
+        size, value = next_size, next_value
     return None
 
 
-def _by_brackets(norm: Callable[[float], float], wanted: float, guess: float,
-                 most: float) -> float:
+def _solve_by_brackets(norm: Callable[[float], float], wanted: float, guess: float,
+                       most: float) -> float:
     low = high = guess
     while norm(high) < wanted:
         if high >= most:

@@ -14,12 +14,12 @@ import json
 import math
 
 from chance import fewest, mean_bound, most, rms_bounds
-from gyro_calibration.allan import allan_deviation, even_record, fit_noise, PARTS
-from gyro_calibration.cli.allan import names
+from gyro_calibration.allan import allan_deviation, build_rest_record, fit_noise, NOISE_TERMS
+from gyro_calibration.cli.allan import figure_labels
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
-from gyro_calibration.logs.stamps import number_stamps
+from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.noise import ALLAN_FLOOR, Noise, simulate_noise
+from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -46,7 +46,7 @@ def test_the_deviation_is_the_textbooks(samples):
     np.testing.assert_allclose(chart.deviation[chosen],
                                [textbook(rate, size) for size in chart.size[chosen]], rtol=1e-9)
     assert chart.time[-1] == pytest.approx(samples // 3 * INTERVAL) and len(chart.size) >= 13
-    assert (chart.differences == samples + 1 - 2 * chart.size).all()
+    assert (chart.difference_count == samples + 1 - 2 * chart.size).all()
 
 
 def test_averaging_times_can_be_given_and_must_fit_twice_into_the_record():
@@ -99,7 +99,7 @@ def figures(noise, runs, seed, samples=20_000, quantization=0.0, ramp=0.0):
         fits.append(fit_noise(
             rate + np.diff(generator.standard_normal(samples + 1)) * quantization / INTERVAL,
             INTERVAL).figures)
-    return {part.symbol: [fit[part.symbol] for fit in fits] for part in PARTS}
+    return {part.symbol: [fit[part.symbol] for fit in fits] for part in NOISE_TERMS}
 
 
 CASES = {'white': (WHITE, 0.0, 0.0), 'flicker': (FLICKER, 0.0, 0.0), 'walk': (WALK, 0.0, 0.0),
@@ -162,7 +162,7 @@ def test_a_gauss_markov_process_is_found_and_a_flicker_or_random_walk_is_not_tak
         shocks = 1e-3 * math.sqrt(1.0 - kept ** 2) * generator.standard_normal(200_000)
         fit = fit_noise(simulate_noise(WHITE, 200_000, 0.01, generator)
                         + lfilter([1.0], [1.0, -kept], shocks), 0.01)
-        found.append((fit.process.deviation, fit.process.correlation_time))
+        found.append((fit.process.standard_deviation, fit.process.correlation_time))
         assert fit.figures['K'].lower == 0.0
         assert fit.figures['N'].value == pytest.approx(1e-3, rel=0.02)
     assert np.median(found, axis=0) == pytest.approx((1e-3, 20.0), rel=0.5)
@@ -203,10 +203,10 @@ def test_a_record_that_is_too_short_for_the_floor_says_so_and_bounds_the_bias_in
     generator = np.random.default_rng(9)
     short, long = (fit_noise(simulate_noise(Noise(1e-3, 3e-4), count, INTERVAL, generator),
                              INTERVAL) for count in (2000, 200_000))
-    assert (not short.floor_reached and not short.figures['B'].value
+    assert (not short.is_floor_reached and not short.figures['B'].value
             and short.figures['B'].upper > 3e-4)
-    assert (long.floor_reached
-            and long.chart.floor.deviation == pytest.approx(ALLAN_FLOOR * 3e-4, rel=0.4))
+    assert (long.is_floor_reached
+            and long.chart.floor.deviation == pytest.approx(ALLAN_FLOOR_RATIO * 3e-4, rel=0.4))
 
 
 def stamps(count):
@@ -219,7 +219,8 @@ def test_lost_samples_are_counted_and_do_not_change_the_figures():
                   generator.random(100_000) > 0.001)
     kept[[0, -1]] = True
     kept[50_000:50_500] = False
-    record = even_record(stamps(100_000)[kept] + 0.0005 * generator.random(kept.sum()), rate[kept])
+    record = build_rest_record(
+        stamps(100_000)[kept] + 0.0005 * generator.random(kept.sum()), rate[kept])
     assert (np.isnan(record.rate).sum() == (~kept).sum()
             and f'{(~kept).sum()} samples are lost' in record.remarks[0])
     np.testing.assert_array_equal(record.rate[kept], rate[kept])
@@ -238,7 +239,7 @@ def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
     rate, kept = (simulate_noise(WHITE, 60_000, INTERVAL, generator),
                   generator.random(60_000) > share)
     kept[[0, -1]] = True
-    record = even_record(
+    record = build_rest_record(
         (stamps(60_000) + jitter * INTERVAL * generator.standard_normal(60_000))[kept], rate[kept])
     assert (record.interval == pytest.approx(INTERVAL, rel=1e-4)
             and np.isnan(record.rate).sum() == pytest.approx((~kept).sum(), abs=3))
@@ -249,13 +250,14 @@ def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
 @pytest.mark.parametrize('every', [8, 20])
 def test_one_lost_sample_of_so_many_is_seen(every):
     kept = np.arange(10_000) % every != 1
-    assert number_stamps(stamps(10_000)[kept]).lost.sum() == (~kept).sum()
+    assert fit_stamp_grid(stamps(10_000)[kept]).lost_after.sum() == (~kept).sum()
 
 
 def test_two_records_hours_apart_are_not_taken_for_one():
     rate = (simulate_noise(WHITE, 40_000, INTERVAL, np.random.default_rng(11))
             + np.where(np.arange(40_000) < 20_000, 0.0, 0.1))
-    record = even_record(stamps(40_000) + np.where(np.arange(40_000) < 20_000, 0.0, 1e7), rate)
+    record = build_rest_record(
+        stamps(40_000) + np.where(np.arange(40_000) < 20_000, 0.0, 1e7), rate)
     assert len(record.rate) < 50_000
     # as one record they would be refused as moved
     assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(
@@ -266,8 +268,8 @@ def test_every_averaging_time_of_a_chart_has_an_upper_bound_however_few_windows_
     """The first of two records is just long enough for one or two of the longest windows."""
     for first in range(2600, 2720, 8):
         time = stamps(4000) + np.where(np.arange(4000) < first, 0.0, 1e3)
-        record = even_record(time,
-                             simulate_noise(WHITE, 4000, INTERVAL, np.random.default_rng(first)))
+        record = build_rest_record(
+            time, simulate_noise(WHITE, 4000, INTERVAL, np.random.default_rng(first)))
         chart = allan_deviation(record.rate, record.interval)
         assert chart.degrees_of_freedom.min() > 0.99 and np.isfinite(chart.upper).all()
 
@@ -284,11 +286,11 @@ def bursts(count):
 def test_stamps_in_bursts_give_the_interval_of_the_gyro():
     time, rate = (np.sort(bursts(50_000)),
                   simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(13)))
-    record = even_record(time, rate)
+    record = build_rest_record(time, rate)
     assert record.interval == pytest.approx(INTERVAL, rel=1e-4) and 'bursts' in record.remarks[0]
     np.testing.assert_array_equal(record.rate, rate)
     gap = np.delete(np.arange(50_000), np.s_[20_000:20_500])
-    assert abs(np.isnan(even_record(time[gap], rate[gap]).rate).sum() - 500) <= 10
+    assert abs(np.isnan(build_rest_record(time[gap], rate[gap]).rate).sum() - 500) <= 10
 
 
 def moved(kind):
@@ -316,7 +318,7 @@ def moved(kind):
     ('uneven', 'no even interval.*--rate')])
 def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
-        record = even_record(*moved(kind))
+        record = build_rest_record(*moved(kind))
         fit_noise(record.rate, record.interval)
 
 
@@ -331,10 +333,10 @@ def test_figures_want_noise_and_windows_without_a_gap():
 def test_an_outlier_is_left_out_and_a_random_walk_of_the_bias_is_no_motion():
     rate = simulate_noise(Noise(1e-3, 3e-4, 3e-4), 50_000, INTERVAL, np.random.default_rng(16))
     rate[[700, 30_000]] += 0.5, -2.0
-    record = even_record(stamps(50_000), rate)
+    record = build_rest_record(stamps(50_000), rate)
     assert (np.nonzero(np.isnan(record.rate))[0].tolist() == [700, 30_000]
             and 'left out: 2 single samples' in record.remarks[0])
-    assert not even_record(
+    assert not build_rest_record(
         stamps(50_000),
         simulate_noise(Noise(0.0, 0.0, 1e-3), 50_000, INTERVAL, np.random.default_rng(20))).remarks
 
@@ -342,7 +344,7 @@ def test_an_outlier_is_left_out_and_a_random_walk_of_the_bias_is_no_motion():
 def test_what_the_log_says_was_moved_is_left_out():
     moving = (stamps(50_000) > 300.0).astype(float)
     rate = simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(17)) + moving
-    assert fit_noise(even_record(stamps(50_000), rate, moving).rate,
+    assert fit_noise(build_rest_record(stamps(50_000), rate, moving).rate,
                      INTERVAL).figures['N'].value == pytest.approx(1e-3, rel=0.03)
 
 
@@ -352,14 +354,14 @@ def test_a_reference_that_turns_with_the_output_shows_motion_and_one_that_wander
     time, count = stamps(10_000), 10_000
     turns = lfilter([0.02 * math.sqrt(2e-2)], [1.0, -0.99], generator.standard_normal(count))
     rate = simulate_noise(WALK, count, INTERVAL, generator) + turns
-    assert len(even_record(time, rate).rate) == count
+    assert len(build_rest_record(time, rate).rate) == count
     course = INTERVAL * np.cumsum(turns) + 0.5 * DEGREE * generator.standard_normal(count)
     with pytest.raises(DataRefused, match='the reference heading turns with the output'):
-        even_record(time, rate, heading=course)
+        build_rest_record(time, rate, heading=course)
     for _ in range(20):
         rate = simulate_noise(WALK, count, INTERVAL, generator)
         wandering = np.cumsum(1e-3 * generator.standard_normal(count))
-        assert len(even_record(time, rate, heading=wandering).rate) == count
+        assert len(build_rest_record(time, rate, heading=wandering).rate) == count
 
 
 def test_three_recordings_of_one_kind_of_gyro_agree(data):
@@ -367,25 +369,25 @@ def test_three_recordings_of_one_kind_of_gyro_agree(data):
     fits = []
     for number in (1, 2, 3):
         log = read_log(data / f'mems_static/adis16405_{number}.csv.gz', rate=100.0)
-        record = even_record(log.time, log.output)
+        record = build_rest_record(log.time, log.output)
         assert not record.remarks and record.interval == pytest.approx(0.01)
         fits.append(fit_noise(record.rate, record.interval))
     walks = np.array([fit.figures['N'].value / DEGREE * 60.0 for fit in fits])
     floors = np.array([fit.chart.floor.deviation / DEGREE for fit in fits])
     assert (np.abs(walks - 2.3) < 0.1).all(), walks
     assert ((floors > 0.006).all() and (floors < 0.012).all()
-            and all(fit.floor_reached and not fit.misfit for fit in fits))
+            and all(fit.is_floor_reached and not fit.misfit for fit in fits))
     assert all(fit.figures['B'].value / DEGREE == pytest.approx(0.008, rel=0.4) for fit in fits)
     assert all(not fit.figures[symbol].value for fit in fits for symbol in 'QR')
 
 
 def test_a_recording_in_bursts_is_taken_by_the_gyros_clock(data):
     log = read_log(data / 'mems_static/mpu6050_host_clock.csv.gz')
-    record = even_record(log.time, log.output)
+    record = build_rest_record(log.time, log.output)
     assert 'bursts' in record.remarks[0] and record.interval == pytest.approx(0.01007, rel=0.001)
     fit = fit_noise(record.rate, record.interval)
     assert (fit.figures['N'].value / DEGREE == pytest.approx(0.0097, rel=0.1)
-            and not fit.figures['B'].value and not fit.floor_reached)
+            and not fit.figures['B'].value and not fit.is_floor_reached)
 
 
 @pytest.fixture
@@ -453,7 +455,7 @@ def test_text_data_picture_and_model_have_one_bias_instability(tmp_path, run):
     assert read_model(out).noise.bias_instability == value < answer['floor']['deviation'] / 0.664
     text = f'{value / DEGREE * 3600.0:.4g} deg/h'
     assert f'Bias instability B: {text},' in run('allan', path)[1]
-    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in names(
+    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in figure_labels(
         fit_noise(rate, INTERVAL))['B']
 
 

@@ -11,7 +11,7 @@
 
 
 from campaigns import judge, least_squares_error, simulated
-from gyro_calibration.calibration.dwells import from_table, take
+from gyro_calibration.calibration.dwells import dwells_from_table, select_dwells
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.logs.log import DEGREE, read_log
 import numpy as np
@@ -34,10 +34,10 @@ def test_the_stated_deviation_is_that_of_another_campaign(sine, gyros):
 
 
 def test_on_the_recorded_table_the_cooler_half_predicts_the_hotter_one(data):
-    dwells = from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
-    first, second = (take(dwells, (dwells.sweep < 12) == part) for part in (True, False))
+    dwells = dwells_from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
+    first, second = (select_dwells(dwells, (dwells.sweep < 12) == part) for part in (True, False))
     error, z = judge(select_effects(first).calibration.model, second)
     assert error < 0.065 and z < 1.6
-    slow = take(first, np.abs(first.rate) < 60.0 * DEGREE)
+    slow = select_dwells(first, np.abs(first.rate) < 60.0 * DEGREE)
     error, z = judge(select_effects(slow).calibration.model, second)
     assert error < 0.08 and z < 1.6

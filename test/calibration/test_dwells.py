@@ -14,18 +14,23 @@ from dataclasses import replace
 import math
 
 from chance import fewest, most, rms_bounds
-from gyro_calibration.calibration.dwells import dwells, find_dwells, from_table, join
-from gyro_calibration.calibration.dwells.averaging import moderated
+from gyro_calibration.calibration.dwells import (
+    dwells_from_table,
+    extract_dwells,
+    find_dwells,
+    join_dwells,
+)
+from gyro_calibration.calibration.dwells.averaging import shrink_variances
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import quantization_step
-from gyro_calibration.model.motion import turns
+from gyro_calibration.model.motion import constant_rate_motion
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 RATES = (0, *(sign * rate for rate in range(10, 101, 10) for sign in (1, -1)))
-RUN = turns([(16.0, rate) for rate in RATES])
+RUN = constant_rate_motion([(16.0, rate) for rate in RATES])
 TIME = np.arange(0.0, RUN.duration, 0.01)
 RATE, HEADING = RUN.rate_at(TIME), RUN.heading_at(TIME)
 SCALE, BIAS = 1.01, 0.3 * DEGREE
@@ -61,18 +66,19 @@ def errors(found):
 # Rate tables
 
 def test_the_rows_of_a_rate_table_are_its_dwells(data):
-    found = dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
+    found = extract_dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
     assert len(found) == 695
     assert found.sweep.max() + 1 == 24
 
 
 def test_the_order_of_the_rates_tells_the_sweeps_that_the_file_names(data):
     log = read_log(data / 'fog_rate_table' / 'table.csv')
-    assert (dwells(replace(log, others={})).sweep == dwells(log).sweep).all()
+    assert (extract_dwells(replace(log, others={})).sweep == extract_dwells(log).sweep).all()
 
 
 def test_a_column_names_the_sweeps():
-    found = from_table(table([1, 2, 3, 4], others={'sweep': ('cold', 'warm', 'cold', 'warm')}))
+    found = dwells_from_table(
+        table([1, 2, 3, 4], others={'sweep': ('cold', 'warm', 'cold', 'warm')}))
     assert list(found.sweep) == [0, 1, 0, 1]
 
 
@@ -84,35 +90,35 @@ def test_a_column_names_the_sweeps():
 ], ids=['one direction', 'both signs in turn', 'rests between',
         'rests between, both signs in turn'])
 def test_sweeps_are_found_by_the_order_of_the_rates(sweep):
-    found = from_table(table(sweep * 3))
+    found = dwells_from_table(table(sweep * 3))
     turning = found.rate != 0.0  # a rest is near to both the sweep before and the one after
     assert list(found.sweep[turning]) == list(np.repeat([0, 1, 2], len(sweep))[turning])
 
 
 def test_a_sweep_ends_where_the_travel_through_the_rates_turns_back():
-    found = from_table(table([-100, -50, 0, 50, 100, 50, 0, -50, -100]))
+    found = dwells_from_table(table([-100, -50, 0, 50, 100, 50, 0, -50, -100]))
     assert list(found.sweep) == [0] * 5 + [1] * 4
 
 
 def test_rates_in_random_order_make_nine_blocks(generator):
-    found = from_table(table(generator.permutation(np.linspace(-100.0, 100.0, 90))))
+    found = dwells_from_table(table(generator.permutation(np.linspace(-100.0, 100.0, 90))))
     assert list(found.sweep) == [block for block in range(9) for _ in range(10)]
 
 
 def test_three_speeds_of_a_record_player_are_three_blocks():
-    assert list(from_table(table([33.3, 45.0, 78.0])).sweep) == [0, 1, 2]
+    assert list(dwells_from_table(table([33.3, 45.0, 78.0])).sweep) == [0, 1, 2]
 
 
 def test_rows_without_output_or_reference_are_left_out_and_reported():
     log = table([10, 20, math.nan, 40, 50], temperature=np.arange(5.0))
-    found = from_table(replace(log, output=np.where(np.arange(5) == 3, np.nan, log.output)))
-    assert found.place == ('row 1', 'row 2', 'row 5')
+    found = dwells_from_table(replace(log, output=np.where(np.arange(5) == 3, np.nan, log.output)))
+    assert found.location == ('row 1', 'row 2', 'row 5')
     assert list(found.temperature) == [0.0, 1.0, 4.0]
     assert found.remarks == ('2 rows without output or reference are left out: 3, 4',)
 
 
 def test_a_table_may_say_how_well_its_means_are_known():
-    found = from_table(table([10, 20, 30], others={'deviation_dps': ('0.5', 'nan', '0')}))
+    found = dwells_from_table(table([10, 20, 30], others={'deviation_dps': ('0.5', 'nan', '0')}))
     assert found.deviation[0] == 0.5 * DEGREE and np.isnan(found.deviation[1:]).all()
 
 
@@ -130,20 +136,20 @@ def test_a_table_may_say_how_well_its_means_are_known():
 ])
 def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
     with pytest.raises(DataRefused, match=message):
-        dwells(log)
+        extract_dwells(log)
 
 
 def test_joined_logs_keep_their_sweeps_and_places_apart():
-    whole = join([dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
-                  for name in ('a.csv', 'b.csv')])
+    whole = join_dwells([extract_dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
+                         for name in ('a.csv', 'b.csv')])
     assert list(whole.sweep) == [0, 1, 2, 3, 4, 5]
-    assert whole.place[0] == 'a.csv: row 1' and whole.place[3] == 'b.csv: row 1'
+    assert whole.location[0] == 'a.csv: row 1' and whole.location[3] == 'b.csv: row 1'
     assert len(whole.temperature) == len(whole) == 6
 
 
 def test_a_log_without_temperature_takes_it_from_those_that_it_is_joined_with():
-    whole = join([table_dwells := dwells(table([1, 2, 3])),
-                  replace(table_dwells, temperature=np.ones(3))])
+    whole = join_dwells([table_dwells := extract_dwells(table([1, 2, 3])),
+                         replace(table_dwells, temperature=np.ones(3))])
     assert whole.temperature is None and '1 of 2 logs hold no temperature' in whole.remarks[-1]
 
 
@@ -160,7 +166,7 @@ def test_every_rate_of_a_table_is_found(reference, generator):
     found = find_dwells(run(generator, **references(generator)[reference]))
     assert np.allclose(found.rate / DEGREE, RATES, atol=0.01)
     assert (np.abs(errors(found)) < 5.0).all()
-    lengths = [float(place.split()[2]) - float(place.split()[0]) for place in found.place]
+    lengths = [float(place.split()[2]) - float(place.split()[0]) for place in found.location]
     assert min(lengths) > 12.5 and np.median(lengths) > 14.0
 
 
@@ -342,7 +348,9 @@ def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
 # Deviations
 
 def test_variances_that_differ_by_chance_become_one(generator):
-    found = [moderated(generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)]
+    found = [
+        shrink_variances(generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)
+    ]
     # Without shrinkage, each would have an error of 43 %.
     assert np.sqrt(np.mean((np.array(found) - 1.0) ** 2)) < 0.15
     assert np.mean(found) == pytest.approx(1.0, abs=0.02)
@@ -350,7 +358,7 @@ def test_variances_that_differ_by_chance_become_one(generator):
 
 def test_variances_that_really_differ_stay_so(generator):
     truth = np.repeat([1.0, 100.0], 20)
-    found = np.mean([moderated(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11))
+    found = np.mean([shrink_variances(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11))
                     for _ in range(200)], axis=0)
     assert np.allclose(found / truth, 1.0, atol=0.25)
 
@@ -375,6 +383,7 @@ def test_a_motion_of_the_hand_gives_its_rests_only(data, name):
     found = find_dwells(log)
     assert len(found) == 2 and (np.abs(found.rate) < 0.05 * DEGREE).all()
     moving = log.time[log.moving > 0.5]
-    ends = [[float(word) for word in place.split() if word[0].isdigit()] for place in found.place]
+    ends = [[float(word) for word in place.split() if word[0].isdigit()]
+            for place in found.location]
     # The hand stands still a little before the recording says so.
     assert ends[0][1] < moving[0] and ends[1][0] > moving[-1] - 0.5

@@ -22,7 +22,7 @@ import efficiency
 from encoder_intervals import run
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
-from gyro_calibration.model.motion import from_rates
+from gyro_calibration.model.motion import motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def swing(duration, speed=60.0, period=8.0):
     knots = np.concatenate([half + start for start in np.arange(0.0, duration, period / 2)])
     rates = np.concatenate([np.array([0.0, 1.0, 1.0, 0.0]) * sign * speed * DEGREE
                             for sign in np.resize([1.0, -1.0], len(knots) // 4)])
-    return from_rates(knots, rates)
+    return motion_from_rates(knots, rates)
 
 
 def log_of(motion, duration, noise=None, generator=None, step=0.088 * DEGREE, late=0.0):
@@ -107,7 +107,7 @@ def test_the_model_holds_what_was_found():
 
 
 LATE = np.arange(len(CLEAN)) < 9990
-REST = from_rates(np.array([0.0, 100.0]), np.array([0.5, 0.5]))
+REST = motion_from_rates(np.array([0.0, 100.0]), np.array([0.5, 0.5]))
 REFUSED = {
     'no heading': (replace(
         CLEAN, reference_heading=None), 'reference_heading_deg'), 'no time': (replace(
@@ -175,9 +175,10 @@ def test_the_temperature_of_the_log_is_that_of_the_model():
 
 def test_the_residual_heading_is_what_the_calibration_leaves():
     found = calibrate_encoder(CLEAN)
-    assert found.before.largest > 10 * DEGREE
-    assert found.after.rms < 0.05 * DEGREE and found.after.rms < found.after.largest == np.abs(
-        found.after.heading).max()
+    assert found.residual_before.largest > 10 * DEGREE
+    after = found.residual_after
+    assert after.rms < 0.05 * DEGREE
+    assert after.rms < after.largest == np.abs(after.heading).max()
 
 
 @pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])

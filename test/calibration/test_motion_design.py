@@ -16,26 +16,32 @@ import json
 import math
 
 from chance import mean_bound, rms_bounds
-from gyro_calibration.calibration.likelihood import ASYMMETRY, fit_likelihood
+from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, fit_likelihood
 from gyro_calibration.calibration.motion_design import (
-    _Family,
-    Ability,
-    able,
-    best,
-    Forecast,
-    plain,
-    profile,
+    _MotionFamily,
+    build_motion,
+    CalibrationForecast,
+    can_follow,
+    find_best_motion,
+    plain_motion,
+    RobotLimits,
 )
 from gyro_calibration.calibration.self_calibration import (
     check_rest,
-    Reference,
-    rest_after,
+    find_rest_after,
+    ReferenceErrors,
     self_calibrate,
 )
 from gyro_calibration.cli.plan import write_motion
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model import presets
-from gyro_calibration.model.motion import CALIBRATION, from_rates, read_motion, ROBOT, turns
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    constant_rate_motion,
+    motion_from_rates,
+    read_motion,
+    ROBOT_MOTION,
+)
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -45,27 +51,29 @@ XV3500 = presets.XV3500.noise
 WHITE = Noise(XV3500.angle_random_walk)
 TIME = np.arange(2001) / 100.0
 ABILITIES = {
-    'a cable': Ability(60 * DEGREE, 120 * DEGREE, lowest=-180 * DEGREE, highest=180 * DEGREE),
-    'free': Ability(60 * DEGREE, 120 * DEGREE),
-    'a narrow place': Ability(60 * DEGREE, 60 * DEGREE, lowest=-20 * DEGREE, highest=20 * DEGREE),
-    'limited jerk': Ability(60 * DEGREE, 120 * DEGREE, 600 * DEGREE, 5 * DEGREE, -90 * DEGREE,
-                            90 * DEGREE),
-    'one way only': Ability(100 * DEGREE, 200 * DEGREE, lowest=-90 * DEGREE, highest=0.0),
-    'long rests': Ability(30 * DEGREE, 30 * DEGREE, lowest=-50 * DEGREE, highest=100 * DEGREE,
-                          rest=4.0),
+    'a cable': RobotLimits(60 * DEGREE, 120 * DEGREE, lowest=-180 * DEGREE, highest=180 * DEGREE),
+    'free': RobotLimits(60 * DEGREE, 120 * DEGREE),
+    'a narrow place': RobotLimits(60 * DEGREE, 60 * DEGREE, lowest=-20 * DEGREE,
+                                  highest=20 * DEGREE),
+    'limited jerk': RobotLimits(60 * DEGREE, 120 * DEGREE, 600 * DEGREE, 5 * DEGREE, -90 * DEGREE,
+                                90 * DEGREE),
+    'one way only': RobotLimits(100 * DEGREE, 200 * DEGREE, lowest=-90 * DEGREE, highest=0.0),
+    'long rests': RobotLimits(30 * DEGREE, 30 * DEGREE, lowest=-50 * DEGREE, highest=100 * DEGREE,
+                              rest=4.0),
 }
 
 
 @cache
 def planned(name):
-    return best(ABILITIES[name], Forecast(XV3500, 20.0, ROBOT, 160.0), 20.0,
-                np.random.default_rng(0), 30)
+    return find_best_motion(ABILITIES[name], CalibrationForecast(XV3500, 20.0, ROBOT_MOTION,
+                                                                 160.0), 20.0,
+                            np.random.default_rng(0), 30)
 
 
 @pytest.mark.parametrize('name', ABILITIES)
 def test_a_planned_motion_is_one_that_the_robot_can_do(name):
     motion, ability = planned(name).motion, ABILITIES[name]
-    assert (able(ability, motion) and motion.duration == pytest.approx(20.0, abs=1e-9)
+    assert (can_follow(ability, motion) and motion.duration == pytest.approx(20.0, abs=1e-9)
             and abs(motion.heading[-1]) < 1e-12)
     for begin in (0.0, 20.0 - ability.rest):
         assert not motion.rate_at(np.linspace(begin + 1e-6, begin + ability.rest - 1e-6, 50)).any()
@@ -82,30 +90,31 @@ def test_the_jerk_keeps_its_limit():
             <= 600 * DEGREE * 1.01)
 
 
-SLUGGISH = {'hardly any acceleration': Ability(60 * DEGREE, 1 * DEGREE),
-            'hardly any jerk': Ability(60 * DEGREE, 120 * DEGREE, 5 * DEGREE)}
+SLUGGISH = {'hardly any acceleration': RobotLimits(60 * DEGREE, 1 * DEGREE),
+            'hardly any jerk': RobotLimits(60 * DEGREE, 120 * DEGREE, 5 * DEGREE)}
 
 
 @pytest.mark.parametrize('name', SLUGGISH)
 def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
     """In 4.5 s from rest: 1 deg/s² gives 4.5 deg/s, 5 deg/s³ gives 5 (4.5 / 2)² = 25.3 deg/s."""
-    ability, forecast = SLUGGISH[name], Forecast(XV3500, 20.0, ROBOT, 160.0)
+    ability, forecast = SLUGGISH[name], CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
     fastest = {'hardly any acceleration': 4.5, 'hardly any jerk': 25.3125}[name] * DEGREE
-    simple, motion = (plain(ability, 20.0),
-                      best(ability, forecast, 20.0, np.random.default_rng(1), 5).motion)
+    simple, motion = (plain_motion(ability, 20.0),
+                      find_best_motion(ability, forecast, 20.0, np.random.default_rng(1),
+                                       5).motion)
     for each in (simple, motion):
-        assert (able(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
+        assert (can_follow(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
                 and abs(each.heading[-1]) < 1e-9)
     assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
-    assert (ability.reach(9.0) == pytest.approx(4.5 * fastest)
-            and ability.fastest(4.5 * fastest) == pytest.approx(fastest))
+    assert (ability.max_turn_angle(9.0) == pytest.approx(4.5 * fastest)
+            and ability.max_turn_rate(4.5 * fastest) == pytest.approx(fastest))
 
 
 @pytest.mark.parametrize('name', ABILITIES)
 def test_it_tells_the_scale_better_than_a_plain_motion(name):
-    forecast = Forecast(XV3500, 20.0, ROBOT, 160.0)
-    simple = plain(ABILITIES[name], 20.0)
-    assert (able(ABILITIES[name], simple) and abs(simple.heading[-1]) < 1e-12
+    forecast = CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
+    simple = plain_motion(ABILITIES[name], 20.0)
+    assert (can_follow(ABILITIES[name], simple) and abs(simple.heading[-1]) < 1e-12
             and simple.duration == pytest.approx(20.0, abs=1e-9))
     assert (planned(name).prediction.scale_deviation
             < 0.75 * forecast.predict(simple).scale_deviation)
@@ -113,21 +122,23 @@ def test_it_tells_the_scale_better_than_a_plain_motion(name):
 
 def test_no_random_motion_that_the_robot_can_do_is_better():
     """500 motions of random turns, rates and rests, stretched to the limit of time or place."""
-    ability, forecast, generator = (ABILITIES['a cable'], Forecast(XV3500, 20.0, ROBOT, 160.0),
-                                    np.random.default_rng(3))
-    family, errors = _Family(ability, 20.0), []
+    ability, forecast, generator = (ABILITIES['a cable'],
+                                    CalibrationForecast(XV3500, 20.0, ROBOT_MOTION,
+                                                        160.0), np.random.default_rng(3))
+    family, errors = _MotionFamily(ability, 20.0), []
     for _ in range(500):
         ends = np.append(generator.uniform(-1.0, 1.0, generator.integers(1, 8)), 0.0)
-        rows = family._timed(np.diff(ends, prepend=0.0),
-                             generator.uniform(0.2, 1.0, len(ends)), 0.0)
+        rows = family._fit_duration(np.diff(ends, prepend=0.0),
+                                    generator.uniform(0.2, 1.0, len(ends)), 0.0)
         if rows is not None:
-            errors.append(forecast.error(profile(ability, rows, 1.0)))
-    assert len(errors) > 100 and min(errors) > forecast.error(planned('a cable').motion)
+            errors.append(forecast.search_error(build_motion(ability, rows, 1.0)))
+    assert len(errors) > 100 and min(errors) > forecast.search_error(planned('a cable').motion)
 
 
 def test_the_same_seed_plans_the_same_motion():
-    first, second = (best(ABILITIES['free'], Forecast(XV3500, 10.0, ROBOT, 160.0), 10.0,
-                          np.random.default_rng(4), 10) for _ in range(2))
+    first, second = (find_best_motion(ABILITIES['free'],
+                                      CalibrationForecast(XV3500, 10.0, ROBOT_MOTION, 160.0), 10.0,
+                                      np.random.default_rng(4), 10) for _ in range(2))
     assert (np.array_equal(first.motion.time, second.motion.time)
             and np.array_equal(first.motion.rate, second.motion.rate))
 
@@ -139,11 +150,11 @@ def test_the_bias_is_as_well_known_as_white_noise_allows_whatever_the_motion():
     The fit weighs means over blocks, which costs half a percent at the ends.
 
     """
-    forecast = Forecast(WHITE, 20.0, ROBOT, 160.0, 0.0)
+    forecast = CalibrationForecast(WHITE, 20.0, ROBOT_MOTION, 160.0, 0.0)
     expected = WHITE.angle_random_walk / math.sqrt(20.0)
-    for motion in (CALIBRATION, *(planned(name).motion for name in ABILITIES),
-                   plain(ABILITIES['free'], 20.0)):
-        senses = ASYMMETRY * np.abs(motion.rate_at(TIME)).mean()
+    for motion in (CALIBRATION_MOTION, *(planned(name).motion for name in ABILITIES),
+                   plain_motion(ABILITIES['free'], 20.0)):
+        senses = ASYMMETRY_DEVIATION * np.abs(motion.rate_at(TIME)).mean()
         assert (0.999 * expected < forecast.predict(motion).bias_deviation
                 < 1.01 * math.hypot(expected, senses))
 
@@ -154,14 +165,14 @@ def test_a_calibration_states_what_the_plan_promised(size):
     noise, deviations = Noise(size * WHITE.angle_random_walk), []
     time = np.arange(2450) / 100.0
     for seed in range(24):
-        rate = np.where(time <= 20.0, CALIBRATION.rate_at(time), 0.0) + simulate_noise(
+        rate = np.where(time <= 20.0, CALIBRATION_MOTION.rate_at(time), 0.0) + simulate_noise(
             noise, len(time), 0.01, np.random.default_rng([3, seed]))
-        fit = self_calibrate(time[time < 21.0], rate[time < 21.0], CALIBRATION, noise=noise,
-                             reference=Reference())
-        rest = rest_after(time, rate, fit, CALIBRATION)
+        fit = self_calibrate(time[time < 21.0], rate[time < 21.0], CALIBRATION_MOTION, noise=noise,
+                             reference=ReferenceErrors())
+        rest = find_rest_after(time, rate, fit, CALIBRATION_MOTION)
         deviations.append(np.sqrt(np.diag(
             check_rest(time[rest], rate[rest], fit, noise).fit.covariance)))
-    promised = Forecast(noise, 20.0, ROBOT, 160.0).predict(CALIBRATION)
+    promised = CalibrationForecast(noise, 20.0, ROBOT_MOTION, 160.0).predict(CALIBRATION_MOTION)
     ratio = np.median(deviations, axis=0) / (promised.scale_deviation, promised.bias_deviation)
     assert (np.abs(np.log(ratio)) < math.log(1.1)).all(), ratio
 
@@ -174,8 +185,9 @@ def test_flicker_and_random_walk_part_the_bias_from_that_of_the_drive_as_simulat
             bias = simulate_noise(noise, 3600, 0.1, generator)[1800:]
             differences.append(bias[:200].mean() - bias[200:].mean())
         # with white noise the fit takes the mean over the run
-        white, both = (Forecast(replace(each, angle_random_walk=1e-3), 20.0, ROBOT,
-                                160.0, 0.0).predict(CALIBRATION).bias_deviation
+        white, both = (CalibrationForecast(replace(each,
+                                                   angle_random_walk=1e-3), 20.0, ROBOT_MOTION,
+                                           160.0, 0.0).predict(CALIBRATION_MOTION).bias_deviation
                        for each in (Noise(), noise))
         low, high = rms_bounds(1499)
         assert low < np.std(differences, ddof=1) / math.sqrt(both ** 2 - white ** 2) < high
@@ -201,7 +213,7 @@ def test_fits_scatter_as_predicted(name, late, lag):
         fit = fit_likelihood(TIME, rate + simulate_noise(
             WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])), motion, 0.2)
         errors.append((fit.scale_factor_error, fit.bias))
-    expected = Forecast(WHITE, 20.0, ROBOT, 160.0, 0.0).predict(motion)
+    expected = CalibrationForecast(WHITE, 20.0, ROBOT_MOTION, 160.0, 0.0).predict(motion)
     ratios = np.std(errors, axis=0, ddof=1) / (expected.scale_deviation, expected.bias_deviation)
     low, high = rms_bounds(19)
     assert ((low < ratios) & (ratios < high)).all(), ratios
@@ -210,23 +222,25 @@ def test_fits_scatter_as_predicted(name, late, lag):
 def test_the_heading_of_a_drive_errs_as_predicted():
     """300 runs of white noise; s and b are weighted sums, so that only the mapping is tested."""
     noise, generator, drive = WHITE, np.random.default_rng(1), np.arange(1, 1601) / 10.0
-    rate, errors = CALIBRATION.rate_at(TIME), []
+    rate, errors = CALIBRATION_MOTION.rate_at(TIME), []
     for _ in range(300):
         white = simulate_noise(noise, len(TIME), 0.01, generator)
         s, b = np.linalg.lstsq(np.column_stack([rate, np.ones(len(TIME))]), white, rcond=None)[0]
         walk = np.cumsum(simulate_noise(noise, len(drive), 0.1, generator)) * 0.1
-        errors.append(np.abs(walk - s * ROBOT.heading_at(drive) - b * drive).mean())
-    predicted = Forecast(noise, 20.0, ROBOT, 160.0, 0.0).predict(CALIBRATION).heading_error
+        errors.append(np.abs(walk - s * ROBOT_MOTION.heading_at(drive) - b * drive).mean())
+    predicted = (CalibrationForecast(noise, 20.0, ROBOT_MOTION, 160.0,
+                                     0.0).predict(CALIBRATION_MOTION).heading_error)
     assert predicted == pytest.approx(np.mean(errors),
                                       abs=mean_bound(np.array(errors) - predicted))
 
 
 def test_where_the_drive_turns_round_and_round_the_motion_gains_heading():
-    round_and_round = turns([(160.0, 45.0)])
-    forecast, generator = Forecast(XV3500, 20.0, round_and_round, 160.0), np.random.default_rng(0)
-    chosen = best(ABILITIES['free'], forecast, 20.0, generator, 15).prediction
+    round_and_round = constant_rate_motion([(160.0, 45.0)])
+    forecast, generator = (CalibrationForecast(XV3500, 20.0, round_and_round,
+                                               160.0), np.random.default_rng(0))
+    chosen = find_best_motion(ABILITIES['free'], forecast, 20.0, generator, 15).prediction
     assert (chosen.heading_error
-            < 0.85 * forecast.predict(plain(ABILITIES['free'], 20.0)).heading_error)
+            < 0.85 * forecast.predict(plain_motion(ABILITIES['free'], 20.0)).heading_error)
 
 
 @pytest.mark.parametrize('name', ABILITIES)
@@ -240,22 +254,23 @@ def test_the_file_is_read_and_a_run_of_it_calibrates(name, tmp_path):
 
 
 IMPOSSIBLE = {
-    'no time': (Ability(1.0, 2.0, rest=10.0), 20.0, '20 s are too short for rests of 10 s'),
-    'no time at the slowest rate': (Ability(1.0, 0.5, slowest=0.5, rest=1.0), 5.0, 'too short'),
-    'no place': (Ability(1.0, 2.0, lowest=0.0, highest=0.0), 20.0,
-                 'the place leaves a turn of 0 deg'),
-    'no place at the slowest rate': (Ability(1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5),
-                                     20.0, 'more place or more acceleration'),
-    'nothing worth it': (Ability(0.01, 0.02), 20.0, 'determines the scale factor to'),
-    'next to no time': (Ability(1.0, 2.0, 0.5, rest=1.0), 2.02, ''),
+    'no time': (RobotLimits(1.0, 2.0, rest=10.0), 20.0, '20 s are too short for rests of 10 s'),
+    'no time at the slowest rate': (RobotLimits(1.0, 0.5, slowest=0.5,
+                                                rest=1.0), 5.0, 'too short'),
+    'no place': (RobotLimits(1.0, 2.0, lowest=0.0,
+                             highest=0.0), 20.0, 'the place leaves a turn of 0 deg'),
+    'no place at the slowest rate': (RobotLimits(
+        1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5), 20.0, 'more place or more acceleration'),
+    'nothing worth it': (RobotLimits(0.01, 0.02), 20.0, 'determines the scale factor to'),
+    'next to no time': (RobotLimits(1.0, 2.0, 0.5, rest=1.0), 2.02, ''),
 }
 
 
 @pytest.mark.parametrize('ability, seconds, reason', IMPOSSIBLE.values(), ids=IMPOSSIBLE)
 def test_the_impossible_is_refused_in_a_sentence(ability, seconds, reason):
     with pytest.raises(DataRefused) as refused:
-        best(ability, Forecast(XV3500, seconds, ROBOT, 160.0), seconds,
-             np.random.default_rng(0), 5)
+        find_best_motion(ability, CalibrationForecast(XV3500, seconds, ROBOT_MOTION, 160.0),
+                         seconds, np.random.default_rng(0), 5)
     assert reason in str(refused.value) and '\n' not in str(refused.value)
 
 
@@ -271,7 +286,7 @@ def limits(tmp_path):
 
 
 def test_the_verb_writes_a_profile_and_says_what_it_is_worth(run, limits, tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.cli.plan.LENGTHS', (30.0,))
+    monkeypatch.setattr('gyro_calibration.cli.plan.COMPARED_DURATIONS', (30.0,))
     code, text, _ = run('plan', '--limits', limits(maximum_heading_deg=90.0), '--seconds', 15,
                         '--out', tmp_path / 'profile.csv', '--json')
     answer, motion = json.loads(text), read_motion(tmp_path / 'profile.csv')
@@ -284,8 +299,9 @@ def test_the_verb_writes_a_profile_and_says_what_it_is_worth(run, limits, tmp_pa
 
 
 def test_the_verb_prints_a_summary(run, limits, tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.cli.plan.LENGTHS', (12.0,))
-    write_motion(tmp_path / 'drive.csv', from_rates(np.array([0.0, 10.0]), np.array([0.5, 0.5])))
+    monkeypatch.setattr('gyro_calibration.cli.plan.COMPARED_DURATIONS', (12.0,))
+    write_motion(tmp_path / 'drive.csv',
+                 motion_from_rates(np.array([0.0, 10.0]), np.array([0.5, 0.5])))
     code, text, _ = run('plan', '--limits', limits(), '--seconds', 10,
                         '--motion', tmp_path / 'drive.csv', '--drive', 30)
     assert (code == 0 and 'planned, 12 s:' in text and 'heading over 30 s' in text

@@ -14,11 +14,11 @@ import math
 
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise,
+    bias_wander_columns,
+    fit_noise_grid,
     heading_noise,
-    noise_grid,
     SharedNoise,
-    Tridiagonal,
-    wander,
+    TridiagonalMatrix,
 )
 import numpy as np
 import pytest
@@ -40,10 +40,10 @@ def headings(generator, count=240, walk=0.2 * DEGREE, reference=0.5 * DEGREE, mo
 
 def fitted(time, rate, turned, seen, **options):
     """Return the fit of scale and bias to increments."""
-    cosines, wanders = wander(time)
+    cosines, wanders = bias_wander_columns(time)
     columns = np.column_stack([np.diff(seen), np.diff(time)])
-    return noise_grid(np.diff(turned), columns, heading_noise(time, rate, **options), cosines,
-                      wanders, noisy_column=0, wandering=1)
+    return fit_noise_grid(np.diff(turned), columns, heading_noise(time, rate, **options), cosines,
+                          wanders, noisy_column=0, wandering_value=1)
 
 
 def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
@@ -54,7 +54,7 @@ def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
     parts = [BandedNoise('a', np.full(n, 2.0), np.full(n, -0.9), (0.5, 0.5)),
              BandedNoise('b', np.linspace(1.0, 2.0, n), None, (1.5, 1.5))]
     variance = np.array([1.0, 0.5, 0.1])
-    found = noise_grid(observed, columns, parts, shared, [_shared('c', variance, 2.0)])
+    found = fit_noise_grid(observed, columns, parts, shared, [_shared('c', variance, 2.0)])
     dense = 0.25 * (
         2.0 * np.eye(n) - 0.9 * np.eye(n, k=1) - 0.9 * np.eye(n, k=-1)
     ) + 2.25 * np.diag(np.linspace(1.0, 2.0, n))
@@ -77,7 +77,7 @@ def _shared(name, variance, size):
 
 def test_whitened_noise_is_independent():
     diagonal, neighbours = np.linspace(2.0, 3.0, 30), np.full(30, -0.8)
-    matrix = Tridiagonal(diagonal, neighbours)
+    matrix = TridiagonalMatrix(diagonal, neighbours)
     dense = np.diag(diagonal) + np.diag(neighbours[1:], 1) + np.diag(neighbours[1:], -1)
     whitened = matrix.whiten(np.eye(30))
     np.testing.assert_allclose(whitened @ dense @ whitened.T, np.eye(30), atol=1e-12)
@@ -101,8 +101,8 @@ def test_a_size_far_from_the_points_of_the_first_grid_is_found():
     """The first points are a factor of 18 apart."""
     white = np.random.default_rng(5).standard_normal(400)
     for size in np.geomspace(0.03, 0.6, 13):
-        found = noise_grid(size * white, np.ones((400, 1)),
-                           [BandedNoise('size', np.ones(400), None, (1e-4, 10.0))])
+        found = fit_noise_grid(size * white, np.ones((400, 1)),
+                               [BandedNoise('size', np.ones(400), None, (1e-4, 10.0))])
         assert found.size('size') == pytest.approx(size * white.std(ddof=1), rel=0.02)
 
 
@@ -114,8 +114,9 @@ def test_noise_of_the_reference_does_not_make_the_scale_smaller():
         generator = np.random.default_rng([seed, 1])
         true = (turned - BIAS * time) / SCALE
         seen = true + 7.0 * DEGREE * generator.standard_normal(len(true))
-        found = fitted(time, np.zeros_like(time), turned, seen, unit=5.0 * DEGREE,
-                       angle_random_walk=(0.02 * DEGREE,) * 2)
+        found = fitted(time, np.zeros_like(time), turned, seen,
+                       typical_reference_noise=5.0 * DEGREE,
+                       angle_random_walk=(0.02 * DEGREE, ) * 2)
         errors.append(found.values[0] - SCALE)
         plain = np.polyfit(np.diff(seen), np.diff(turned), 1)[0]
         assert plain < 0.85 * SCALE
@@ -135,8 +136,9 @@ def test_a_gap_of_the_reference_is_a_long_span():
 def test_a_value_that_nothing_shows_keeps_its_prior():
     time, rate, turned, seen = headings(np.random.default_rng(4))
     columns = np.column_stack([np.zeros(len(time) - 1), np.diff(time)])
-    found = noise_grid(np.diff(turned - SCALE * seen), columns, heading_noise(time, rate),
-                       prior_mean=np.array([1.0, 0.0]), prior_deviation=np.array([0.02, math.inf]))
+    found = fit_noise_grid(np.diff(turned - SCALE * seen), columns, heading_noise(time, rate),
+                           prior_mean=np.array([1.0,
+                                                0.0]), prior_deviation=np.array([0.02, math.inf]))
     assert found.values[0] == pytest.approx(1.0) and found.deviations[0] == pytest.approx(0.02)
     # five deviations of the mean of an angle random walk of 0.2 deg/√s over 240 s
     assert found.values[1] == pytest.approx(BIAS, abs=5.0 * 0.2 * DEGREE / math.sqrt(240.0))
@@ -144,7 +146,7 @@ def test_a_value_that_nothing_shows_keeps_its_prior():
 
 def test_too_few_observations_are_refused():
     with pytest.raises(ValueError, match='2 observations do not determine 2 values'):
-        noise_grid(np.zeros(2), np.eye(2), [BandedNoise('a', np.ones(2), None, (1.0, 1.0))])
+        fit_noise_grid(np.zeros(2), np.eye(2), [BandedNoise('a', np.ones(2), None, (1.0, 1.0))])
 
 
 @pytest.mark.evidence

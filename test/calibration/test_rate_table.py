@@ -13,17 +13,17 @@
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, from_table, take
+from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.rate_table import (
-    binned,
+    bin_errors,
     channels_of,
     EffectsUnidentifiable,
     fit_effects,
 )
 from gyro_calibration.calibration.scatter import (
-    _restricted_likelihood,
-    _surface,
-    find_scatter,
+    _restricted_log_likelihood,
+    _smooth_surface,
+    estimate_scatter,
     Scatter,
     Whitener,
 )
@@ -37,7 +37,7 @@ from gyro_calibration.model.effects import (
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
-    STEADY,
+    STATIC_EFFECTS,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
@@ -78,7 +78,7 @@ def test_a_sine_that_is_zero_at_the_rates_of_all_dwells_is_chance():
     noise = 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
     fit = fit_effects(dwells(rate, noise), [BIAS, SCALE_FACTOR_ERROR])
     sine = Term(SINE_RESPONSE, (30.0, 1.0))
-    assert replace(fit, terms=(*fit.terms, sine)).chance_of(SINE_RESPONSE) == 1.0
+    assert replace(fit, terms=(*fit.terms, sine)).p_value(SINE_RESPONSE) == 1.0
 
 
 @pytest.mark.parametrize('terms, table', [
@@ -153,7 +153,8 @@ def test_the_matrix_of_the_paper_is_the_polynomial():
     raw = np.column_stack([table.temperature ** j * (table.output / DEGREE) ** i for j in range(3)
                            for i in range(4)])
     columns = np.column_stack(fit.terms[0].columns(channels_of(table)))
-    assert fit.condition < 100.0 and np.linalg.cond(columns) < 1e3 < 1e9 < np.linalg.cond(raw)
+    assert (fit.condition_number < 100.0
+            and np.linalg.cond(columns) < 1e3 < 1e9 < np.linalg.cond(raw))
 
 
 # few dwells
@@ -186,14 +187,14 @@ def test_intervals_from_three_speeds_hold_the_truth(runs):
 def test_as_many_values_as_dwells_have_no_covariance():
     table = measured(SINE, sweeps=3, rates=4)
     fit = fit_effects(table, [rate_temperature_polynomial(3, 2)])
-    assert len(table) == 12 and fit.model.covariance is None and fit.freedom == 0
+    assert len(table) == 12 and fit.model.covariance is None and fit.dof == 0
 
 
 # scatter
 
 def test_the_scatter_of_sweeps_is_found():
     wander = 0.05 * DEGREE
-    found = find_scatter(measured(SINE, sweeps=24, sweep_bias=wander)).sweep_bias / wander
+    found = estimate_scatter(measured(SINE, sweeps=24, sweep_bias=wander)).sweep_bias / wander
     # One value is fitted to the biases of the sweeps, three to their change with temperature.
     assert math.sqrt(chi2.ppf(RARE, 20) / 20) < found < math.sqrt(chi2.ppf(1 - RARE, 20) / 20)
 
@@ -204,12 +205,12 @@ def test_the_scatter_that_is_found_is_likelier_than_the_true_one(sweeps, rates):
         shape = Table(sweeps=sweeps, rates=rates, fastest=200.0 * DEGREE, dwell=0.01 * DEGREE,
                       dwell_scale=7e-4)
         table = shape.measure(GyroModel(SINE), np.random.default_rng(seed))
-        found = find_scatter(table)
-        used = take(table, found.kept)
-        surface, error = _surface(used), used.output - used.rate
+        found = estimate_scatter(table)
+        used = select_dwells(table, found.inliers)
+        surface, error = _smooth_surface(used), used.output - used.rate
         error = error - surface @ (surface.T @ error)
-        true = Scatter(shape.dwell, shape.dwell_scale, 0.0, 0.0, found.kept)
-        best, as_simulated = (_restricted_likelihood(used, each, error, surface)
+        true = Scatter(shape.dwell, shape.dwell_scale, 0.0, 0.0, found.inliers)
+        best, as_simulated = (_restricted_log_likelihood(used, each, error, surface)
                               for each in (found, true))
         assert best > as_simulated - 0.01
 
@@ -218,7 +219,7 @@ def test_the_scatter_that_is_found_is_likelier_than_the_true_one(sweeps, rates):
 def test_a_table_without_any_error_is_fitted(rates):
     fit = fit_effects(dwells(rates, 0.0), [BIAS])
     assert fit.model.terms[0].values[0] == pytest.approx(0.0, abs=1e-15)
-    assert fit.chance_of(BIAS) == 1.0
+    assert fit.p_value(BIAS) == 1.0
 
 
 def test_whitening_is_by_the_whole_covariance():
@@ -226,7 +227,7 @@ def test_whitening_is_by_the_whole_covariance():
     scatter = Scatter(1e-3, 2e-3, 3e-3, 4e-3, np.ones(len(table), bool))
     same = table.sweep[:, None] == table.sweep
     covariance = (np.diag(scatter.deviation(table) ** 2)
-                  + same * (scatter.shared(table) @ scatter.shared(table).T))
+                  + same * (scatter.sweep_columns(table) @ scatter.sweep_columns(table).T))
     whitener, error = Whitener(table, scatter), table.output - table.rate
     assert whitener.whiten(error) @ whitener.whiten(error) == pytest.approx(
         error @ np.linalg.solve(covariance, error))
@@ -238,12 +239,12 @@ def test_what_is_left_out_is_what_a_fit_without_the_sweep_gives():
     effects = [term.effect for term in CUBIC]
     fit = fit_effects(table, effects)
     seen = table.sweep != 2
-    without = fit_effects(take(table, seen), effects,
-                          replace(fit.scatter, kept=np.ones(seen.sum(), bool))).model
-    hidden = take(table, ~seen)
-    np.testing.assert_allclose(
-        fit.left_out[~seen], hidden.output - hidden.rate - without.error(channels_of(hidden)),
-        atol=1e-9)
+    without = fit_effects(select_dwells(table, seen), effects,
+                          replace(fit.scatter, inliers=np.ones(seen.sum(), bool))).model
+    hidden = select_dwells(table, ~seen)
+    np.testing.assert_allclose(fit.left_out_residual[~seen],
+                               hidden.output - hidden.rate - without.error(channels_of(hidden)),
+                               atol=1e-9)
 
 
 def test_what_one_sweep_alone_shows_cannot_be_left_out():
@@ -251,8 +252,8 @@ def test_what_one_sweep_alone_shows_cannot_be_left_out():
     rate = np.where(table.sweep == 0, table.rate, 0.0)
     fit = fit_effects(replace(table, rate=rate, output=table.output - table.rate + rate),
                       (BIAS, SCALE_FACTOR_ERROR))
-    assert (np.isinf(fit.left_out[table.sweep == 0]).all()
-            and np.isfinite(fit.left_out[table.sweep > 0]).all())
+    assert (np.isinf(fit.left_out_residual[table.sweep == 0]).all()
+            and np.isfinite(fit.left_out_residual[table.sweep > 0]).all())
 
 
 def test_an_outlying_dwell_is_not_fitted():
@@ -261,20 +262,20 @@ def test_an_outlying_dwell_is_not_fitted():
                   + np.where(np.arange(len(table)) == 30, 0.5 * DEGREE, 0.0))
     effects, others = [term.effect for term in SINE], np.arange(len(table)) != 30
     fit = fit_effects(off, effects)
-    clean = fit_effects(take(table, others), effects,
-                        replace(fit.scatter, kept=np.ones(167, bool)))
-    assert np.flatnonzero(~fit.scatter.kept).tolist() == [30]
-    np.testing.assert_allclose(fit.residual[fit.scatter.kept], clean.residual, atol=1e-6)
+    clean = fit_effects(select_dwells(table, others), effects,
+                        replace(fit.scatter, inliers=np.ones(167, bool)))
+    assert np.flatnonzero(~fit.scatter.inliers).tolist() == [30]
+    np.testing.assert_allclose(fit.residual[fit.scatter.inliers], clean.residual, atol=1e-6)
     assert (fit.residual[30] == pytest.approx(0.5 * DEGREE, abs=6 * 0.03 * DEGREE)
-            and np.isnan(fit.left_out[30]))
+            and np.isnan(fit.left_out_residual[30]))
 
 
 def test_bins_hold_all_dwells_that_were_fitted_and_know_what_sweeps_share():
     fit = fit_effects(measured(SINE, sweep_bias=0.1 * DEGREE), [term.effect for term in SINE])
-    parts = binned(fit, fit.dwells.temperature)
-    assert sum(part.count for part in parts) == fit.scatter.kept.sum()
+    parts = bin_errors(fit, fit.dwells.temperature)
+    assert sum(part.count for part in parts) == fit.scatter.inliers.sum()
     assert (min(part.deviation for part in parts) > 0.5 * fit.scatter.sweep_bias
-            > fit.scatter.dwell / 2.0)
+            > fit.scatter.dwell_bias / 2.0)
 
 
 def test_rates_beyond_the_top_of_a_sine_are_reported():
@@ -284,7 +285,8 @@ def test_rates_beyond_the_top_of_a_sine_are_reported():
             (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE))
         for fastest in (450.0, 250.0))
     # 90 degrees of phase are at 360 deg/s
-    assert within.folded_beyond is None and 300.0 < beyond.folded_beyond / DEGREE < 400.0
+    assert (within.min_non_monotonic_rate is None
+            and 300.0 < beyond.min_non_monotonic_rate / DEGREE < 400.0)
 
 
 # refusals
@@ -332,14 +334,14 @@ def test_a_polynomial_of_too_high_an_order_is_refused_in_a_whole_sentence():
 def test_fewer_dwells_than_values_are_refused():
     with pytest.raises(DataRefused,
                        match='2 dwells do not determine 9 values; add dwells, or fit fewer'):
-        fit_effects(dwells([0.0, 1.0], 0.0, np.array([20.0, 40.0])), list(STEADY.values()))
+        fit_effects(dwells([0.0, 1.0], 0.0, np.array([20.0, 40.0])), list(STATIC_EFFECTS.values()))
 
 
 # a polynomial of the output
 
 def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the_output_away(data):
     """On this table 0.1.0 stated t0w1 = 0.097 +- 46 deg/s, with a residual of 0.045."""
-    fit = fit_effects(from_table(read_log(data / 'fog_rate_table' / 'table.csv')),
+    fit = fit_effects(dwells_from_table(read_log(data / 'fog_rate_table' / 'table.csv')),
                       [rate_temperature_polynomial(3, 2)])
     assert np.sqrt(np.diag(fit.model.covariance)).max() < 2.0 * fit.residual_rms
 
@@ -349,7 +351,7 @@ def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
     for seed in range(10):
         table, output = simulated_table(np.random.default_rng(seed))
         model = fit_effects(table, [rate_temperature_polynomial(3, 2)]).model
-        at = channels_of(table).moving(table.rate, output)
+        at = channels_of(table).with_rate(table.rate, output)
         rows = np.array(model.terms[0].sensitivity(at))
         off = model.error(at) - (output - table.rate)
         held.append(

@@ -21,20 +21,29 @@ import math
 
 from chance import fewest, most
 from fooled import LEVELS, tried, WAYS
-from gyro_calibration.calibration.likelihood import Fit, fit_likelihood, UNLIKELY
-from gyro_calibration.calibration.run_faults import pieces, unit_error
+from gyro_calibration.calibration.likelihood import (
+    fit_likelihood,
+    MIN_FIT_PROBABILITY,
+    ScaleBiasFit,
+)
+from gyro_calibration.calibration.run_faults import describe_unit_error, split_run
 from gyro_calibration.calibration.self_calibration import (
     check_rest,
-    Limits,
-    Reference,
-    rest_after,
+    find_rest_after,
+    ReferenceErrors,
+    RunLimits,
     self_calibrate,
 )
 from gyro_calibration.calibration.whole_turns import calibrate_turns
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
-from gyro_calibration.model.motion import CALIBRATION, from_headings, from_rates, turns
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    constant_rate_motion,
+    motion_from_headings,
+    motion_from_rates,
+)
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
 import numpy as np
@@ -65,7 +74,7 @@ def test_good_runs_are_accepted_and_their_intervals_hold_the_truth(level, runs):
     assert (np.abs(accepted[:, :2]) < 4.0).all()
 
 
-def output(seed=0, motion=CALIBRATION, time=TIME, level=1.0):
+def output(seed=0, motion=CALIBRATION_MOTION, time=TIME, level=1.0):
     """Return the output of an XV3500 with a multiple of its noise in a motion."""
     noise = Noise(level * XV3500.noise.angle_random_walk, level * XV3500.noise.bias_instability)
     return ((1 + S) * motion.rate_at(time) + B
@@ -76,37 +85,40 @@ def output(seed=0, motion=CALIBRATION, time=TIME, level=1.0):
 def test_the_goodness_of_fit_has_the_probability_that_it_says(runs):
     """The probability is uniform where the noise is as stated: mean to 4 standard errors."""
     probabilities = [
-        self_calibrate(TIME, output(seed), CALIBRATION, noise=XV3500.noise).goodness.probability
-        for seed in range(runs)]
+        self_calibrate(TIME, output(seed), CALIBRATION_MOTION,
+                       noise=XV3500.noise).goodness.probability for seed in range(runs)
+    ]
     assert np.mean(probabilities) == pytest.approx(0.5, abs=4.0 / math.sqrt(12.0 * runs))
 
 
 def test_noise_beyond_the_models_is_reported_and_more_of_it_refused():
-    goodness = self_calibrate(TIME, output(level=3.0), CALIBRATION, noise=XV3500.noise).goodness
-    assert goodness.probability < UNLIKELY and goodness.noise_ratio == pytest.approx(3.0, rel=0.4)
+    goodness = (self_calibrate(TIME, output(level=3.0), CALIBRATION_MOTION,
+                               noise=XV3500.noise).goodness)
+    assert (goodness.probability < MIN_FIT_PROBABILITY
+            and goodness.noise_ratio == pytest.approx(3.0, rel=0.4))
     assert 'more than the noise explains' in str(goodness)
     with pytest.raises(DataRefused, match='times as noisy as the model states|a slip or a bump'):
-        self_calibrate(TIME, output(level=15.0), CALIBRATION, noise=XV3500.noise,
-                       limits=Limits(scale_standard_deviation=1.0))
+        self_calibrate(TIME, output(level=15.0), CALIBRATION_MOTION, noise=XV3500.noise,
+                       limits=RunLimits(max_scale_deviation=1.0))
 
 
 def test_an_early_end_is_reported_by_when():
-    motion = turns([(1, 0), (4, 45), (1, 0), (2, -45), (20, 0)])
+    motion = constant_rate_motion([(1, 0), (4, 45), (1, 0), (2, -45), (20, 0)])
     with pytest.raises(DataRefused,
                        match=r'stopped at about (7\.[5-9]|8\.[0-5]) s of the profile\'s 20\.0 s'):
-        self_calibrate(TIME, output(motion=motion), CALIBRATION, noise=XV3500.noise)
+        self_calibrate(TIME, output(motion=motion), CALIBRATION_MOTION, noise=XV3500.noise)
 
 
 def test_a_robot_that_begins_too_late_is_reported_by_how_much():
     time = np.arange(2301) / 100.0
     with pytest.raises(DataRefused, match=r'began (2\.4|2\.5|2\.6) s after the profile'):
-        self_calibrate(time, output(time=time - 2.5), CALIBRATION, noise=XV3500.noise)
+        self_calibrate(time, output(time=time - 2.5), CALIBRATION_MOTION, noise=XV3500.noise)
 
 
 def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_length():
     """The node serves nothing else meanwhile; short pieces only would take 10 times as long."""
     time, work = np.arange(30000) / 100.0, []
-    motion = from_rates(time, 0.5 * np.sin(0.5 * time))
+    motion = motion_from_rates(time, 0.5 * np.sin(0.5 * time))
     rate = ((1.0 + S) * motion.rate_at(time) + B + 0.3 * ((time > 9.0) & (time < 9.7))
             + 1e-3 * np.random.default_rng(0).standard_normal(len(time)))
 
@@ -114,12 +126,12 @@ def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_len
         with pytest.raises(DataRefused, match='turned (9|1[0-9.]+)[0-9.]* deg otherwise .* at '
                                               'about [789].* a slip or a bump'):
             self_calibrate(time[:count], rate[:count],
-                           from_rates(time[:count], motion.rate[:count]), noise=Noise(1e-4))
+                           motion_from_rates(time[:count], motion.rate[:count]), noise=Noise(1e-4))
     for count in (len(time) // 4, len(time)):
         work.append(operations(lambda: refused(count)))  # noqa: B023
-        assert len(pieces(time[:count], rate[:count]).turned) <= 650
+        assert len(split_run(time[:count], rate[:count]).gyro_angle) <= 650
     assert work[1] < 4.0 * work[0]
-    assert np.diff(pieces(time[:6000], rate[:6000]).edges) == pytest.approx(0.1), (
+    assert np.diff(split_run(time[:6000], rate[:6000]).edges) == pytest.approx(0.1), (
         'a minute keeps its short pieces')
 
 
@@ -127,14 +139,15 @@ def test_a_limit_hidden_by_the_model_is_seen_in_the_output():
     clipped = np.clip(output(), -40 * DEGREE, 40 * DEGREE)
     drifting = clipped - 1e-4 * TIME  # a compensation that changes with temperature
     with pytest.raises(DataRefused, match='saturated'):
-        self_calibrate(TIME, drifting, CALIBRATION, output=clipped)
+        self_calibrate(TIME, drifting, CALIBRATION_MOTION, output=clipped)
 
 
-LONG_RAMPS = from_rates(np.array([0.0, 2.0, 7.0, 8.0, 18.0, 19.0, 24.0, 26.0]),
-                        np.array([0, 0, 45, 45, -45, -45, 0, 0]) * DEGREE)
+LONG_RAMPS = motion_from_rates(np.array([0.0, 2.0, 7.0, 8.0, 18.0, 19.0, 24.0, 26.0]),
+                               np.array([0, 0, 45, 45, -45, -45, 0, 0]) * DEGREE)
 
 
-@pytest.mark.parametrize('motion', [CALIBRATION, LONG_RAMPS], ids=['short ramps', 'long ramps'])
+@pytest.mark.parametrize('motion', [CALIBRATION_MOTION, LONG_RAMPS],
+                         ids=['short ramps', 'long ramps'])
 def test_coarse_quantization_is_no_saturation(motion):
     code, time = 0.2 * DEGREE, np.arange(0.0, motion.duration, 0.01)
     fit = self_calibrate(
@@ -146,12 +159,12 @@ def test_coarse_quantization_is_no_saturation(motion):
     'scale, words', [(1.0, ''), (1.05, ''), (0.7, ''), (-57.0, 'turns the other way'), (0.0, ''),
                      (1030.0, 'thousandths'), (0.164, 'revolutions'), (3700.0, 'deg/h')])
 def test_a_unit_is_named_where_there_is_one(scale, words):
-    assert (words in unit_error(scale)) if words else not unit_error(scale)
+    assert (words in describe_unit_error(scale)) if words else not describe_unit_error(scale)
 
 
 @cache
 def calibrated(seed):
-    return self_calibrate(TIME, output(seed), CALIBRATION, noise=XV3500.noise)
+    return self_calibrate(TIME, output(seed), CALIBRATION_MOTION, noise=XV3500.noise)
 
 
 def rested(seed, change=0.0):
@@ -165,8 +178,8 @@ def test_a_rest_after_the_run_refuses_no_more_good_calibrations_than_it_says():
     refused = 0
     for seed in range(200):
         try:
-            check_rest(*rested(seed), calibrated(seed % 20), XV3500.noise, Limits(drift=0.0),
-                       false_refusals=0.1)
+            check_rest(*rested(seed), calibrated(seed % 20), XV3500.noise,
+                       RunLimits(max_rest_rate=0.0), false_refusal_rate=0.1)
         except DataRefused:
             refused += 1
     assert fewest(200, 0.1) <= refused <= most(200, 0.1)
@@ -189,14 +202,15 @@ def test_a_rest_after_the_run_must_be_there():
 def test_the_rest_after_a_run_is_found_and_a_drive_is_none():
     time = np.arange(2600) / 100.0
     rate = output(0, time=time)
-    rest = rest_after(time, rate, calibrated(0), CALIBRATION)
+    rest = find_rest_after(time, rate, calibrated(0), CALIBRATION_MOTION)
     assert (time[rest][0] == pytest.approx(21.0, abs=0.02)
             and time[rest][-1] == pytest.approx(26.0, abs=0.3))
-    driven = rest_after(time, rate + np.where(time > 24.5, 0.2, 0.0), calibrated(0), CALIBRATION)
+    driven = find_rest_after(time, rate + np.where(time > 24.5, 0.2, 0.0), calibrated(0),
+                             CALIBRATION_MOTION)
     assert driven.start == rest.start and 23.0 <= time[driven][-1] <= 24.5
-    assert rest_after(time, rate + np.where(time > 20.5, 0.2, 0.0), calibrated(0),
-                      CALIBRATION) is None
-    assert rest_after(TIME, rate[:2001], calibrated(0), CALIBRATION) is None
+    assert find_rest_after(time, rate + np.where(time > 20.5, 0.2, 0.0), calibrated(0),
+                           CALIBRATION_MOTION) is None
+    assert find_rest_after(TIME, rate[:2001], calibrated(0), CALIBRATION_MOTION) is None
 
 
 @pytest.mark.parametrize('yaw', [0.5, 2.0, -5.0])
@@ -204,9 +218,9 @@ def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
     """The fit takes it for a bias, and the rest after it then has a rate of opposite sign."""
     time = np.arange(2600) / 100.0
     rate = output(0, time=time) + np.where(time < 20.5, yaw * DEGREE, 0.0)
-    fit = self_calibrate(time[:2001], rate[:2001], CALIBRATION, noise=XV3500.noise)
+    fit = self_calibrate(time[:2001], rate[:2001], CALIBRATION_MOTION, noise=XV3500.noise)
     assert fit.bias - B == pytest.approx(yaw * DEGREE, rel=0.1)
-    rest = rest_after(time, rate, fit, CALIBRATION)
+    rest = find_rest_after(time, rate, fit, CALIBRATION_MOTION)
     with pytest.raises(DataRefused, match='the corrected rate is'):
         check_rest(time[rest], rate[rest], fit, XV3500.noise)
 
@@ -217,9 +231,9 @@ def test_the_rest_after_a_run_draws_the_bias_of_a_run_that_is_off(off):
     time, generator = np.arange(201) / 100.0, np.random.default_rng(7)
     run, errors = (0.01 * DEGREE) ** 2, []
     for _ in range(50):
-        fit = Fit(0.0, off * math.sqrt(run), np.diag([1e-6, run]))
+        fit = ScaleBiasFit(0.0, off * math.sqrt(run), np.diag([1e-6, run]))
         rest = check_rest(time, 0.2 * math.sqrt(run * len(time)) * generator.standard_normal(201),
-                          fit, limits=Limits(drift=1.0)).fit
+                          fit, limits=RunLimits(max_rest_rate=1.0)).fit
         errors.append(rest.bias / math.sqrt(rest.covariance[1, 1]))
         assert rest.covariance[1, 1] < 0.3 * run and rest.covariance[0, 0] == pytest.approx(1e-6)
     assert np.mean(np.abs(errors) < 1.96) > 0.8
@@ -229,15 +243,15 @@ def test_the_rest_of_a_robot_that_swings_out_begins_when_it_rests():
     time = np.arange(2600) / 100.0
     swing = 0.02 * np.exp(-2.0 * (time - 21.0)) * (time > 20.5)
     rate = calibrated(0).bias + 1e-5 * np.random.default_rng(3).standard_normal(2600) + swing
-    rest = rest_after(time, rate, calibrated(0), CALIBRATION)
+    rest = find_rest_after(time, rate, calibrated(0), CALIBRATION_MOTION)
     assert 22.5 < time[rest][0] <= 23.01
 
 
 def test_a_slip_at_speed_alone_is_in_the_interval_of_the_scale():
     """At 45 deg/s all turns lose 1.5 %, and those at 30 deg/s nothing."""
-    rate = CALIBRATION.rate_at(TIME)
+    rate = CALIBRATION_MOTION.rate_at(TIME)
     slipped = output(0) - (1.0 + S) * 0.015 * np.where(np.abs(rate) > 0.6, rate, 0.0)
-    fit = self_calibrate(TIME, slipped, CALIBRATION, noise=XV3500.noise)
+    fit = self_calibrate(TIME, slipped, CALIBRATION_MOTION, noise=XV3500.noise)
     deviation = math.sqrt(fit.covariance[0, 0])
     assert deviation > 0.008 and abs(fit.scale_factor_error - S) < 1.96 * deviation
 
@@ -246,18 +260,18 @@ def odometry(seed, deviation, drift):
     """Return the heading of wheels at 50 Hz with errors of scale and drift, and with slip."""
     generator = np.random.default_rng([seed, 2])
     fine = np.arange(20001) / 1000.0
-    rate = ((1 + deviation * generator.standard_normal()) * CALIBRATION.rate_at(fine)
+    rate = ((1 + deviation * generator.standard_normal()) * CALIBRATION_MOTION.rate_at(fine)
             + drift * generator.standard_normal())
     slip = (0.3 * DEGREE * np.sqrt(np.abs(rate) / (90 * DEGREE) / 1000.0)
             * generator.standard_normal(len(fine)))
     heading = np.concatenate([[0.0], np.cumsum(rate / 1000.0 + slip)[:-1]])
-    return from_headings(fine[::20], heading[::20])
+    return motion_from_headings(fine[::20], heading[::20])
 
 
 @pytest.mark.parametrize('runs', [10, pytest.param(25, marks=pytest.mark.evidence)])
 def test_odometry_calibrates_and_its_own_scale_and_drift_are_in_the_deviations(runs):
     """Of 60 runs, 93 to 98 % were within 1.96 standard deviations; 1 of 50 was refused."""
-    reference, sizes = Reference(0.0075, 0.01 * DEGREE), []
+    reference, sizes = ReferenceErrors(0.0075, 0.01 * DEGREE), []
     for seed in range(runs):
         late = np.random.default_rng([seed, 3]).uniform(-0.3, 0.3)
         try:
@@ -279,8 +293,10 @@ def test_the_start_heading_is_found_with_its_deviation(runs):
     sizes, readings = [], np.arange(401) / 20.0
     for seed in range(runs):
         errors = 0.5 * DEGREE * np.random.default_rng([seed, 4]).standard_normal(401)
-        fit = fit_likelihood(TIME, output(seed),
-                             from_headings(readings, CALIBRATION.heading_at(readings) + errors))
+        fit = fit_likelihood(
+            TIME, output(seed),
+            motion_from_headings(readings,
+                                 CALIBRATION_MOTION.heading_at(readings) + errors))
         sizes.append(abs(fit.start_heading + errors[0]) / fit.start_heading_deviation)
         assert fit.start_heading_deviation < 0.25 * DEGREE
     assert np.sum(np.array(sizes) < 1.96) >= fewest(runs, 0.93), np.sort(sizes)
@@ -290,8 +306,8 @@ def turned(number, seed=0, s=S, before=3.0, after=3.0, speed=45.0):
     """Return time and output of whole turns that are closed to about a degree."""
     generator = np.random.default_rng([seed, 5])
     angle = 360.0 * number + generator.standard_normal()
-    motion = turns([(before, 0), (abs(angle) / speed, math.copysign(speed, angle)),
-                    (after + 0.5, 0)])
+    motion = constant_rate_motion([(before, 0), (abs(angle) / speed, math.copysign(speed, angle)),
+                                   (after + 0.5, 0)])
     time = np.arange(int(100 * motion.duration) + 1) / 100.0
     return time, ((1 + s) * motion.rate_at(time) + B
                   + simulate_noise(XV3500.noise, len(time), 0.01, generator))
@@ -354,8 +370,8 @@ def write_log(path, time, rate, name='gyro_rad_s'):
 def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, run):
     write_model(tmp_path / 'model.yaml', GyroModel(noise=XV3500.noise))
     profile = tmp_path / 'profile.csv'
-    profile.write_text('time_s,rate_rad_s\n'
-                       + ''.join(f'{t},{r}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
+    profile.write_text('time_s,rate_rad_s\n' + ''.join(
+        f'{t},{r}\n' for t, r in zip(CALIBRATION_MOTION.time, CALIBRATION_MOTION.rate)))
     time = np.arange(2500) / 100.0
     log = write_log(tmp_path / 'log.csv', time, output(0, time=time))
     words = ('self-calibrate', log, '--profile', profile, '--model', tmp_path / 'model.yaml',
@@ -400,6 +416,7 @@ def test_the_verb_refuses_options_that_exclude_each_other(tmp_path, run, words, 
 
 
 def test_a_fit_without_figures_claims_no_goodness():
-    assert Fit(0.0, 0.0, np.zeros((2, 2))).goodness is None
+    assert ScaleBiasFit(0.0, 0.0, np.zeros((2, 2))).goodness is None
     assert self_calibrate(TIME, output(),
-                          from_rates(CALIBRATION.time, CALIBRATION.rate)).goodness is None
+                          motion_from_rates(CALIBRATION_MOTION.time,
+                                            CALIBRATION_MOTION.rate)).goodness is None

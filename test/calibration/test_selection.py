@@ -12,13 +12,13 @@
 
 from dataclasses import replace
 
-from gyro_calibration.calibration.dwells import from_table, join
+from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells
 from gyro_calibration.calibration.selection import (
-    DISTINGUISHED,
     FALSE_ALARM_RATE,
-    HARDLY,
+    MIN_DISTINGUISHING_SIGMAS,
+    MIN_PREFERENCE_SIGMAS,
     select_effects,
-    TECHNOLOGIES,
+    TECHNOLOGY_EFFECTS,
 )
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.effects import (
@@ -85,17 +85,17 @@ def test_two_sweeps_at_two_temperatures_show_the_slope_between_them():
     assert 'bias_temperature' in names(select_effects(measured(Table(sweeps=2), terms)))
 
 
-@pytest.mark.parametrize('technology', TECHNOLOGIES)
+@pytest.mark.parametrize('technology', TECHNOLOGY_EFFECTS)
 @pytest.mark.parametrize('wide', [True, False])
 def test_what_the_gyro_is_decides_only_where_the_data_do_not(technology, wide):
     table = replace(WANDERING, fastest=300.0 * DEGREE) if wide else WANDERING
     selection = select_effects(measured(table, (*LINEAR, TRUTH['sine_response'])), technology)
-    expected = SINE_RESPONSE if wide else TECHNOLOGIES[technology]
+    expected = SINE_RESPONSE if wide else TECHNOLOGY_EFFECTS[technology]
     assert expected in selection.calibration.effects
-    assert selection.confounders[0].distinguishable == wide
+    assert selection.confounders[0].is_distinguishable == wide
     reason = selection.confounders[0].reason
-    assert technology in reason or wide and TECHNOLOGIES[technology] is SINE_RESPONSE
-    assert ('although' in reason) == (wide and TECHNOLOGIES[technology] is not SINE_RESPONSE)
+    assert technology in reason or wide and TECHNOLOGY_EFFECTS[technology] is SINE_RESPONSE
+    assert ('although' in reason) == (wide and TECHNOLOGY_EFFECTS[technology] is not SINE_RESPONSE)
 
 
 @pytest.mark.parametrize('runs', [2, pytest.param(12, marks=pytest.mark.evidence)])
@@ -104,15 +104,15 @@ def test_the_rate_that_is_proposed_distinguishes_confounders(runs):
     truth = GyroModel((*LINEAR, TRUTH['sine_response']))
     for _ in range(runs):
         table = Table().measure(truth, generator)
-        rate = select_effects(table).confounders[0].rate
+        rate = select_effects(table).confounders[0].distinguishing_rate
         more, fast = (Table(sweeps=1, rates=4).measure(truth, generator),
                       np.array([rate, -rate, rate, -rate]))
         noise = more.output - truth.output(more.rate, more.temperature)
         more = replace(more, rate=fast, output=truth.output(fast, more.temperature) + noise)
-        pair = select_effects(join([table, more])).confounders[0]
+        pair = select_effects(join_dwells([table, more])).confounders[0]
         sigmas.append(pair.sigmas if pair.taken == 'sine_response' else -pair.sigmas)
     # The aim is one sigma more than needed; a single pair of fits varies by one sigma.
-    assert np.mean(sigmas) > DISTINGUISHED - 3.7 / np.sqrt(runs), sigmas
+    assert np.mean(sigmas) > MIN_DISTINGUISHING_SIGMAS - 3.7 / np.sqrt(runs), sigmas
 
 
 def test_a_sine_with_its_zeros_at_the_rates_of_the_dwells_is_no_response():
@@ -120,9 +120,9 @@ def test_a_sine_with_its_zeros_at_the_rates_of_the_dwells_is_no_response():
     sweeps = {'sweep': tuple(np.repeat(list('abcdef'), 21))}
     for seed in range(4):
         error = 1.2e-5 * np.random.default_rng(seed).standard_normal(len(rate))
-        table = from_table(Log(output=rate * (1.0 + 2e-5 * rate ** 2) + error,
-                               reference_rate=rate, others=sweeps))
-        assert select_effects(table, 'open_loop_fog').calibration.folded_beyond is None
+        table = dwells_from_table(Log(output=rate * (1.0 + 2e-5 * rate ** 2) + error,
+                                      reference_rate=rate, others=sweeps))
+        assert select_effects(table, 'open_loop_fog').calibration.min_non_monotonic_rate is None
 
 
 def test_every_effect_has_its_reason():
@@ -132,7 +132,8 @@ def test_every_effect_has_its_reason():
             and reasons['scale_factor_asymmetry'].reason == 'no better than chance')
     assert reasons['cubic_nonlinearity'].reason.startswith('explains the same as sine_response')
     taken = reasons['scale_factor_temperature']
-    assert taken.taken and taken.with_it < taken.without and taken.chance < FALSE_ALARM_RATE
+    assert (taken.taken and taken.error_with < taken.error_without
+            and taken.p_value < FALSE_ALARM_RATE)
 
 
 def test_what_cannot_be_seen_says_what_would_show_it():
@@ -158,10 +159,10 @@ def test_of_confounders_that_fit_alike_the_bounded_one_is_taken_by_default():
         fit = select_effects(WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])),
                                                generator))
         pair, = fit.confounders
-        assert pair.taken == 'sine_response' or pair.sigmas >= HARDLY
+        assert pair.taken == 'sine_response' or pair.sigmas >= MIN_PREFERENCE_SIGMAS
 
 
-@pytest.mark.parametrize('technology', [None, *TECHNOLOGIES])
+@pytest.mark.parametrize('technology', [None, *TECHNOLOGY_EFFECTS])
 def test_on_the_recorded_table_the_default_predicts_rates_beyond_those_it_saw(data, technology):
     dwells = rate_table.table(data)
     assert rate_table.beyond(rate_table.chosen(technology), dwells) < 0.085 * DEGREE
@@ -173,6 +174,6 @@ def test_on_the_recorded_table_sine_and_cubic_are_hardly_distinguished_and_a_rat
     selection = select_effects(dwells, 'open_loop_fog')
     assert names(selection) == {'bias', 'scale_factor_error', 'sine_response', *SLOPES}
     pair, = selection.confounders
-    assert (pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < DISTINGUISHED
-            and 110.0 < pair.rate / DEGREE < 200.0)
+    assert (pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < MIN_DISTINGUISHING_SIGMAS
+            and 110.0 < pair.distinguishing_rate / DEGREE < 200.0)
     assert selection.calibration.left_out_rms < 0.05 * DEGREE

@@ -21,17 +21,22 @@ import math
 from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.calibration.self_calibration import (
     calibrate_bias,
-    combined_rest,
+    combine_with_rest,
     fit_heading,
     fit_likelihood,
     fit_rate,
-    Limits,
+    RunLimits,
     self_calibrate,
 )
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
-from gyro_calibration.model.motion import CALIBRATION, from_headings, from_rates, turns
-from gyro_calibration.model.noise import ALLAN_FLOOR, Noise, simulate_noise
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    constant_rate_motion,
+    motion_from_headings,
+    motion_from_rates,
+)
+from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
 from honest_runs import GYROS, tried
 import numpy as np
 import pytest
@@ -41,18 +46,18 @@ S, B = -0.1, 0.1
 #: Their XV3500: 2.5 deg/sqrt(h); s and b of their experiment, b in deg/min (see sources).
 XV3500, XV3500_S, XV3500_B = Noise(2.5 * DEGREE / 60), 0.0373, 0.75 * DEGREE / 60
 TIME = np.arange(2001) / 100.0
-RATE = CALIBRATION.rate_at(TIME)
+RATE = CALIBRATION_MOTION.rate_at(TIME)
 
 
 def sampled(motion, rate=20.0, step=0.0, phase=0.0):
     """Return a heading reference of the motion at `rate`, Hz, with encoder steps, rad, if any."""
     time = np.arange(round(motion.duration * rate) + 1) / rate
     heading = motion.heading_at(time) + phase
-    return from_headings(time, np.round(heading / step) * step if step else heading)
+    return motion_from_headings(time, np.round(heading / step) * step if step else heading)
 
 
 # Hong and Park's evaluation: a move of 3.8 s to 0.4 rad/s, a quarter of it ramp, at 20 Hz.
-MOVE = from_rates(np.array([0.0, 0.95, 2.85, 3.8]), np.array([0.0, 0.4, 0.4, 0.0]))
+MOVE = motion_from_rates(np.array([0.0, 0.95, 2.85, 3.8]), np.array([0.0, 0.4, 0.4, 0.0]))
 MOVE_TIME = np.arange(77) / 20.0
 MOVE_RATE = (1 + S) * MOVE.rate_at(MOVE_TIME) + B
 
@@ -79,8 +84,10 @@ def test_the_likelihood_shows_no_error_on_their_move(reference):
 @pytest.mark.parametrize('offset', [0.0, 0.137, -0.42])
 def test_the_likelihood_needs_no_common_rate_and_no_common_start(gyro, reference, offset):
     time = np.arange(21 * gyro) / gyro - 0.5
-    rate = (1 + S) * CALIBRATION.rate_at(time - offset) + B
-    fit = fit_likelihood(time, rate, sampled(CALIBRATION, reference) if reference else CALIBRATION)
+    rate = (1 + S) * CALIBRATION_MOTION.rate_at(time - offset) + B
+    fit = fit_likelihood(
+        time, rate,
+        sampled(CALIBRATION_MOTION, reference) if reference else CALIBRATION_MOTION)
     # at 20 Hz the error is that of the trapezoid rule between the samples about a corner
     assert (fit.scale_factor_error, fit.bias) == pytest.approx(
         (S, B), abs=1e-6 if gyro == 100 else 1e-5)
@@ -102,8 +109,8 @@ def honest(reference, runs):
         generator = np.random.default_rng([seed, len(reference)])
         rate = (1 + XV3500_S) * RATE + XV3500_B + simulate_noise(
             XV3500, len(TIME), 0.01, generator)
-        motion = (CALIBRATION if reference == 'profile'
-                  else sampled(CALIBRATION, 20.0, STEP, generator.uniform(0.0, STEP)))
+        motion = (CALIBRATION_MOTION if reference == 'profile'
+                  else sampled(CALIBRATION_MOTION, 20.0, STEP, generator.uniform(0.0, STEP)))
         try:
             fit = self_calibrate(TIME, rate, motion)
         except DataRefused:
@@ -117,7 +124,7 @@ def honest(reference, runs):
 def bound(reference):
     """Return the Cramer-Rao bound of s and b: white noise, encoder steps, unknown time offset."""
     time = TIME if reference == 'profile' else np.arange(401) / 20.0
-    heading, rate = CALIBRATION.heading_at(time), CALIBRATION.rate_at(time)
+    heading, rate = CALIBRATION_MOTION.heading_at(time), CALIBRATION_MOTION.rate_at(time)
     columns = np.column_stack([np.diff(heading), np.diff(time), np.diff(rate)])
     differences = np.diff(np.eye(len(time)), axis=0)
     steps = 0.0 if reference == 'profile' else ((1 + XV3500_S) * STEP) ** 2 / 12
@@ -163,15 +170,15 @@ def lagging(constant, every=10):
     """Return the rate of a robot with a first-order lag, s, sampled every so many ms."""
     fine = np.arange(20001) / 1000.0
     decay, state, rates = math.exp(-0.001 / constant), 0.0, []
-    for wanted in CALIBRATION.rate_at(fine):
+    for wanted in CALIBRATION_MOTION.rate_at(fine):
         state = decay * state + (1 - decay) * wanted
         rates.append(state)
     return np.array(rates[::every])
 
 
-SOFT = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1, 0)],
-             ramp=0.7).rate_at(TIME)
-ROBOTS = {'late by 0.3 s': (CALIBRATION.rate_at(TIME - 0.3), 0.1),
+SOFT = constant_rate_motion([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0),
+                             (3.5, -30), (1, 0)], ramp=0.7).rate_at(TIME)
+ROBOTS = {'late by 0.3 s': (CALIBRATION_MOTION.rate_at(TIME - 0.3), 0.1),
           'lag of 0.1 s': (lagging(0.1), 0.2), 'lag of 0.3 s': (lagging(0.3), 1.0),
           'ramps of 0.7 instead of 0.5 s': (SOFT, 0.5)}
 
@@ -180,7 +187,7 @@ ROBOTS = {'late by 0.3 s': (CALIBRATION.rate_at(TIME - 0.3), 0.1),
 def test_a_robot_that_follows_late_or_softly_is_calibrated_all_the_same(rate, percent):
     for seed in range(5):
         noise = simulate_noise(XV3500, len(TIME), 0.01, np.random.default_rng(seed))
-        fit = self_calibrate(TIME, (1 + XV3500_S) * rate + XV3500_B + noise, CALIBRATION)
+        fit = self_calibrate(TIME, (1 + XV3500_S) * rate + XV3500_B + noise, CALIBRATION_MOTION)
         assert 100 * abs(fit.scale_factor_error - XV3500_S) < percent
         assert abs(fit.scale_factor_error - XV3500_S) < 4.0 * math.sqrt(fit.covariance[0, 0])
 
@@ -190,7 +197,7 @@ def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
     fine, true, sizes = np.arange(20001) / 1000.0, lagging(0.15, 1), []
     for seed in range(20):
         noise = simulate_noise(XV3500, len(fine), 0.001, np.random.default_rng([8, seed]))
-        fit = self_calibrate(fine, (1 + XV3500_S) * true + XV3500_B + noise, CALIBRATION)
+        fit = self_calibrate(fine, (1 + XV3500_S) * true + XV3500_B + noise, CALIBRATION_MOTION)
         sizes.append((fit.scale_factor_error - XV3500_S) / math.sqrt(fit.covariance[0, 0]))
     assert abs(np.mean(sizes)) < mean_bound(sizes), np.round(sizes, 1)
     assert np.sqrt(np.mean(np.square(sizes))) < rms_bounds(20)[1], np.round(sizes, 1)
@@ -227,34 +234,38 @@ def test_a_slip_or_bump_is_refused(degrees, runs):
     refused = 0
     for seed in range(runs):
         try:
-            self_calibrate(TIME, run(seed, bumped(seed, degrees)), CALIBRATION)
+            self_calibrate(TIME, run(seed, bumped(seed, degrees)), CALIBRATION_MOTION)
         except DataRefused as error:
             refused += 'slip or a bump' in str(error)
     assert refused >= runs - 1
 
 
 def test_a_bump_below_the_limit_does_little_harm():
-    errors = [self_calibrate(TIME, run(seed, bumped(seed, 0.5)), CALIBRATION).scale_factor_error
-              - XV3500_S for seed in range(10)]
+    errors = [
+        self_calibrate(TIME, run(seed, bumped(seed, 0.5)), CALIBRATION_MOTION).scale_factor_error
+        - XV3500_S for seed in range(10)
+    ]
     assert np.abs(errors).max() < 0.005
 
 
-ONE_SPEED = from_rates(np.array([0.0, 20.0]), np.array([0.5, 0.5]))
+ONE_SPEED = motion_from_rates(np.array([0.0, 20.0]), np.array([0.5, 0.5]))
 GAP = (TIME < 8.0) | (TIME > 9.0)
 #: Cases that are not in benchmarks/fooled.py, which test_run_faults.py runs.
 REFUSED = {
-    'too few samples': (TIME[:40], run()[:40], CALIBRATION, 'only 40 samples came; at least 50'),
-    'a gap': (TIME[GAP], run()[GAP], CALIBRATION, 'no samples came for 1.0'),
-    'a lost sample': (TIME, np.where(TIME == 5.0, np.nan, run()), CALIBRATION,
-                      'not a finite number'),
-    'a lost reference': (TIME, run(), from_headings(TIME, np.where(TIME == 5.0, np.nan, RATE)),
-                         'the reference was lost'),
+    'too few samples': (TIME[:40], run()[:40], CALIBRATION_MOTION, 'only 40 samples came; at '
+                        'least 50'),
+    'a gap': (TIME[GAP], run()[GAP], CALIBRATION_MOTION, 'no samples came for 1.0'),
+    'a lost sample': (TIME, np.where(TIME == 5.0, np.nan,
+                                     run()), CALIBRATION_MOTION, 'not a finite number'),
+    'a lost reference': (TIME, run(),
+                         motion_from_headings(TIME, np.where(TIME == 5.0, np.nan,
+                                                             RATE)), 'the reference was lost'),
     'one speed': (TIME, run(), ONE_SPEED, 'the profile turns at one speed'),
-    'half the motion': (TIME[:1000], run()[:1000], CALIBRATION,
+    'half the motion': (TIME[:1000], run()[:1000], CALIBRATION_MOTION,
                         "the samples cover 10.0 s of the profile's 20.0 s"),
-    'half of the scale': (TIME, run(s=-0.4), CALIBRATION,
+    'half of the scale': (TIME, run(s=-0.4), CALIBRATION_MOTION,
                           'a scale factor error of -40 % is beyond 30 %'),
-    'carried round': (TIME, run() + 0.3, CALIBRATION,
+    'carried round': (TIME, run() + 0.3, CALIBRATION_MOTION,
                       'is beyond 10 deg/s: do not turn the robot by hand'),
 }
 
@@ -269,21 +280,21 @@ def test_what_cannot_be_believed_is_refused_with_its_reason(time, rate, motion, 
 @pytest.mark.parametrize('method', ['heading', 'rate', 'likelihood'])
 def test_no_method_calibrates_by_a_dead_gyro(method):
     with pytest.raises(DataRefused):
-        self_calibrate(TIME, np.where(TIME > 19.9, 1e-9, 0.0), CALIBRATION, method)
+        self_calibrate(TIME, np.where(TIME > 19.9, 1e-9, 0.0), CALIBRATION_MOTION, method)
 
 
 def test_the_wander_of_the_bias_is_in_its_standard_deviation():
     flicker = Noise(bias_instability=18 * DEGREE / 3600)
-    without, with_it = (self_calibrate(TIME, run(), CALIBRATION, noise=noise).covariance[1, 1]
-                        for noise in (None, flicker))
-    assert with_it - without == pytest.approx((ALLAN_FLOOR * flicker.bias_instability) ** 2)
+    without, with_it = (self_calibrate(TIME, run(), CALIBRATION_MOTION,
+                                       noise=noise).covariance[1, 1] for noise in (None, flicker))
+    assert with_it - without == pytest.approx((ALLAN_FLOOR_RATIO * flicker.bias_instability) ** 2)
 
 
 @pytest.mark.parametrize('variance', [3.0, 10.0, 20.0])
 def test_a_run_that_is_far_off_is_in_the_interval_after_a_rest_that_hardly_shows_it(variance):
     """A robot that yawed all the time: a bias of several deviations, and a short rest of noise."""
     for off in np.arange(2.0, 11.0):
-        gain, covariance = combined_rest(np.diag([1e-6, 1.0]), -off, variance)
+        gain, covariance = combine_with_rest(np.diag([1e-6, 1.0]), -off, variance)
         assert abs(off + gain[1] * -off) < 3.0 * math.sqrt(covariance[1, 1]), off
 
 
@@ -333,7 +344,8 @@ def test_a_bias_is_not_taken_from_a_dead_gyro_or_a_few_samples(count, rate, reas
 
 
 def test_limits_are_for_the_caller_to_set():
-    fit = self_calibrate(TIME, run(s=-0.4), CALIBRATION, limits=Limits(scale_factor_error=0.5))
+    fit = self_calibrate(TIME, run(s=-0.4), CALIBRATION_MOTION,
+                         limits=RunLimits(max_scale_factor_error=0.5))
     assert fit.scale_factor_error == pytest.approx(-0.4, abs=0.002)
 
 
@@ -344,7 +356,7 @@ def heading_error(log, start, calibrated):
     heading, first, fit = log.reference_heading[used], time < 20.0, None
     if calibrated:
         fit = self_calibrate(time[first], output[first],
-                             from_headings(time[first], heading[first]))
+                             motion_from_headings(time[first], heading[first]))
         output = (output - fit.bias) / (1.0 + fit.scale_factor_error)
     error = integrate(time, output) - (heading - heading[0])
     return math.sqrt(np.mean(error ** 2)) / DEGREE
@@ -363,6 +375,6 @@ def test_a_log_of_25_minutes_is_fitted_within_seconds_and_by_1e_3(data):
     """The encoder's firmware is trusted to 0.2 %; long and short runs must agree."""
     log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
     fit = fit_likelihood(log.time - log.time[0], -log.output,
-                         from_headings(log.time, log.reference_heading))
+                         motion_from_headings(log.time, log.reference_heading))
     assert (fit.scale_factor_error == pytest.approx(0.006, abs=0.002)
             and math.sqrt(fit.covariance[0, 0]) < 2e-4)

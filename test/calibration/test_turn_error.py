@@ -17,9 +17,13 @@ import json
 import math
 import sys
 
-from gyro_calibration.calibration.dwells import Dwells, dwells, take
+from gyro_calibration.calibration.dwells import Dwells, extract_dwells, select_dwells
 from gyro_calibration.calibration.rate_table import fit_effects
-from gyro_calibration.calibration.turn_error import predicted_rates, size, turn_errors
+from gyro_calibration.calibration.turn_error import (
+    compute_turn_errors,
+    predict_left_out_rates,
+    summarize_errors,
+)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
 from gyro_calibration.model.compensation import compensate
@@ -30,7 +34,7 @@ from gyro_calibration.model.effects import (
     SINE_RESPONSE,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import from_rates, simulate
+from gyro_calibration.model.motion import motion_from_rates, simulate
 from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
@@ -49,7 +53,7 @@ def table(rates, errors, temperature=None, sweep=None):
 
 def static(found):
     """Return the errors with the static bias only, deg per turn; the model is the identity."""
-    return turn_errors(found, found.output).static / DEGREE
+    return compute_turn_errors(found, found.output).static / DEGREE
 
 
 # the published formulas, by hand
@@ -62,7 +66,7 @@ def test_a_turn_at_10_deg_s_takes_36_s_and_one_at_20_takes_18():
 
 
 def test_the_static_bias_after_the_model_is_that_of_the_compensated_rest():
-    errors = turn_errors(HAND, HAND.rate + np.array([0.02, 0.03, 0.01]) * DEGREE)
+    errors = compute_turn_errors(HAND, HAND.rate + np.array([0.02, 0.03, 0.01]) * DEGREE)
     assert errors.modelled / DEGREE == pytest.approx([0.01 * 36.0, -0.01 * 18.0])
 
 
@@ -73,22 +77,22 @@ def test_a_bias_changes_nothing_since_a_rest_shows_it():
 
 def test_slow_turns_are_left_out_and_a_rest_is_no_turn():
     found = table([0.0, 4.9, -4.9, 5.1, -60.0], [0.0] * 5)
-    assert turn_errors(found, found.output).rate / DEGREE == pytest.approx([5.1, -60.0])
-    assert turn_errors(found, found.output, 1.0 * DEGREE).place == (
+    assert compute_turn_errors(found, found.output).rate / DEGREE == pytest.approx([5.1, -60.0])
+    assert compute_turn_errors(found, found.output, 1.0 * DEGREE).location == (
         'row 2', 'row 3', 'row 4', 'row 5')
 
 
 def test_every_sweep_has_its_own_rest_and_one_without_takes_that_of_the_nearest_temperature():
     found = table([0, 10, 0, 10, 10], [0.1, 0.2, 0.5, 0.6, 0.6], [20, 21, 40, 41, 38],
                   [0, 0, 1, 1, 2])
-    errors = turn_errors(found, found.output)
+    errors = compute_turn_errors(found, found.output)
     assert errors.static / DEGREE == pytest.approx([3.6, 3.6, 3.6])
     assert '1 of 3 sweeps have none' in errors.remarks[0]
 
 
 def test_without_a_rest_the_slowest_turns_both_ways_stand_for_it():
     rates = np.array([-30.0, -10.0, 6.0, 30.0])
-    errors = turn_errors(table(rates, 0.3 + 0.01 * rates), table(rates, 0.0 * rates).rate)
+    errors = compute_turn_errors(table(rates, 0.3 + 0.01 * rates), table(rates, 0.0 * rates).rate)
     assert errors.static == pytest.approx(TURN * 0.01 * np.sign(rates))
     assert errors.remarks[0].startswith(
         'no rest; the static bias is the error between the slowest turns')
@@ -100,12 +104,12 @@ def test_without_a_rest_the_slowest_turns_both_ways_stand_for_it():
 def test_a_table_without_turns_or_what_stands_for_a_rest_is_refused(rates, said):
     found = table(rates, [0.0] * 3)
     with pytest.raises(DataRefused, match=said):
-        turn_errors(found, found.output)
+        compute_turn_errors(found, found.output)
 
 
 def test_a_gyro_that_is_upside_down_is_refused_with_the_way_out():
     with pytest.raises(DataRefused, match='the other way than the reference .* --invert'):
-        turn_errors(replace(HAND, output=-HAND.output), -HAND.output)
+        compute_turn_errors(replace(HAND, output=-HAND.output), -HAND.output)
 
 
 # a real turn
@@ -122,10 +126,10 @@ MODEL = GyroModel((Term(BIAS, (0.003,)), Term(SCALE_FACTOR_ERROR, (0.014,)),
 def test_a_simulated_turn_integrated_at_10_hz_is_off_by_as_much(rate):
     found = table([0.0, rate], [0.0, 0.0])
     found = replace(found, output=GYRO.output(found.rate, np.full(2, 25.0)))
-    errors = turn_errors(found, compensate(MODEL, found.output).rate)
+    errors = compute_turn_errors(found, compensate(MODEL, found.output).rate)
     rest, lasts = 10.0, 360.0 / abs(rate)
-    motion = from_rates(np.array([0.0, rest, rest + 0.1, rest + lasts, rest + lasts + 0.1]),
-                        np.array([0, 0, rate, rate, 0]) * DEGREE)
+    motion = motion_from_rates(np.array([0.0, rest, rest + 0.1, rest + lasts, rest + lasts + 0.1]),
+                               np.array([0, 0, rate, rate, 0]) * DEGREE)
     log = simulate(GYRO, motion, 10.0, np.random.default_rng(1))
     assert log.reference_heading[-1] == pytest.approx(math.copysign(TURN, rate))
     deviation = NOISE.angle_random_walk * math.sqrt(lasts + lasts ** 2 / rest)
@@ -151,9 +155,9 @@ def sweeps(seed=0, deviation=1e-5, odd=None):
 
 def test_a_sweep_has_no_part_in_the_model_that_corrects_it():
     found = sweeps(odd=2)
-    fit = fit_effects(take(found, found.sweep != 2), (BIAS, SCALE_FACTOR_ERROR))
-    scatter = replace(fit.scatter, kept=np.full(len(found), True))
-    rate = predicted_rates(replace(fit, dwells=found, scatter=scatter))[found.sweep == 2]
+    fit = fit_effects(select_dwells(found, found.sweep != 2), (BIAS, SCALE_FACTOR_ERROR))
+    scatter = replace(fit.scatter, inliers=np.full(len(found), True))
+    rate = predict_left_out_rates(replace(fit, dwells=found, scatter=scatter))[found.sweep == 2]
     turning = found.rate[found.sweep == 2]
     # rate by the model = output less bias, over 1.01; the output holds 1.03 times the rate
     assert rate == pytest.approx(turning * 1.03 / 1.01, abs=1e-6)
@@ -161,42 +165,43 @@ def test_a_sweep_has_no_part_in_the_model_that_corrects_it():
 
 def test_errors_that_are_nothing_but_scatter_are_predicted_as_large_as_they_are():
     found = sweeps(3, 0.01)
-    rate = predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
-    assert size(rate - found.rate).rms / DEGREE == pytest.approx(0.01, rel=0.3)
+    rate = predict_left_out_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
+    assert summarize_errors(rate - found.rate).rms / DEGREE == pytest.approx(0.01, rel=0.3)
 
 
 def test_a_single_sweep_is_predicted_dwell_by_dwell():
-    found = take(sweeps(), sweeps().sweep == 0)
-    assert (predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
+    found = select_dwells(sweeps(), sweeps().sweep == 0)
+    assert (predict_left_out_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
             == pytest.approx(found.rate, abs=1e-6))
 
 
 def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_reported():
     found = table([0, 20, -20, 0, 0, 0], [0.1, 0.3, -0.1, 0.1001, 0.1, 0.0999],
                   sweep=[0, 0, 0, 1, 1, 1])
-    rate = predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
+    rate = predict_left_out_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
     assert np.isnan(rate[:3]).all()
     with pytest.raises(DataRefused, match='record faster turns, or several sweeps'):
-        turn_errors(found, rate)
+        compute_turn_errors(found, rate)
 
 
 def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
     found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21],
                   [0, 0, 1, 1, 2])
     rate = np.where(found.sweep == 0, np.nan, found.rate + 0.1 * DEGREE)
-    errors = turn_errors(found, rate)
+    errors = compute_turn_errors(found, rate)
     assert (errors.static / DEGREE == pytest.approx([0.2 * 18.0, 0.3 * 18.0])
             and errors.modelled == pytest.approx(0.0))
     assert '1 turns are left out' in errors.remarks[1]
 
 
 def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_tenth(data):
-    found = dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
+    found = extract_dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
     fit = fit_effects(found, (rate_temperature_polynomial(3, 2),))
-    kept = fit.scatter.kept
-    errors = turn_errors(take(found, kept), predicted_rates(fit)[kept])
-    assert size(errors.static).largest > 0.02 * TURN > size(errors.modelled).largest
-    assert size(errors.static).rms > 10.0 * size(errors.modelled).rms
+    kept = fit.scatter.inliers
+    errors = compute_turn_errors(select_dwells(found, kept), predict_left_out_rates(fit)[kept])
+    assert (summarize_errors(errors.static).largest > 0.02 * TURN > summarize_errors(
+        errors.modelled).largest)
+    assert summarize_errors(errors.static).rms > 10.0 * summarize_errors(errors.modelled).rms
 
 
 # the program
@@ -306,7 +311,7 @@ def test_an_outlying_dwell_is_named_and_left_out(run, log, model, tmp_path):
 
 def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model, tmp_path):
     time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
-    motion = from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
+    motion = motion_from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
     write_log(tmp_path / 'log.csv', simulate(GYRO, motion, 50.0, np.random.default_rng(2)))
     code, text, _ = run(tmp_path / 'log.csv', '--model', model, '--json')
     answer = json.loads(text)
@@ -322,7 +327,7 @@ def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(run, tmp_pat
     (tmp_path / 'model.yaml').write_text(
         'effects: {supply_sensitivity: {supply_sensitivity: 0.01}}')
     time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
-    motion = from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
+    motion = motion_from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
     log = simulate(GyroModel(), motion, 50.0, np.random.default_rng(2))
     supply = np.where(np.abs(log.time - 20.0) < 11.0, 6.0, 5.0)
     write_log(tmp_path / 'log.csv',

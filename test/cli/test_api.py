@@ -31,7 +31,7 @@ from gyro_calibration import (
     write_log,
     write_model,
 )
-from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest
 
@@ -44,8 +44,9 @@ NOISE = read_model({'effects': {}, 'noise': {'angle_random_walk': 3e-4}})
 
 def run_and_rest():
     """Return the log of the built-in motion and of 10 s of rest after it."""
-    return simulate(GYRO, (np.append(CALIBRATION.time, 30.0), np.append(CALIBRATION.rate, 0.0)),
-                    seed=1)
+    return simulate(
+        GYRO, (np.append(CALIBRATION_MOTION.time, 30.0), np.append(CALIBRATION_MOTION.rate, 0.0)),
+        seed=1)
 
 
 @pytest.fixture(scope='module')

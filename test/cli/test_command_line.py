@@ -20,10 +20,10 @@ import sys
 from types import SimpleNamespace
 
 from gyro_calibration import cli as verbs
-from gyro_calibration.driver.protocols import find
+from gyro_calibration.driver.protocols import find_protocol
 from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest
 from tqdm import tqdm
@@ -162,7 +162,7 @@ def test_compensate_gives_rates_alone_for_a_rate_table(run, model, tmp_path):
 def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tolerance):
     profile = tmp_path / 'profile.csv'
     profile.write_text('time_s,rate_dps\n' + ''.join(
-        f'{t},{r / DEGREE}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
+        f'{t},{r / DEGREE}\n' for t, r in zip(CALIBRATION_MOTION.time, CALIBRATION_MOTION.rate)))
     code, text, _ = run('self-calibrate', log, '--profile', profile, '--method', method,
                         '--out', tmp_path / 'new.yaml', '--json')
     answer = json.loads(text)
@@ -268,7 +268,7 @@ def test_emulate_prints_its_path_first_and_sends_the_model(model, tmp_path):
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert json.loads(process.stdout.readline())['path'] == str(tmp_path / 'gyro')
-        decoder, samples, port = (find('kvh_dsp3000').decoder(), [],
+        decoder, samples, port = (find_protocol('kvh_dsp3000').decoder(), [],
                                   os.open(tmp_path / 'gyro', os.O_RDONLY | os.O_NOCTTY))
         while len(samples) < 30:
             samples += decoder.feed(os.read(port, 1000))
@@ -304,21 +304,21 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
 def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(
         ros_domain, capsys, monkeypatch, refusals):
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    from gyro_calibration.cli.demo_run import ATTEMPTS, calibrate, Refused
-    monkeypatch.setattr('gyro_calibration.cli.demo_run._pass', lambda *_: None)
-    answers = iter([Refused('calibrate: the gyro slipped')] * refusals + ['done'])
+    from gyro_calibration.cli.demo_run import calibrate, CallRefused, MAX_ATTEMPTS
+    monkeypatch.setattr('gyro_calibration.cli.demo_run._wait', lambda *_: None)
+    answers = iter([CallRefused('calibrate: the gyro slipped')] * refusals + ['done'])
 
     def call(*_):
         answer = next(answers)
-        if isinstance(answer, Refused):
+        if isinstance(answer, CallRefused):
             raise answer
     with tqdm(total=60, disable=True) as bar:
-        if refusals < ATTEMPTS:
+        if refusals < MAX_ATTEMPTS:
             calibrate(SimpleNamespace(call=call), SimpleNamespace(phase=0), bar)
         else:
-            with pytest.raises(Refused, match='slipped'):
+            with pytest.raises(CallRefused, match='slipped'):
                 calibrate(SimpleNamespace(call=call), SimpleNamespace(phase=0), bar)
-    assert capsys.readouterr().err.count('slipped; once more') == min(refusals, ATTEMPTS - 1)
+    assert capsys.readouterr().err.count('slipped; once more') == min(refusals, MAX_ATTEMPTS - 1)
 
 
 def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_path):

@@ -16,7 +16,7 @@ import subprocess
 import sys
 
 from gyro_calibration.logs.log import Log, read_log, read_log_blocks, write_log
-from gyro_calibration.model.motion import ROBOT
+from gyro_calibration.model.motion import ROBOT_MOTION
 import numpy as np
 import pytest
 
@@ -43,7 +43,7 @@ def write_robot(path, rows):
     """Write a log of the robot, which drives its way again and again."""
     time = np.arange(16000) * 0.01
     way = [f',{rate:.6f},{degc:.2f}\n'
-           for rate, degc in zip(ROBOT.rate_at(time), 35.0 + 12.0 * np.sin(time / 20.0))]
+           for rate, degc in zip(ROBOT_MOTION.rate_at(time), 35.0 + 12.0 * np.sin(time / 20.0))]
     with open(path, 'w') as file:
         file.write('time_s,gyro_rad_s,temperature_degc\n')
         file.writelines(f'{row / 100:.2f}{rest}'

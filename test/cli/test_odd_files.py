@@ -27,7 +27,13 @@ import subprocess
 import sys
 import tracemalloc
 
-from gyro_calibration.files import explained, InputError, plain, reason, write_atomically
+from gyro_calibration.files import (
+    describe_error,
+    describe_os_error,
+    InputError,
+    to_printable,
+    write_atomically,
+)
 from gyro_calibration.heading.bias_table import BiasTable, Prior
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.tracker import Settings
@@ -110,8 +116,9 @@ def test_what_is_no_file_is_neither_replaced_nor_removed_as_a_leftover(kind, fol
     code, _, error = run(*words, folder / 'there.csv')
     assert code == 2 and f'there.csv: it is {kind}, where a file is wanted; name a file' in error
     store = StateStore('', folder / 'calibration.yaml', folder / 'biases.yaml', Prior())
-    assert kind in store.hint and store.model.self_calibration is None
-    assert 'NOT STORED' in store.keep(SelfCalibration(0.01, 0.02)) and 'name a file' in store.hint
+    assert kind in store.calibration_hint and store.model.self_calibration is None
+    assert ('NOT STORED' in store.store_calibration(SelfCalibration(0.01, 0.02))
+            and 'name a file' in store.calibration_hint)
     (folder / 'out.csv').unlink()
     assert {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()} == before
 
@@ -151,7 +158,7 @@ def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, 
     assert 'uncalibrated' in store.problem and str(path) in store.problem
     store = StateStore('', path, path.with_suffix('.yaml'), Prior())
     if 'circle' not in path.name:  # a link is replaced by what is written
-        said = store.keep(SelfCalibration())
+        said = store.store_calibration(SelfCalibration())
         assert 'NOT STORED' in said and re.search(words, said)
         code, _, error = run('compensate', folder / 'log.csv', '--model', folder / 'model.yaml',
                              '--out', path)
@@ -182,9 +189,9 @@ def test_the_longest_name_that_there_may_be_is_written(folder):
 
 @pytest.mark.parametrize('number', [28, 30, 13, 36, 20, 2, 40, 122])
 def test_an_error_of_the_system_names_file_and_remedy(number):
-    said = explained(OSError(number, os.strerror(number), '/data/a\x1b[2Jb'))
+    said = describe_os_error(OSError(number, os.strerror(number), '/data/a\x1b[2Jb'))
     assert (said.startswith('/data/a\\x1b[2Jb: ') and '; ' in said
-            and reason(OSError(number, 'X y')) == 'x y')
+            and describe_error(OSError(number, 'X y')) == 'x y')
 
 
 # Links and modes
@@ -277,8 +284,9 @@ def test_nothing_that_a_terminal_obeys_is_printed(folder, run):
 
 def test_messages_are_one_printable_line():
     assert str(InputError(f'a{ESCAPES}\nb')) == 'a\\x1b[31m\\x9b2J\\u202e\\u2066\\x07\\r\\nb'
-    assert plain(plain('\x1b')) == plain('\x1b') and plain('a\nb', kept='\n') == 'a\nb'
-    assert plain('Größe 1°, \udcff') == 'Größe 1°, \\udcff'
+    assert (to_printable(to_printable('\x1b')) == to_printable('\x1b')
+            and to_printable('a\nb', allowed='\n') == 'a\nb')
+    assert to_printable('Größe 1°, \udcff') == 'Größe 1°, \\udcff'
 
 
 # The calibration of a robot
@@ -299,7 +307,8 @@ def test_a_calibration_that_is_not_used_is_reported(model, calibration, hint, tm
     (tmp_path / 'calibration.yaml').write_text(calibration)
     store = StateStore(str(tmp_path / 'model.yaml'), tmp_path / 'calibration.yaml',
                        tmp_path / 'biases.yaml', Prior())
-    assert hint in store.hint and 'not used' in store.hint and 'calibrate again' in store.hint
+    assert (hint in store.calibration_hint and 'not used' in store.calibration_hint
+            and 'calibrate again' in store.calibration_hint)
     assert (store.model.self_calibration is not None) == ('self_calibration' in model)
 
 
@@ -315,11 +324,11 @@ def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
     live = HeadingEstimator(model, BiasTable(model, Prior()), Assumptions(), Settings(), 10.0, now)
     live.add(0.0, 0.01, now)
     assert (live.age(now) == max(-ahead, 0.0)) == known == (
-        'later than the clock' not in live.sentence)
+        'later than the clock' not in live.calibration_message)
     assert known or live.bias_variance > 100.0 * variance
-    live.clock_was_set(ahead + 60.0)
+    live.shift_clock(ahead + 60.0)
     live.add(0.01, 0.01, now + ahead + 60.0)
-    assert ('later than the clock' not in live.sentence
+    assert ('later than the clock' not in live.calibration_message
             and live.age(now + ahead + 60.0) == pytest.approx(60.0))
 
 
@@ -410,7 +419,8 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
         made.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)', rows)
         made.execute('CREATE TRIGGER t AFTER INSERT ON messages BEGIN DELETE FROM messages; END')
     contents = Contents()
-    assert len(list(read_messages(tmp_path / 'a.db3', contents))) == 98 and contents.left_out == 2
+    assert (len(list(read_messages(tmp_path / 'a.db3', contents))) == 98
+            and contents.skipped_parts == 2)
 
 
 # Damaged numbers and text
@@ -518,10 +528,11 @@ def test_no_file_is_written_that_cannot_be_read(bias, tmp_path):
     with pytest.raises(ArithmeticError, match='is no number that a file may hold'):
         write_model(path, GyroModel(self_calibration=SelfCalibration(0.0, bias)))
     store = StateStore('', path, tmp_path / 'biases.yaml', Prior())
-    assert 'NOT STORED' in store.keep(SelfCalibration(0.0, bias)) and not path.exists()
+    assert ('NOT STORED' in store.store_calibration(SelfCalibration(0.0, bias))
+            and not path.exists())
 
 
 def test_a_model_with_the_name_of_a_log_that_is_no_text_is_written(tmp_path):
-    model = GyroModel(origin={'files': [{'name': plain('a\udcff.csv')}]})
+    model = GyroModel(origin={'files': [{'name': to_printable('a\udcff.csv')}]})
     write_model(tmp_path / 'model.yaml', model)
     assert read_model(tmp_path / 'model.yaml').origin == model.origin

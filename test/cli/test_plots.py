@@ -13,9 +13,13 @@
 from dataclasses import replace
 from functools import cache
 
-from gyro_calibration.calibration.dwells import Dwells, take
+from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.rate_table import fit_effects
-from gyro_calibration.calibration.turn_error import predicted_rates, SLOWEST, turn_errors
+from gyro_calibration.calibration.turn_error import (
+    compute_turn_errors,
+    MIN_TURN_RATE,
+    predict_left_out_rates,
+)
 from gyro_calibration.cli.plots import (
     draw_error_surface,
     draw_headings,
@@ -27,7 +31,7 @@ from gyro_calibration.cli.plots import (
 )
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
-from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 import numpy as np
 import pytest
 
@@ -64,13 +68,15 @@ def draw_surface(path, fit, dwells=None):
 
 
 def fitted(fit):
-    return take(fit.dwells, fit.scatter.kept)
+    return select_dwells(fit.dwells, fit.scatter.inliers)
 
 
 def draw_turns(path, fit):
-    kept = fit.scatter.kept
+    kept = fit.scatter.inliers
     return draw_turn_errors(
-        path, turn_errors(take(fit.dwells, kept), predicted_rates(fit)[kept]), SLOWEST)
+        path,
+        compute_turn_errors(select_dwells(fit.dwells, kept),
+                            predict_left_out_rates(fit)[kept]), MIN_TURN_RATE)
 
 
 def draw_drive(path):
@@ -86,9 +92,9 @@ def draw_encoder(path):
 
 
 def draw_calibration_run(path):
-    time = np.linspace(0.0, CALIBRATION.duration, 1000)
-    rate = 1.03 * CALIBRATION.rate_at(time) + 0.002
-    return draw_run(path, time, rate, (rate - 0.002) / 1.03, CALIBRATION)
+    time = np.linspace(0.0, CALIBRATION_MOTION.duration, 1000)
+    rate = 1.03 * CALIBRATION_MOTION.rate_at(time) + 0.002
+    return draw_run(path, time, rate, (rate - 0.002) / 1.03, CALIBRATION_MOTION)
 
 
 IN_GREY = {'turns': lambda path: draw_turns(path, warm()),
@@ -102,7 +108,7 @@ PICTURES = {
     'residuals': lambda path: draw_residuals(path, warm()),
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
     'headings': draw_drive, 'encoder': draw_encoder, 'run': draw_calibration_run,
-    'motion': lambda path: draw_motion(path, CALIBRATION, 1.0),
+    'motion': lambda path: draw_motion(path, CALIBRATION_MOTION, 1.0),
 }
 each_picture = pytest.mark.parametrize('draw', PICTURES.values(), ids=PICTURES)
 
@@ -198,7 +204,7 @@ def test_a_picture_is_svg_where_its_name_says_so_and_does_not_stay_in_memory(pyp
 
 
 def test_outlying_dwells_are_marked_and_do_not_set_the_scale(figure_of):
-    outlying = np.flatnonzero(~warm().scatter.kept)
+    outlying = np.flatnonzero(~warm().scatter.inliers)
     assert set(outlying) >= {20, 50}
     for axes in figure_of(lambda path: draw_residuals(path, warm())).axes[:4]:
         assert axes.get_legend().get_texts()[0].get_text().startswith(f'{len(outlying)} outlying')
@@ -208,7 +214,7 @@ def test_outlying_dwells_are_marked_and_do_not_set_the_scale(figure_of):
 
 def test_the_residuals_drawn_are_those_of_the_calibration(figure_of):
     figure = figure_of(lambda path: draw_residuals(path, warm()))
-    kept = warm().scatter.kept
+    kept = warm().scatter.inliers
     after = figure.axes[2].collections[0].get_offsets()
     np.testing.assert_allclose(after,
                                np.column_stack([MEASURED.rate, warm().residual])[kept] / DEGREE)

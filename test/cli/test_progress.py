@@ -28,8 +28,8 @@ class Terminal(io.StringIO):
 def test_a_long_step_is_shown_with_share_and_time_and_cleared_after_it(monkeypatch):
     terminal, until = Terminal(), time.monotonic() + 20.0
     monkeypatch.setattr(sys, 'stderr', terminal)
-    monkeypatch.setattr(verb, 'DELAY', 0.01)
-    with verb.under_way('fit') as on_progress:
+    monkeypatch.setattr(verb, 'PROGRESS_DELAY', 0.01)
+    with verb.show_progress('fit') as on_progress:
         on_progress(0.5, 'search')
         while 'search' not in terminal.getvalue() and time.monotonic() < until:
             time.sleep(0.01)
@@ -40,7 +40,7 @@ def test_a_long_step_is_shown_with_share_and_time_and_cleared_after_it(monkeypat
 def test_a_short_step_and_a_file_show_nothing(monkeypatch):
     for stream, delay in ((Terminal(), 20.0), (io.StringIO(), 0.0)):
         monkeypatch.setattr(sys, 'stderr', stream)
-        monkeypatch.setattr(verb, 'DELAY', delay)
-        with verb.under_way('fit'):
+        monkeypatch.setattr(verb, 'PROGRESS_DELAY', delay)
+        with verb.show_progress('fit'):
             pass
         assert not stream.getvalue()

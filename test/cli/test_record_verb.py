@@ -25,7 +25,7 @@ import time
 from gyro_calibration.cli import main as command_line
 from gyro_calibration.cli import record as record_verb
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.logs.log import read_log
 from gyro_calibration.logs.recording import read_recording, Topics
 import numpy as np
@@ -46,7 +46,7 @@ def gyro(link, rate=RATE):
     """
     samples = (Sample(1e-4 * (number % 10_000), 25.0, time=2.0 * number / rate)
                for number in range(10 ** 6))
-    with Emulator(find('csv'), samples,
+    with Emulator(find_protocol('csv'), samples,
                   Settings(columns=('gyro_rad_s', 'temperature_degc')), 2.0, link):
         yield
 
@@ -155,7 +155,7 @@ def test_an_interrupted_recording_is_done(record, wait_until, tmp_path, name, nu
 def test_where_a_hangup_is_ignored_a_recording_goes_on():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with record_verb._stopping(None) as stop:
+        with record_verb._stop_event(None) as stop:
             os.kill(os.getpid(), signal.SIGHUP)
             assert not stop.is_set() and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
             os.kill(os.getpid(), signal.SIGTERM)
@@ -204,7 +204,7 @@ def test_wrong_use_is_one_sentence_and_leaves_no_file(run, tmp_path, monkeypatch
 def angles(link, rate=100.0):
     """Send the angles of a gyro at 0.1 rad/s, at another sample rate than a new one does."""
     samples = (Sample(0.1, 25.0, time=number / rate) for number in range(10 ** 6))
-    with Emulator(find('kvh_1750'), samples, Settings(sample_rate=rate), link=link):
+    with Emulator(find_protocol('kvh_1750'), samples, Settings(sample_rate=rate), link=link):
         yield
 
 
@@ -230,8 +230,9 @@ def test_a_temperature_of_a_port_that_comes_too_late_for_a_column_is_a_remark(ru
     """Which comes in time is tested in test_recorder.py, without a port."""
     samples = (Sample(0.1, 25.0 if number >= 4.5 * RATE else None, time=number / RATE)
                for number in range(10 ** 6))
-    with Emulator(find('csv'), samples, Settings(columns=('gyro_rad_s', 'temperature_degc')),
-                  link=tmp_path / 'gyro', wait_for_reader=True):
+    with Emulator(find_protocol('csv'), samples,
+                  Settings(columns=('gyro_rad_s', 'temperature_degc')), link=tmp_path / 'gyro',
+                  wait_for_reader=True):
         code, out, _ = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv',
                                       '--seconds', '6', '--json'))
     assert code == 0 and read(tmp_path / 'a.csv').temperature is None
@@ -294,7 +295,8 @@ def test_a_killed_recording_can_be_read_up_to_the_last_second(record, wait_until
 def test_what_came_before_a_silence_outlives_a_kill(record, wait_until, tmp_path, name):
     samples = [Sample(1e-4 * number, 25.0, time=number / RATE) for number in range(500)]
     columns = Settings(columns=('gyro_rad_s', 'temperature_degc'))
-    with Emulator(find('csv'), samples, columns, 2.0, tmp_path / 'gyro', wait_for_reader=True):
+    with Emulator(find_protocol('csv'), samples, columns, 2.0, tmp_path / 'gyro',
+                  wait_for_reader=True):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / name))
         wait_until(lambda: 'nothing comes' in recording.error)
         recording.process.kill()

@@ -12,10 +12,10 @@
 import json
 
 from gyro_calibration_bench.__main__ import main
-from gyro_calibration_bench.cases import cases, made, PARTS, source
+from gyro_calibration_bench.cases import make_logs, part_cases, PARTS, random_source
 from gyro_calibration_bench.hidden import hide
 from gyro_calibration_bench.methods import METHODS
-from gyro_calibration_bench.scores import interval, scored
+from gyro_calibration_bench.scores import score_case, wilson_interval
 import numpy as np
 import pytest
 
@@ -62,12 +62,12 @@ def test_an_answer_is_scored_from_its_file(folder, tmp_path, capsys):
     ('sets', [BOTH], True), ('sets', [ALONE], False), ('sets', [BOTH, ALONE], False),
     ('separated', [ALONE], True), ('separated', [BOTH], False), ('separated', [], False)])
 def test_look_alikes_are_both_named_until_a_log_separates_them(part, causes, right):
-    assert scored({**TRUTH, 'part': part}, {'causes': causes}).right == right
+    assert score_case({**TRUTH, 'part': part}, {'causes': causes}).is_right == right
 
 
 def test_intervals_are_those_of_wilson():
     # (k + z²/2 -+ z sqrt(k (n - k) / n + z²/4)) / (n + z²), by hand for 9 of 10
-    assert interval(9, 10) == pytest.approx((0.5958, 0.9821), abs=1e-4)
+    assert wilson_interval(9, 10) == pytest.approx((0.5958, 0.9821), abs=1e-4)
 
 
 @pytest.mark.parametrize('method', ['greedy', 'lasso'])
@@ -82,9 +82,9 @@ def test_a_baseline_names_a_large_effect_with_its_size(method, tmp_path):
 
 
 def test_a_case_is_random_by_its_name_and_the_seed():
-    case = next(cases('nothing', 1))
-    first, again, other = (made(case, source(case, seed))[0].columns['gyro_rad_s']
+    case = next(part_cases('nothing', 1))
+    first, again, other = (make_logs(case, random_source(case, seed))[0].columns['gyro_rad_s']
                            for seed in (1, 1, 2))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
-    assert all(len({str(each) for each in cases(part, 2)}) == len([*cases(part, 2)])
+    assert all(len({str(each) for each in part_cases(part, 2)}) == len([*part_cases(part, 2)])
                for part in PARTS)

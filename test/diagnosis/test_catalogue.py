@@ -14,7 +14,7 @@ import json
 import math
 
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.model.effects import ADDED, CATALOGUE
+from gyro_calibration.model.effects import CATALOGUE, USER_EFFECTS
 import pytest
 
 OWN = """
@@ -44,7 +44,7 @@ def own(tmp_path):
     """Return a file with an effect of one's own, and forget that effect in the end."""
     (tmp_path / 'own.py').write_text(OWN)
     yield tmp_path / 'own.py'
-    for known in (ADDED, CATALOGUE, CAUSES):
+    for known in (USER_EFFECTS, CATALOGUE, CAUSES):
         known.pop('soft_iron', None)
 
 

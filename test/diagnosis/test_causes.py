@@ -15,23 +15,23 @@ import zlib
 
 from diagnosed import diagnosis_of, log_of
 from gyro_calibration.diagnosis.candidates import observed_range
-from gyro_calibration.diagnosis.causes import CAUSES, experiment, REFERENCES
+from gyro_calibration.diagnosis.causes import CAUSES, next_experiment, REFERENCES
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import DEGREE, QUANTITIES
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration_bench.hidden import hide
-from gyro_calibration_bench.hidden.twins import twin, TWINS
+from gyro_calibration_bench.hidden.twins import hide_look_alike, LOOK_ALIKES
 import numpy as np
 import pytest
 
 
 def test_causes_are_the_effects_of_the_gyro_with_their_sentences_and_those_of_the_record():
-    assert {name: cause.of for name, cause in CAUSES.items() if name not in CATALOGUE} == {
+    assert {name: cause.origin for name, cause in CAUSES.items() if name not in CATALOGUE} == {
         **dict.fromkeys(('outliers', 'stuck_samples', 'dropped_samples', 'unit_error'), 'record'),
         **dict.fromkeys(('reference_once_per_rev', 'reference_scale', 'reference_slip',
                          'reference_quantization'), 'reference'),
         **dict.fromkeys(('angle_random_walk', 'bias_instability', 'rate_random_walk'), 'noise')}
-    assert {name for name, cause in CAUSES.items() if cause.of == 'gyro'} == set(CATALOGUE)
+    assert {name for name, cause in CAUSES.items() if cause.origin == 'gyro'} == set(CATALOGUE)
     assert all(CAUSES[name].sentence == effect.cause for name, effect in CATALOGUE.items())
 
 
@@ -39,8 +39,8 @@ def test_a_cause_has_units_and_a_variable_along_which_it_shows():
     for name, cause in CAUSES.items():
         assert cause.name == name and cause.units and cause.along
         assert re.match(r'[A-Z].*\.$', cause.sentence), name
-        assert (cause.needs <= {*QUANTITIES, 'reference'}
-                and cause.of in {'gyro', 'reference', 'record', 'noise'}), name
+        assert (cause.required_channels <= {*QUANTITIES, 'reference'}
+                and cause.origin in {'gyro', 'reference', 'record', 'noise'}), name
     assert len({cause.sentence for cause in CAUSES.values()}) == len(CAUSES)
 
 
@@ -51,7 +51,7 @@ def test_a_cause_has_units_and_a_variable_along_which_it_shows():
     ('heading_sensitivity', {'time', 'reference'}), ('interference_tone', {'time'}),
     ('reference_quantization', {'time', 'reference_heading'})])
 def test_what_a_log_must_hold_to_show_a_cause(name, needed):
-    assert CAUSES[name].needs == needed
+    assert CAUSES[name].required_channels == needed
 
 
 def test_a_reference_is_a_column_of_a_log():
@@ -59,7 +59,7 @@ def test_a_reference_is_a_column_of_a_log():
 
 
 #: Words of the experiment for each pair of twins, in their order.
-WANTED = dict(zip(TWINS, [
+WANTED = dict(zip(LOOK_ALIKES, [
     'heat and cool', 'heat and cool', 'rest for', 'whole turns', 'at eight speeds', 'motor',
     'axis up, level, down', 'beyond', 'quick reversals', 'abrupt changes', 'abrupt changes',
     'again', 'again', 'step the supply', 'axis up', 'whole turns']))
@@ -72,17 +72,17 @@ def _laid():
     return replay(log, np.ones(len(log), bool), np.random.default_rng(1))
 
 
-@pytest.mark.parametrize('pair', TWINS, ids='-'.join)
+@pytest.mark.parametrize('pair', LOOK_ALIKES, ids='-'.join)
 def test_twins_are_given_the_experiment_that_physics_wants_in_either_order(pair, laid):
     for one, other in (pair, pair[::-1]):
-        words = experiment(one, [(other, 2.0)], observed_range([laid]))
+        words = next_experiment(one, [(other, 2.0)], observed_range([laid]))
         assert WANTED[pair] in words
         assert f'{other.replace("_", " ")} by 2.0 sigma, 2 such logs together by 2.8' in words
 
 
 def test_the_numbers_of_an_experiment_are_those_of_the_log(laid):
     def numbers(one, other):
-        words = experiment(one, [(other, 0.0)], observed_range([laid])).partition(' (')[0]
+        words = next_experiment(one, [(other, 0.0)], observed_range([laid])).partition(' (')[0]
         return [float(each) for each in re.findall(r'-?\d+\.?\d*', words)]
     top = float(np.abs(laid.channels.rate).max()) / DEGREE
     assert numbers('sine_response', 'saturation') == pytest.approx([3.0 * top, top], rel=0.01)
@@ -93,17 +93,17 @@ def test_the_numbers_of_an_experiment_are_those_of_the_log(laid):
 
 
 def test_a_set_of_three_names_each_experiment_once(laid):
-    words = experiment('cubic_nonlinearity', [('sine_response', 0.0), ('saturation', 0.5)],
-                       observed_range([laid]))
+    words = next_experiment('cubic_nonlinearity', [('sine_response', 0.0), ('saturation', 0.5)],
+                            observed_range([laid]))
     assert words.count('turn both ways') == 1
     assert 'sine response by 0.0 sigma, saturation by 1.0 sigma, 7 such logs' in words
-    assert not experiment('outliers', [('dropped_samples', 0.0)], {})
+    assert not next_experiment('outliers', [('dropped_samples', 0.0)], {})
 
 
 def test_a_set_that_is_found_has_its_experiment():
     pair = ('bias_temperature', 'warm_up')
     generator = np.random.default_rng(zlib.crc32(b'a set'))
-    found = diagnosis_of([twin(pair, pair[0], generator, sample_rate=10.0)], generator)
+    found = diagnosis_of([hide_look_alike(pair, pair[0], generator, sample_rate=10.0)], generator)
     (finding,) = found.findings
     assert {finding.effect, *finding.ambiguous_with} >= set(pair)
     assert 'heat and cool it twice' in finding.separate_by and 'sigma' in finding.separate_by

@@ -10,10 +10,14 @@
 
 """The stated improvement by an extended model on held-out blocks: the state before, and limits."""
 
-from gyro_calibration.diagnosis.cross_validation import change_over, gain, shares
+from gyro_calibration.diagnosis.cross_validation import (
+    heading_error_shares,
+    jackknife_change,
+    measure_gain,
+)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.search import begin
+from gyro_calibration.diagnosis.search import start_search
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -89,14 +93,14 @@ def test_a_reference_that_is_known_in_too_few_blocks_gives_no_gain(known):
     generator = np.random.default_rng(5)
     logs = [drive(generator, 300.0) for _ in known]
     laid = [replay(log, where(log.time), generator) for log, where in zip(logs, known)]
-    assert gain(begin(laid, generator), {'rate_ramp'}, False) is None
+    assert measure_gain(start_search(laid, generator), {'rate_ramp'}, False) is None
 
 
 def test_one_part_has_no_interval_and_is_not_called_worse():
-    change = change_over(np.array([[1.0, 2.0]]), np.ones(1))
-    assert change.interval is None and not change.worse and change.figures()['ci95'] is None
-    assert change_over(np.array([[1.0, 2.0]] * 2), np.ones(2)).worse
-    assert not change_over(np.array([[1.0, 2.0], [1.0, 1.2]]), np.ones(2)).worse
+    change = jackknife_change(np.array([[1.0, 2.0]]), np.ones(1))
+    assert change.interval is None and not change.is_worse and change.to_dict()['ci95'] is None
+    assert jackknife_change(np.array([[1.0, 2.0]] * 2), np.ones(2)).is_worse
+    assert not jackknife_change(np.array([[1.0, 2.0], [1.0, 1.2]]), np.ones(2)).is_worse
 
 
 # how sure
@@ -111,7 +115,7 @@ def test_intervals_of_the_improvement_hold_the_truth_for_few_parts(parts, shared
         mine, other = generator.standard_normal((2, parts))
         after = shared * mine + 0.2 * other
         before = mine + 0.2 * generator.standard_normal(parts)
-        change = change_over(np.column_stack([before, after]) ** 2, np.ones(parts))
+        change = jackknife_change(np.column_stack([before, after]) ** 2, np.ones(parts))
         low, high = change.interval
         inside += low <= np.hypot(1.0, 0.2) - np.hypot(shared, 0.2) <= high
     # Few squares are skew, which costs some per cent; resampled blocks cover 62 to 86 of 100.
@@ -124,10 +128,10 @@ def test_what_a_cause_adds_like_a_bias_or_a_scale_factor_error_is_not_its_share(
     rate = 1.0 + 0.1 * np.sin(0.2 * time[1:])
     parts = {'scale_factor_error': 0.02 * rate, 'quadratic_nonlinearity': 0.5 * rate ** 2,
              'bias': np.full(600, -0.5), 'left': 1e-4 * np.cos(time[1:])}
-    found = shares([(parts, time)])
+    found = heading_error_shares([(parts, time)])
     assert abs(found['quadratic_nonlinearity']) < 0.01
     assert sum(found.values()) == pytest.approx(1.0)
     # what no bias and no scale factor error makes is its own
     own = {**parts, 'quadratic_nonlinearity': 1e-3 * np.sin(0.01 * time[1:]),
            'bias': 0.0 * rate, 'scale_factor_error': 0.0 * rate}
-    assert shares([(own, time)])['quadratic_nonlinearity'] > 0.5
+    assert heading_error_shares([(own, time)])['quadratic_nonlinearity'] > 0.5

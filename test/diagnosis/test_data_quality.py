@@ -16,19 +16,24 @@ import re
 
 from chance import fewest, most, seeded
 from diagnosed import log_of
-from gyro_calibration.diagnosis.data_quality import encoder_step, inspect, LEVEL, update_interval
-from gyro_calibration.diagnosis.expected_output import (
-    compare,
-    FACTORS,
-    unit_of_offset,
-    unit_of_scale,
+from gyro_calibration.diagnosis.data_quality import (
+    encoder_step,
+    FALSE_ALARM_CHANCE,
+    inspect_record,
+    update_interval,
 )
-from gyro_calibration.diagnosis.gates import refuse, rests
+from gyro_calibration.diagnosis.expected_output import (
+    compare_output,
+    identify_sample_offset,
+    identify_unit_factor,
+    UNIT_FACTORS,
+)
+from gyro_calibration.diagnosis.gates import is_at_rest, refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.samples import repeated_samples
+from gyro_calibration.diagnosis.samples import find_repeated_samples
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
-from gyro_calibration.logs.quality import codes_of
-from gyro_calibration.logs.stamps import number_stamps
+from gyro_calibration.logs.quality import find_codes
+from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -71,7 +76,7 @@ def stepping(generator, noise, count=6000):
 
 def found(log, model=None):
     """Return the findings by name."""
-    return {finding.effect: finding for finding in inspect(log, model).findings}
+    return {finding.effect: finding for finding in inspect_record(log, model).findings}
 
 
 def value(finding):
@@ -121,7 +126,7 @@ CLEAN = {'white': lambda generator: swing(generator),
 
 
 #: Rate of false alarms that is stated for a log, by five checks.
-STATED = 5 * LEVEL
+STATED = 5 * FALSE_ALARM_CHANCE
 
 
 @pytest.mark.parametrize('logs', [30, pytest.param(300, marks=pytest.mark.evidence)])
@@ -170,11 +175,11 @@ def test_outliers_are_left_out_and_others_are_not(generator):
     log = swing(generator)
     wild = generator.choice(np.arange(20, 5980), 8, replace=False)
     log.output[wild] += 12.0 * SIGMA * generator.choice([-1.0, 1.0], 8)
-    quality = inspect(log)
+    quality = inspect_record(log)
     assert [finding.effect for finding in quality.findings] == ['outliers']
     # two that are neighbours may hide each other
-    assert (np.count_nonzero(~quality.trusted[wild]) >= 6
-            and np.count_nonzero(~quality.trusted) <= 9)
+    assert (np.count_nonzero(~quality.usable[wild]) >= 6
+            and np.count_nonzero(~quality.usable) <= 9)
 
 
 @pytest.mark.parametrize('rough, rate', [('steps', STATED), ('jolts', 0.01),
@@ -201,7 +206,7 @@ def roughened(rough, generator):
 def test_an_outlier_at_an_end_of_the_log_is_found(place, generator):
     log = swing(generator)
     log.output[place] += 90.0
-    assert not inspect(log).trusted[place] and 'outliers' in found(log)
+    assert not inspect_record(log).usable[place] and 'outliers' in found(log)
 
 
 def test_an_outlier_of_the_reference_is_not_blamed_on_the_gyro(generator):
@@ -213,10 +218,10 @@ def test_an_outlier_of_the_reference_is_not_blamed_on_the_gyro(generator):
 def test_repeated_samples_of_exact_values_are_found_and_left_out(generator):
     log = swing(generator)
     log.output[1000:1003] = log.output[999]
-    quality = inspect(log)
+    quality = inspect_record(log)
     assert ([finding.effect for finding in quality.findings] == ['stuck_samples']
             and value(quality.findings[0]) == 3.0)
-    assert not quality.trusted[1000:1003].any() and quality.trusted[999] and quality.trusted[1003]
+    assert not quality.usable[1000:1003].any() and quality.usable[999] and quality.usable[1003]
 
 
 @pytest.mark.parametrize('step', [0.3, 1.0, 3.0, 30.0])
@@ -233,10 +238,10 @@ def test_samples_that_a_coarse_gyro_repeats_in_a_turn_are_found(generator):
 
 def test_steps_as_wide_as_the_noise_repeat_as_seldom_as_stated(any_generator):
     """200 logs at rest in the middle of a step at 2 % each; 26 alarms if each repeat counted."""
-    logs = [compare(np.round(any_generator.standard_normal(2000) / 1.05) * 1.05, None, None)
+    logs = [compare_output(np.round(any_generator.standard_normal(2000) / 1.05) * 1.05, None, None)
             for _ in range(200)]
-    assert sum(repeated_samples(log, codes_of(log.output), None, np.ones(2000, dtype=bool),
-                                0.02) is not None for log in logs) <= most(200, 0.02)
+    assert sum(find_repeated_samples(log, find_codes(log.output), None, np.ones(2000, dtype=bool),
+                                     0.02) is not None for log in logs) <= most(200, 0.02)
 
 
 @pytest.mark.parametrize('noise', [1e-4, 1e-5])
@@ -261,18 +266,18 @@ def test_a_dead_band_is_no_fault_of_the_record(within, ways, any_generator):
     logs = logs if ways == 2 else [replace(log, output=np.abs(log.output),
                                            reference_rate=np.abs(log.reference_rate))
                                    for log in logs]
-    records = [inspect(zeroed(log, within * SIGMA)) for log in logs]
+    records = [inspect_record(zeroed(log, within * SIGMA)) for log in logs]
     assert (sum(bool(record.findings) for record in records) <= most(5, STATED)
-            and all(record.trusted.mean() > 0.99 for record in records))
+            and all(record.usable.mean() > 0.99 for record in records))
 
 
 def test_zeros_in_a_turn_are_repeated_samples_beside_a_dead_band(generator):
     log = zeroed(swing(generator), 10.0 * SIGMA)
     places = np.flatnonzero(np.abs(log.reference_rate[:5900]) > 0.5)[:1] + np.arange(10)
     log.output[places] = 0.0
-    quality = inspect(log)
+    quality = inspect_record(log)
     assert 'stuck_samples' in [finding.effect for finding in quality.findings]
-    assert not quality.trusted[places[1:]].any() and np.count_nonzero(~quality.trusted) <= 12
+    assert not quality.usable[places[1:]].any() and np.count_nonzero(~quality.usable) <= 12
 
 
 def test_a_dead_band_of_the_driver_is_found_as_a_dead_zone():
@@ -296,12 +301,12 @@ def test_a_moving_average_of_coarse_steps_has_no_repeated_samples(generator):
 @pytest.mark.parametrize('low, high', [(-0.8, 0.8), (-math.inf, 0.7), (-0.9, math.inf)])
 def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
     log = swing(generator)
-    quality = inspect(replace(log, output=np.clip(log.output, low, high)))
+    quality = inspect_record(replace(log, output=np.clip(log.output, low, high)))
     assert ([finding.effect for finding in quality.findings] == ['saturation']
             and quality.limit == min(-low, high))
     beyond = (log.output > high) | (log.output < low)
-    assert (not quality.trusted[beyond].any()
-            and quality.trusted[np.abs(log.reference_rate) < 0.6].all())
+    assert (not quality.usable[beyond].any()
+            and quality.usable[np.abs(log.reference_rate) < 0.6].all())
 
 
 def test_a_limit_that_is_a_step_further_on_one_side_has_the_size_of_the_smaller(generator):
@@ -330,14 +335,14 @@ def test_quantization_and_saturation_of_the_model_are_no_findings(generator):
     assert list(found(replace(log, output=output))) == ['quantization', 'saturation']
 
 
-@pytest.mark.parametrize('name', [name for name, factor in FACTORS.items()
+@pytest.mark.parametrize('name', [name for name, factor in UNIT_FACTORS.items()
                                   if 1e-2 < abs(factor) < 100.0 and name != '1000000/1048576'])
 def test_a_wrong_unit_is_named_and_corrected(name, generator):
     log = swing(generator, scale=1.0)
-    quality = inspect(replace(log, output=log.output * FACTORS[name]))
+    quality = inspect_record(replace(log, output=log.output * UNIT_FACTORS[name]))
     assert [finding.effect for finding in quality.findings] == ['unit_error']
     assert (f'and {name} is' in quality.findings[0].evidence
-            and quality.factor * FACTORS[name] == pytest.approx(1.0))
+            and quality.unit_factor * UNIT_FACTORS[name] == pytest.approx(1.0))
 
 
 @pytest.mark.parametrize('factor, deviation, name', [
@@ -345,14 +350,14 @@ def test_a_wrong_unit_is_named_and_corrected(name, generator):
     (2.1, 1e-3, '2'), (1.0239, 1e-4, '1024/1000'), (1.0235, 1e-5, None), (1.0239, 5e-3, None),
     (1.03, 1e-4, None), (0.98, 1e-4, None), (3.0, 1e-3, None)])
 def test_a_factor_is_a_unit_only_where_it_is_known_to_be_one(factor, deviation, name):
-    assert unit_of_scale(factor, deviation) == name
+    assert identify_unit_factor(factor, deviation) == name
 
 
 @pytest.mark.parametrize('offset, deviation, name',
                          [(0.01, 1e-4, 'one sample'), (-0.0051, 1e-4, 'half a sample'),
                           (0.0075, 1e-4, None), (0.01, 2e-3, None), (0.02, 1e-4, None)])
 def test_an_offset_is_a_sample_only_where_it_is_known_to_be_one(offset, deviation, name):
-    assert unit_of_offset(offset, deviation, INTERVAL) == name
+    assert identify_sample_offset(offset, deviation, INTERVAL) == name
 
 
 def test_a_scale_factor_error_that_the_model_has_is_no_unit(generator):
@@ -376,10 +381,10 @@ def test_lost_samples_are_counted_through_jitter(jitter, generator):
 
 def test_a_changing_sampling_interval_is_a_remark(generator):
     log = swing(generator)
-    warped = inspect(replace(log, time=log.time * (1.0 + 1e-5 * log.time)))
+    warped = inspect_record(replace(log, time=log.time * (1.0 + 1e-5 * log.time)))
     assert (not warped.findings
             and 'interval of the samples changes by +800 ppm' in ' '.join(warped.remarks))
-    assert not inspect(log).remarks
+    assert not inspect_record(log).remarks
 
 
 @pytest.mark.parametrize('step', [0.088 * DEGREE, 0.01 * DEGREE])
@@ -409,23 +414,24 @@ def test_the_update_interval_of_a_held_reference_is_found(every, generator):
     interval = update_interval(log.time, held, 0.0)
     assert interval is None if every == 1 else interval == pytest.approx(every * INTERVAL,
                                                                          rel=1e-6)
-    assert bool(inspect(replace(log, reference_rate=held)).remarks) == (every > 1)
+    assert bool(inspect_record(replace(log, reference_rate=held)).remarks) == (every > 1)
 
 
 @pytest.mark.parametrize('count', [400, 2000, 50_000])
 def test_values_without_steps_have_no_quantization(count, generator):
     values = np.sin(np.arange(count) * 0.003) + generator.normal(0.0, 1e-3, count)
-    assert codes_of(values).step == 0.0
-    assert codes_of(np.round(values / 1e-4) * 1e-4).step == pytest.approx(1e-4, rel=1e-9)
+    assert find_codes(values).step == 0.0
+    assert find_codes(np.round(values / 1e-4) * 1e-4).step == pytest.approx(1e-4, rel=1e-9)
 
 
 @pytest.mark.parametrize('share', [0.7, 0.9, 0.99])
 def test_one_value_that_comes_often_makes_no_quantization(share, generator):
     for _ in range(20):
         often, values = generator.random(6000) < share, generator.standard_normal(6000)
-        assert codes_of(np.where(often, 0.0, values)).step == 0.0
-        assert codes_of(np.where(often, 0.0, np.round(values / 0.1) * 0.1)).step == pytest.approx(
-            0.1, rel=1e-9)
+        assert find_codes(np.where(often, 0.0, values)).step == 0.0
+        assert find_codes(np.where(often, 0.0,
+                                   np.round(values / 0.1) * 0.1)).step == pytest.approx(
+                                       0.1, rel=1e-9)
 
 
 GOOD = swing(np.random.default_rng(1))
@@ -466,7 +472,7 @@ REFUSED = {
 @pytest.mark.parametrize('log, model, reason', REFUSED.values(), ids=REFUSED)
 def test_a_log_that_allows_no_diagnosis_is_refused_in_one_sentence(log, model, reason):
     with pytest.raises(DataRefused) as refused:
-        refuse(log, model)
+        refuse_unusable(log, model)
     assert (reason in str(refused.value) and '\n' not in str(refused.value)
             and re.search('[:;]', str(refused.value)))
 
@@ -475,21 +481,21 @@ def test_a_log_that_allows_a_diagnosis_is_accepted():
     own = GyroModel((Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))),
                     rate_range=(-1.0, 1.0), noise=WHITE)
     half = np.where(np.arange(6000) % 1000 < 300, np.nan, 1.0)
-    refuse(GOOD)
-    refuse(GOOD, own)
-    refuse(replace(GOOD, output=GOOD.output * half,
-                   reference_rate=GOOD.reference_rate * half[::-1]), own)
-    refuse(replace(GOOD, output=GOOD.output / DEGREE), own)
-    refuse(Log(output=GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
+    refuse_unusable(GOOD)
+    refuse_unusable(GOOD, own)
+    refuse_unusable(replace(GOOD, output=GOOD.output * half,
+                            reference_rate=GOOD.reference_rate * half[::-1]), own)
+    refuse_unusable(replace(GOOD, output=GOOD.output / DEGREE), own)
+    refuse_unusable(Log(output=GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
 
 
 def test_a_gyro_at_rest_needs_no_reference():
     still = replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate, reference_rate=None)
     for log in (still, replace(GOOD, reference_rate=None, moving=np.zeros(6000)),
                 replace(still, reference_rate=np.zeros(6000))):
-        refuse(log)
-        assert rests(log)
-    assert not rests(GOOD)
+        refuse_unusable(log)
+        assert is_at_rest(log)
+    assert not is_at_rest(GOOD)
 
 
 RECORDINGS = {
@@ -503,10 +509,10 @@ RECORDINGS = {
 @pytest.mark.parametrize('name', RECORDINGS)
 def test_measured_records_show_what_is_known_of_them(name, data):
     log = read_log(data / name)
-    refuse(log)
-    quality = inspect(log)
+    refuse_unusable(log)
+    quality = inspect_record(log)
     assert [finding.effect for finding in quality.findings] == RECORDINGS[name]
     if 'turntable' in name:
         assert quality.heading_step == pytest.approx(360.0 / 4096 * DEGREE * 351 / 360, rel=0.03)
         lost = {finding.effect: finding for finding in quality.findings}['dropped_samples']
-        assert value(lost) == number_stamps(log.time).lost.sum() > 15
+        assert value(lost) == fit_stamp_grid(log.time).lost_after.sum() > 15

@@ -25,22 +25,22 @@ from diagnosed import diagnosis_of, held, judged_diagnosis, log_of, model_of, wo
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.model.channels import channels_of
+from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE
-from gyro_calibration.model.model_file import model_text, read_model
-from gyro_calibration.model.motion import respond
+from gyro_calibration.model.model_file import format_model, read_model
+from gyro_calibration.model.motion import simulate_gyro_output
 from gyro_calibration_bench.hidden import (
-    described,
     draw_gyro,
     FORMS,
     hide,
     KINDS,
     NoiseFigures,
-    OUTSIDE,
+    OUTSIDE_CATALOGUE,
     record,
     session,
+    session_from_motion,
 )
-from gyro_calibration_bench.hidden.effects import AGAINST_A_MODEL
+from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
 import numpy as np
 import pytest
 
@@ -95,7 +95,7 @@ def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
     log, = hidden_in([name], 5.0, seed, reference=reference)
     found = diagnosis_of([log], np.random.default_rng(seed))
     how = judged_diagnosis(log, found, ENCODER)
-    assert how.right, told(log, found)
+    assert how.is_right, told(log, found)
     # an encoder blurs where a zone ends by more than the noise does
     ends_blurred = name == 'dead_zone' and 'encoder_step' in reference
     assert ends_blurred or all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(
@@ -113,7 +113,7 @@ def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
 def test_effects_together_are_all_named(seed, names):
     log, = hidden_in(names, 5.0, seed)
     found = diagnosis_of([log], np.random.default_rng(seed))
-    assert judged_diagnosis(log, found, ENCODER).right, told(log, found)
+    assert judged_diagnosis(log, found, ENCODER).is_right, told(log, found)
 
 
 def test_a_coarse_output_and_another_effect_are_both_named():
@@ -132,7 +132,7 @@ def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
     found = diagnosis_of([log], np.random.default_rng(seed),
                          with_model=bool((seed + reference) % 2))
     assert judged_diagnosis(
-        log, found, ENCODER).right and set(names_of(found)) <= set(ENCODER), told(log, found)
+        log, found, ENCODER).is_right and set(names_of(found)) <= set(ENCODER), told(log, found)
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
 
 
@@ -141,9 +141,10 @@ def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
     ('third_harmonic_of_heading',), ('resonance_at_a_speed',), ('bias_pulse',),
     ('supply_times_rate',)))
 def test_what_the_catalogue_does_not_have_is_reported_as_unexplained(name):
-    log, = hidden_in([name], 5.0, list(OUTSIDE).index(name), reference=REFERENCES[0])
+    log, = hidden_in([name], 5.0, list(OUTSIDE_CATALOGUE).index(name), reference=REFERENCES[0])
     found = diagnosis_of([log], np.random.default_rng(0))
-    assert found.verdict == 'unexplained' and judged_diagnosis(log, found).right, told(log, found)
+    assert found.verdict == 'unexplained' and judged_diagnosis(log, found).is_right, told(
+        log, found)
 
 
 @pytest.mark.evidence
@@ -153,7 +154,7 @@ def test_random_effects_are_found():
         name = str(generator.choice(list(FORMS)))
         log, = hide([name], 5.0, generator, noise=str(generator.choice(KINDS)), **SHORT)
         found = diagnosis_of([log], generator)
-        wrong += [] if judged_diagnosis(log, found).right else [told(log, found)]
+        wrong += [] if judged_diagnosis(log, found).is_right else [told(log, found)]
     # right in 92 % at 5 times the minimum detectable effect (docs/benchmarks.md)
     assert len(wrong) <= most(16, 0.08), '\n'.join(wrong)
 
@@ -166,15 +167,15 @@ def test_random_effects_are_found():
 def test_a_wrong_reference_is_blamed_on_the_reference(name, reference):
     log, = hidden_in([name], 10.0, reference, 'mixed', REFERENCES[reference])
     found = diagnosis_of([log], np.random.default_rng(1))
-    assert judged_diagnosis(log, found,
-                            ENCODER).right and CAUSES[name].of == 'reference', told(log, found)
+    assert judged_diagnosis(
+        log, found, ENCODER).is_right and CAUSES[name].origin == 'reference', told(log, found)
     assert name not in {term.effect.name for term in found.model.terms}
 
 
 def test_a_strobe_of_another_frequency_is_named_beside_the_scale_of_the_gyro():
     def given(sessions):
         return {'reference_scale': {'size': 59.8 / 60.0 - 1.0}}
-    log, = hidden_in(['reference_scale'], 1.0, 5, 'mixed', REFERENCES[0], given=given)
+    log, = hidden_in(['reference_scale'], 1.0, 5, 'mixed', REFERENCES[0], fixed_parts=given)
     found = diagnosis_of([log], np.random.default_rng(1))
     (finding,) = found.findings
     assert ({finding.effect, *finding.ambiguous_with} >= {'scale_factor_error', 'reference_scale'}
@@ -192,9 +193,9 @@ LARGE = {'time_offset': lambda sessions: {'size': 0.02},
                                                 *itertools.product(range(2), LARGE)))
 def test_a_large_effect_brings_no_companions(name, seed):
     log, = hidden_in([name], 1.0, seed, 'mixed', REFERENCES[0],
-                     given=lambda sessions: {name: LARGE[name](sessions)})
+                     fixed_parts=lambda sessions: {name: LARGE[name](sessions)})
     found = diagnosis_of([log], np.random.default_rng(seed))
-    assert judged_diagnosis(log, found).right, told(log, found)
+    assert judged_diagnosis(log, found).is_right, told(log, found)
     assert held(log.truth.gyro.causes, found.findings, 4.0).get(name, True), told(log, found)
 
 
@@ -205,9 +206,9 @@ def test_a_log_without_channels_says_what_it_cannot_show():
     found = diagnose([replace(log_of(log), temperature=None, supply=None, specific_force=None)],
                      np.random.default_rng(0))
     needed = {name for name, cause in CAUSES.items()
-              if cause.needs & {'temperature', 'supply', 'specific_force'}}
+              if cause.required_channels & {'temperature', 'supply', 'specific_force'}}
     assert needed <= set(found.cannot_show) and 'cubic_nonlinearity' not in found.cannot_show
-    assert judged_diagnosis(log, found).right, told(log, found)
+    assert judged_diagnosis(log, found).is_right, told(log, found)
 
 
 def test_a_log_of_a_gyro_at_rest_needs_no_reference():
@@ -216,8 +217,8 @@ def test_a_log_of_a_gyro_at_rest_needs_no_reference():
     rest = truth.prediction - (1.0 + truth.scale_factor_error) * truth.rate + truth.noise
     found = diagnose([replace(log_of(log), output=rest, reference_rate=None, moving=0.0 * rest)],
                      np.random.default_rng(0))
-    assert judged_diagnosis(log, found).in_set and not judged_diagnosis(log, found).extra, told(
-        log, found)
+    assert judged_diagnosis(
+        log, found).is_in_set and not judged_diagnosis(log, found).false_names, told(log, found)
     assert {'cubic_nonlinearity', 'time_offset',
             'reference_once_per_rev'} <= set(found.cannot_show)
 
@@ -229,10 +230,10 @@ def recorded(names, steps, seed, given=None, multiple=8.0):
     generator = np.random.default_rng(seed)
     time = np.arange(0.0, SHORT['duration'], 1.0 / SHORT['sample_rate'])
     motion = 1.5 * np.sin(0.7 * time) * (np.sin(0.05 * time) > 0.0)
-    sessions = [described(generator, time, motion,
-                          25.0 + 10.0 * (time > step) - 15.0 * (time > step + 100.0))
+    sessions = [session_from_motion(generator, time, motion,
+                                    25.0 + 10.0 * (time > step) - 15.0 * (time > step + 100.0))
                 for step in steps]
-    gyro = draw_gyro(names, multiple, generator, sessions, NoiseFigures(1e-4), given=given)
+    gyro = draw_gyro(names, multiple, generator, sessions, NoiseFigures(1e-4), fixed_parts=given)
     return [record(gyro, each, generator, run=run) for run, each in enumerate(sessions)]
 
 
@@ -243,7 +244,7 @@ def test_a_step_that_happens_with_a_change_of_temperature_is_a_step_where_the_ot
     logs = recorded(['bias_step'], STEPS, 1,
                     {'bias_step': {'run': 0, 'step_time': STEPS[0] + 5.0}})
     found = diagnosis_of(logs, np.random.default_rng(0))
-    assert judged_diagnosis(logs[0], found).right, told(logs[0], found)
+    assert judged_diagnosis(logs[0], found).is_right, told(logs[0], found)
     named = {name for each in found.findings for name in (each.effect, *each.ambiguous_with)}
     assert not {name for name in named if CAUSES[name].along.startswith('temperature')}, told(
         logs[0], found)
@@ -260,8 +261,9 @@ def test_an_effect_of_the_motion_is_found_in_several_logs_together():
     logs = hide(['cubic_nonlinearity'], 5.0, np.random.default_rng(3), noise='mixed', runs=3,
                 **SHORT)
     found = diagnosis_of(logs, np.random.default_rng(0))
-    assert (judged_diagnosis(logs[0], found).right
-            and all(judged_diagnosis(logs[0], found).held.values())), told(logs[0], found)
+    assert (judged_diagnosis(logs[0], found).is_right
+            and all(judged_diagnosis(logs[0], found).interval_holds.values())), told(
+                logs[0], found)
 
 
 # against a model
@@ -295,14 +297,15 @@ def again(hidden, seed):
     """Record the same gyro in another motion at the same temperatures, after another power-on."""
     generator = np.random.default_rng(seed)
     other = session(generator, **SHORT)
-    other = described(generator, other.time, other.rate, hidden.session.temperature)
+    other = session_from_motion(generator, other.time, other.rate, hidden.session.temperature)
     return record(hidden.truth.gyro, other, generator, reference='both', run=1)
 
 
 def left_over(model, log):
     """Return the residuals of a log: of its simulated output, and of its compensated rate."""
-    channels = channels_of(log)
-    simulated = respond(model, log.time, channels.moving(log.reference_rate, log.reference_rate))
+    channels = channels_from_log(log)
+    simulated = simulate_gyro_output(model, log.time,
+                                     channels.with_rate(log.reference_rate, log.reference_rate))
     known = np.interp(model.true_time(log.time), log.time, log.reference_rate)
     return np.var(log.output - simulated), np.var(compensate_log(model, log) - known)
 
@@ -314,9 +317,9 @@ def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path
         # as small as it is detectable, no motion tells a delay from a lag
         return {'time_offset': {'size': 0.01}} if 'time_offset' in names else {}
     first, = hide(names, 10.0, np.random.default_rng(seed), noise='white', reference='both',
-                  given=given, **SHORT)
+                  fixed_parts=given, **SHORT)
     found, second = diagnosis_of([first], np.random.default_rng(0)), again(first, seed)
-    (tmp_path / 'model.yaml').write_text(model_text(found.model))
+    (tmp_path / 'model.yaml').write_text(format_model(found.model))
     model = read_model(tmp_path / 'model.yaml')
     assert set(names) <= {term.effect.name
                           for term in model.terms} <= set(CATALOGUE), told(first, found)
@@ -329,6 +332,7 @@ def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path
 
 
 def test_noise_is_found_against_a_model_only():
-    assert {name for name, cause in CAUSES.items() if cause.of == 'noise'} <= set(AGAINST_A_MODEL)
+    assert ({name for name, cause in CAUSES.items() if cause.origin == 'noise'}
+            <= set(MODEL_FINDINGS))
     log, = hidden_in(['angle_random_walk'], 20.0, 1, 'white', REFERENCES[0])
     assert names_of(diagnosis_of([log], np.random.default_rng(0), with_model=False)) == []

@@ -13,19 +13,28 @@
 from dataclasses import replace
 
 from diagnosed import log_of
-from gyro_calibration.diagnosis.candidates import effect
-from gyro_calibration.diagnosis.extended_model import calibrated, extended, left_out
+from gyro_calibration.diagnosis.candidates import effect_candidate
+from gyro_calibration.diagnosis.extended_model import (
+    add_causes,
+    merge_self_calibration,
+    unmergeable_causes,
+)
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression import fitted, FittedValues, Named, regression_problem
+from gyro_calibration.diagnosis.regression import (
+    build_problem,
+    fit_causes,
+    FittedValues,
+    SelectedCause,
+)
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.words import headline, is_inside
+from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.words import headline, is_in_extended_model
 from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import simulate, turns
+from gyro_calibration.model.motion import constant_rate_motion, simulate
 from gyro_calibration.model.noise import Noise
 from gyro_calibration_bench.hidden import hide
 import numpy as np
@@ -37,7 +46,8 @@ LINEAR = (Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)))
 MODEL = GyroModel(LINEAR, np.diag([1e-10, 1e-8]), (-1.5, 1.5), (10.0, 30.0), noise=NOISE,
                   gyro={'name': 'yaw'},
                   origin={'files': [{'name': 'old.csv'}], 'date': '2025-01-01'})
-DRIVE = turns([(20, 0), (9, 40), (10, 0), (6, -60), (15, 20), (20, -10)] * 5, ramp=1.0)
+DRIVE = constant_rate_motion([(20, 0), (9, 40), (10, 0), (6, -60), (15, 20), (20, -10)] * 5,
+                             ramp=1.0)
 RATE = 20.0
 TIME = np.arange(round(DRIVE.duration * RATE) + 1) / RATE
 #: It is heated, and cools again.
@@ -72,11 +82,11 @@ def value(model, name, place=0):
 def on_top(own, found, *shapes, supply=None):
     """Return a model with an effect, and a finding of more of it from another origin or time."""
     model = replace(MODEL, terms=(*LINEAR, own),
-                    covariance=np.diag([1e-10, 1e-8, 1e-12, 1e-12][:2 + len(own.fitted)]))
+                    covariance=np.diag([1e-10, 1e-8, 1e-12, 1e-12][:2 + len(own.fitted_indices)]))
     log = replace(drive(), supply=supply)
     laid = replay(log, np.ones(len(log), dtype=bool), np.random.default_rng(3), model=model)
-    named = [Named(effect(found, *shapes), (1e-4,))]
-    return model, FittedValues(fitted(regression_problem([laid]), named), (laid,))
+    named = [SelectedCause(effect_candidate(found, *shapes), (1e-4,))]
+    return model, FittedValues(fit_causes(build_problem([laid]), named), (laid,))
 
 
 VOLTS = 12.0 + np.sin(0.05 * TIME)
@@ -95,13 +105,13 @@ BESIDE = {'bias_temperature': (term('bias_temperature', 25.0, 1e-4), 'bias_tempe
                          ids=BESIDE)
 def test_the_extended_model_says_what_model_and_finding_say_together(own, found, shapes):
     model, outcome = on_top(own, found, *shapes, supply=VOLTS)
-    new, (laid,) = extended(model, outcome, 1e-5), outcome.replays
+    new, (laid,) = add_causes(model, outcome, 1e-5), outcome.replays
     channels, rate = laid.channels, laid.channels.rate
-    together = rate + laid.added + outcome.explained[0] + outcome.biases[0]
-    assert (not left_out(model, outcome)
-            and new.output_in(channels.moving(rate, rate)) == pytest.approx(together, abs=1e-12))
+    together = rate + laid.simulated_error + outcome.explained_outputs[0] + outcome.biases[0]
+    assert (not unmergeable_causes(model, outcome) and new.output_from_channels(
+        channels.with_rate(rate, rate)) == pytest.approx(together, abs=1e-12))
     # how well the error is known is what the model, the bias and the finding say of it
-    columns = np.array([rate, *(outcome.named[0].candidate.columns(laid))])
+    columns = np.array([rate, *(outcome.causes[0].candidate.columns(laid))])
     own_rows, rows = (np.array([row + 0.0 * rate for each in terms
                                 for row in each.sensitivity(channels)])
                       for terms in (model.terms, new.terms))
@@ -116,8 +126,8 @@ def test_the_extended_model_says_what_model_and_finding_say_together(own, found,
                           ('clock_rate', 2e-5, 3e-5)])
 def test_delays_and_paces_of_clocks_add_up(name, own, found):
     model, outcome = on_top(term(name, own), name, found)
-    assert (not left_out(model, outcome)
-            and value(extended(model, outcome, 1e-5), name) == pytest.approx(own + found))
+    assert (not unmergeable_causes(model, outcome)
+            and value(add_causes(model, outcome, 1e-5), name) == pytest.approx(own + found))
 
 
 @pytest.mark.parametrize('name, own, shape',
@@ -125,9 +135,9 @@ def test_delays_and_paces_of_clocks_add_up(name, own, found):
                           ('bandwidth', (0.02,), 0.05), ('time_offset', (0.9,), 0.2)])
 def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, own, shape):
     model, outcome = on_top(term(name, *own), name, shape)
-    (out,) = left_out(model, outcome)
+    (out,) = unmergeable_causes(model, outcome)
     assert out.candidate.cause == name
-    assert not left_out(GyroModel(), outcome)
+    assert not unmergeable_causes(GyroModel(), outcome)
 
 
 def test_a_second_tone_is_not_reported_as_in_the_model():
@@ -136,8 +146,10 @@ def test_a_second_tone_is_not_reported_as_in_the_model():
     model = replace(MODEL, terms=(*LINEAR, slow), covariance=None)
     log = drive(slow, fast)
     found = diagnosed(log, model)
-    assert names(found) == ['interference_tone'] and not is_inside(found.findings[0], found)
-    assert found.model.terms == model.terms and 'It is in the extended model' not in report(found)
+    assert (names(found) == ['interference_tone']
+            and not is_in_extended_model(found.findings[0], found))
+    assert (found.model.terms == model.terms
+            and 'It is in the extended model' not in render_report(found))
     assert any('interference tone occurs once: it is not in the extended model' in remark
                for remark in found.remarks)
 
@@ -159,7 +171,7 @@ def test_what_happens_once_is_named_and_only_what_lasts_is_in_the_model(once, ow
     mean = np.mean(once.values[1] * (TIME > 130.0)) if once.effect.name == 'bias_step' else 0.0
     assert value(found.model, 'bias') == pytest.approx(2e-3 + mean, abs=5e-5)
     (finding,) = (each for each in found.findings if each.effect == once.effect.name)
-    assert 'in this log alone' in finding.remedy and not is_inside(finding, found)
+    assert 'in this log alone' in finding.remedy and not is_in_extended_model(finding, found)
 
 
 # a model that is right
@@ -204,17 +216,17 @@ BEHIND = SelfCalibration(0.02, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)))
 def test_a_self_calibration_goes_into_bias_and_scale_factor_error():
     behind = replace(MODEL, self_calibration=BEHIND)
     output = np.linspace(-1.5, 1.5, 7)
-    assert compensate(calibrated(behind),
+    assert compensate(merge_self_calibration(behind),
                       output).rate == pytest.approx(compensate(behind, output).rate, abs=1e-15)
-    assert (calibrated(behind).self_calibration is None
-            and np.diag(calibrated(behind).covariance) == pytest.approx([2e-10, 2e-8], rel=0.05))
+    assert (merge_self_calibration(behind).self_calibration is None and np.diag(
+        merge_self_calibration(behind).covariance) == pytest.approx([2e-10, 2e-8], rel=0.05))
 
 
 def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
     behind = replace(MODEL, self_calibration=BEHIND)
-    found = diagnosed(drive(gyro=calibrated(behind)), behind)
+    found = diagnosed(drive(gyro=merge_self_calibration(behind)), behind)
     assert found.verdict == 'adequate' and found.model is behind
-    log = drive(term('warm_up', 60.0, 4e-3), gyro=calibrated(behind))
+    log = drive(term('warm_up', 60.0, 4e-3), gyro=merge_self_calibration(behind))
     found = diagnosed(log, behind)
     assert names(found) == ['warm_up'] and found.model.self_calibration is None
     assert value(found.model, 'scale_factor_error') == pytest.approx(1.01 * 1.02 - 1.0, abs=5e-4)
@@ -223,7 +235,7 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
 
 def test_a_table_that_the_model_explains_leaves_it_as_it_is_to_the_letter(run, tmp_path):
     behind, rate = replace(MODEL, self_calibration=BEHIND), np.tile(np.linspace(-1.5, 1.5, 21), 8)
-    output = (calibrated(behind).output(rate, 25.0)
+    output = (merge_self_calibration(behind).output(rate, 25.0)
               + 5e-4 * np.random.default_rng(7).standard_normal(len(rate)))
     write_log(tmp_path / 'table.csv',
               Log(output=output, reference_rate=rate, temperature=np.full(len(rate), 25.0)))
@@ -292,7 +304,7 @@ def test_a_factor_that_may_be_of_the_gyro_stays_in_the_model(model):
 def test_a_limit_and_steps_that_are_found_are_in_the_model(name, size):
     found = diagnosed(drive(term(name, size)), MODEL)
     assert (names(found) == [name] and value(found.model, name) == pytest.approx(size, rel=0.02)
-            and is_inside(found.findings[0], found))
+            and is_in_extended_model(found.findings[0], found))
     assert found.model.covariance.shape == (3, 3) and found.model.terms[:2] == MODEL.terms
     assert diagnosed(drive(term(name, size), seed=5), found.model).verdict == 'adequate'
 

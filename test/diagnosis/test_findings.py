@@ -23,7 +23,7 @@ import re
 import shlex
 
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.words import amount, quantity
+from gyro_calibration.diagnosis.words import format_amount, format_quantity
 import pytest
 
 TEXT = (Path(__file__).parents[2] / 'docs/findings.md').read_text()
@@ -68,7 +68,8 @@ def agree(written, found):
 def shown(finding):
     """Return the size of a cause as the program prints it."""
     name, size = next(iter(finding['parameters'].items()))
-    return str(quantity(Estimate(size['estimate'], tuple(size['ci95']), size['unit']), name))
+    return str(format_quantity(Estimate(size['estimate'], tuple(size['ci95']), size['unit']),
+                               name))
 
 
 #: Recordings of 25 min, which take most of a minute each, and the slower of two by hand.
@@ -128,7 +129,7 @@ def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
         width = interval[1] - interval[0] if interval else 0.0
         for text, moment in ((before, 'before'), (after, 'after')):
             (size,), form = numbers(text)
-            (now,), unit = numbers(amount(errors[what][moment],
-                                          {'rate': 'rad/s', 'heading': 'rad'}[what]))
+            (now,), unit = numbers(format_amount(errors[what][moment],
+                                                 {'rate': 'rad/s', 'heading': 'rad'}[what]))
             assert unit == form and abs(now - size) <= max(0.25 * width,
                                                            0.03 * size), (what, moment, now)

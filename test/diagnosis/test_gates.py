@@ -12,9 +12,9 @@
 
 from dataclasses import replace
 
-from gyro_calibration.diagnosis.gates import gates
+from gyro_calibration.diagnosis.gates import check_gates
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DEGREE, Log
 import numpy as np
 import pytest
@@ -76,21 +76,21 @@ def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
     assert (
         found.verdict == 'mismatched' and finding.remedy and failed[0] in FAILED.get(wrong, 'unit')
     ), (failed, finding.evidence)
-    assert (found.figures()['gates'][-1]['passed'] is False
-            and found.figures()['findings'][0]['remedy'] == finding.remedy)
-    assert finding.remedy in ' '.join(' '.join(lines(found)).split())
+    assert (found.to_dict()['gates'][-1]['passed'] is False
+            and found.to_dict()['findings'][0]['remedy'] == finding.remedy)
+    assert finding.remedy in ' '.join(' '.join(terminal_lines(found)).split())
 
 
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])
 def test_a_gyro_that_follows_passes_all_gates(noise):
-    assert all(gate.passed for gate in gates(drive(1, noise)))
+    assert all(gate.passed for gate in check_gates(drive(1, noise)))
 
 
 def test_a_late_reference_passes_all_gates():
     log = drive(2, 1.0 * DEGREE)
     assert all(
         gate.passed
-        for gate in gates(
+        for gate in check_gates(
             replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading)))
     )
 
@@ -99,4 +99,4 @@ def test_a_gyro_at_rest_beside_a_noisy_reference_passes_the_gates():
     generator = np.random.default_rng(3)
     output, heading = (size * generator.standard_normal(len(TIME)) for size in (1e-3, DEGREE))
     log = Log(output=output, time=TIME, reference_heading=heading)
-    assert not any(gate.passed is False for gate in gates(log))
+    assert not any(gate.passed is False for gate in check_gates(log))

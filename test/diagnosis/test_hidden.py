@@ -17,32 +17,37 @@ from pathlib import Path
 from chance import seeded
 import gyro_calibration_bench.hidden
 from gyro_calibration_bench.hidden import (
-    described,
-    DETECTABLE,
+    DETECTION_SIGMAS,
     draw_gyro,
     FORMS,
     hide,
+    hide_look_alike,
     KINDS,
+    LOOK_ALIKES,
     NoiseFigures,
     oracle_gain,
-    OUTSIDE,
-    part,
+    OUTSIDE_CATALOGUE,
     record,
+    record_separating,
     session,
-    twin,
-    TWINS,
+    session_from_motion,
 )
-from gyro_calibration_bench.hidden.effects import COUNTED, errors, STEPPED, UNIT_FACTORS
+from gyro_calibration_bench.hidden.effects import (
+    COUNTED_FAULTS,
+    effect_errors,
+    STEP_EFFECTS,
+    UNIT_FACTORS,
+)
 from gyro_calibration_bench.hidden.filters import lag
 from gyro_calibration_bench.hidden.log import ALL
 from gyro_calibration_bench.hidden.noise import (
     divergence,
     draw_figures,
-    make,
-    processes,
+    generate_noise,
+    markov_processes,
     Whitening,
 )
-from gyro_calibration_bench.hidden.size import Metric
+from gyro_calibration_bench.hidden.size import InformationMetric
 import numpy as np
 import pytest
 
@@ -82,7 +87,9 @@ def allan_variance(rate, interval, size):
                          ids=['white', 'walk', 'flicker'])
 def test_the_noise_has_the_allan_variance_of_ieee_952(generator, figures, expected, tolerance):
     interval = 0.1
-    records = [np.sum(make(figures, 20_000, interval, generator), axis=0) for _ in range(40)]
+    records = [
+        np.sum(generate_noise(figures, 20_000, interval, generator), axis=0) for _ in range(40)
+    ]
     for size in (16, 64, 128):
         found = np.mean([allan_variance(each, interval, size) for each in records])
         assert found == pytest.approx(expected(size * interval), rel=tolerance)
@@ -90,7 +97,7 @@ def test_the_noise_has_the_allan_variance_of_ieee_952(generator, figures, expect
 
 def test_a_gauss_markov_process_has_its_deviation_and_time_constant(generator):
     figures = NoiseFigures(1e-12, correlated=1e-3, correlation_time=5.0)
-    slow = np.array([make(figures, 2000, 0.1, generator)[1] for _ in range(400)])
+    slow = np.array([generate_noise(figures, 2000, 0.1, generator)[1] for _ in range(400)])
     assert np.mean(slow ** 2) == pytest.approx(1e-6, rel=0.1)
     assert np.mean(slow[:, 50:] * slow[:, :-50]) == pytest.approx(1e-6 / math.e, rel=0.15)
 
@@ -99,9 +106,9 @@ def test_a_gauss_markov_process_has_its_deviation_and_time_constant(generator):
 def test_whitening_is_the_inverse_of_the_dense_covariance(generator, encoder_step):
     figures, count, interval = NoiseFigures(1e-4, 3e-4, 1e-4, 4e-4, 1.0), 300, 0.02
     covariance = np.eye(count) * figures.sample_deviation(interval) ** 2
-    for process in processes(figures, count, interval):
+    for process in markov_processes(figures, count, interval):
         innovations = np.full(count, process.innovation ** 2)
-        innovations[0] = process.first ** 2
+        innovations[0] = process.first_deviation ** 2
         answer = np.linalg.inv(np.eye(count) - np.diag(np.full(count - 1, process.factor), -1))
         covariance += answer * innovations @ answer.T
     difference = (np.eye(count) - np.eye(count, k=-1)) / interval
@@ -118,11 +125,13 @@ def test_whitening_is_the_inverse_of_the_dense_covariance(generator, encoder_ste
 def test_a_detectable_effect_is_found_with_the_promised_scatter_and_power(generator, kind, name):
     each, figures = session(generator, 300.0, 10.0), draw_figures(kind, generator)
     cause = draw_gyro([name], 1.0, generator, [each], figures).causes[0]
-    metric = Metric([each], figures)
-    column = errors(FORMS[name], 1.0, cause.shapes, [each])
+    metric = InformationMetric([each], figures)
+    column = effect_errors(FORMS[name], 1.0, cause.shapes, [each])
     hidden, scale = cause.size * column[0] + 0.01 + 0.02 * each.rate, 1e-9 + abs(cause.size)
-    noises = [hidden + np.sum(make(figures, len(each.time), each.interval, generator), axis=0)
-              for _ in range(150)]
+    noises = [
+        hidden + np.sum(generate_noise(figures, len(each.time), each.interval, generator), axis=0)
+        for _ in range(150)
+    ]
     gram = metric.gram([column, *([noise] for noise in noises)])
     estimates = gram[0, 1:] / gram[0, 0]
     assert np.std(estimates) / scale == pytest.approx(cause.standard_deviation / scale, rel=0.25)
@@ -147,27 +156,27 @@ def test_every_effect_can_be_hidden(generator, name):
                for column in log.columns.values())
     assert ((np.diff(log.columns['time_s']) > 0.0).all() and math.isfinite(cause.size)
             and all(map(math.isfinite, cause.shapes.values())))
-    if name not in (*COUNTED, *STEPPED, 'unit_error') and ALL[name].stage != 'noise':
+    if name not in (*COUNTED_FAULTS, *STEP_EFFECTS, 'unit_error') and ALL[name].stage != 'noise':
         # a dead zone and a saturation grow by whole samples
         assert cause.multiple == pytest.approx(2.0, rel=0.5 if name in ('dead_zone', 'saturation')
                                                else 0.05)
-    residual = (log.columns['gyro_rad_s'] - truth.prediction)[truth.good]
-    unit, step = abs(truth.gyro.value('unit_error') or 1.0), truth.gyro.value('quantization')
+    residual = (log.columns['gyro_rad_s'] - truth.prediction)[truth.is_good]
+    unit, step = abs(truth.gyro.size_of('unit_error') or 1.0), truth.gyro.size_of('quantization')
     assert np.std(residual) <= 1.5 * unit * np.std(truth.noise) + step
 
 
-@pytest.mark.parametrize('name', [name for name in ON_THE_SUM if ALL[name].linear
+@pytest.mark.parametrize('name', [name for name in ON_THE_SUM if ALL[name].is_linear
                                   and name not in ('bias', 'scale_factor_error')])
 def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
     log, = hide([name], 3.0, generator, noise='white', **COARSE)
     cause, truth, each = log.truth[name], log.truth, log.session
     plain = truth.bias + truth.scale_factor_error * each.rate
-    assert truth.added - plain == pytest.approx(
-        errors(ALL[name], cause.size, cause.shapes, [each])[0], abs=1e-12)
-    assert log.columns['gyro_rad_s'] == pytest.approx(truth.rate + truth.added + truth.noise,
+    assert truth.added_rate - plain == pytest.approx(
+        effect_errors(ALL[name], cause.size, cause.shapes, [each])[0], abs=1e-12)
+    assert log.columns['gyro_rad_s'] == pytest.approx(truth.rate + truth.added_rate + truth.noise,
                                                       abs=1e-12)
-    assert Metric([each], truth.gyro.figures).norm([truth.added]) == pytest.approx(
-        3.0 * DETECTABLE, rel=1e-3)
+    assert InformationMetric([each], truth.gyro.figures).norm([truth.added_rate]) == pytest.approx(
+        3.0 * DETECTION_SIGMAS, rel=1e-3)
 
 
 def test_the_heading_is_the_integral_of_the_rate_and_rest_is_rest(generator):
@@ -215,10 +224,10 @@ def test_faults_of_samples_are_as_many_as_it_says(generator):
     wild, = hide(['outliers'], 4.0, generator, noise='white', **COARSE)
     far = np.abs(wild.columns['gyro_rad_s'] - wild.truth.prediction) > 6.0 * np.std(
         wild.truth.noise)
-    assert far.sum() == wild.truth['outliers'].size == 12.0 and (far == ~wild.truth.good).all()
+    assert far.sum() == wild.truth['outliers'].size == 12.0 and (far == ~wild.truth.is_good).all()
     stuck, = hide(['stuck_samples'], 4.0, generator, noise='white', **COARSE)
     repeated = np.diff(stuck.columns['gyro_rad_s']) == 0.0
-    assert (repeated == ~stuck.truth.good[1:]).all() and repeated.sum() >= 3 * 4
+    assert (repeated == ~stuck.truth.is_good[1:]).all() and repeated.sum() >= 3 * 4
     holed, = hide(['dropped_samples'], 4.0, generator, noise='white', **COARSE)
     assert 1 <= np.sum(np.diff(holed.columns['time_s']) > 1.5 * holed.session.interval) <= 12
 
@@ -227,7 +236,7 @@ def test_a_size_in_si_is_hidden_as_it_is_given(generator):
     def given(sessions):
         return {'time_offset': {'size': 0.02},
                 'saturation': {'size': 0.5 * abs(sessions[0].rate).max()}}
-    log, = hide(['time_offset', 'saturation'], 1.0, generator, noise='white', given=given,
+    log, = hide(['time_offset', 'saturation'], 1.0, generator, noise='white', fixed_parts=given,
                 reference='both', **COARSE)
     assert log.truth['time_offset'].size == 0.02 and log.truth['time_offset'].multiple > 3.0
     assert np.abs(log.columns['gyro_rad_s']).max() == 0.5 * np.abs(log.session.rate).max()
@@ -247,8 +256,8 @@ def test_a_wrong_reference_leaves_the_gyro_alone_and_errs_in_rate_as_in_heading(
     gyro = draw_gyro([name], 50.0, generator, [each], NoiseFigures(1e-4))
     of_rate = record(gyro, each, generator)
     of_heading = record(gyro, each, generator, reference='heading')
-    assert of_rate.truth.added == pytest.approx(of_rate.truth.bias
-                                                + gyro.scale_factor_error * each.rate, abs=1e-12)
+    assert of_rate.truth.added_rate == pytest.approx(
+        of_rate.truth.bias + gyro.scale_factor_error * each.rate, abs=1e-12)
     wrong_rate = of_rate.columns['reference_rate_rad_s'] - each.rate
     wrong_heading = of_heading.columns['reference_heading_rad'] - each.heading
     change = np.cumsum(0.5 * (wrong_rate[1:] + wrong_rate[:-1])) * each.interval
@@ -272,14 +281,19 @@ def test_noise_is_changed_against_what_a_model_expects(generator):
 
 def left_over(hidden_name, other, log, sessions, twins):
     """Return the sigmas of a hidden twin left by the other, by a search over nonlinear sizes."""
-    cause, metric = log.truth[hidden_name], Metric(sessions, log.truth.gyro.figures)
-    known = ('bias', 'scale') if twins.against_a_model else ()
-    hidden = errors(ALL[hidden_name], cause.size, cause.shapes, sessions)
-    shapes = (twins.given(sessions) if twins.given else {}).get(other, {})
-    if ALL[other].linear:
+    cause, metric = log.truth[hidden_name], InformationMetric(sessions, log.truth.gyro.figures)
+    known = ('bias', 'scale') if twins.needs_model else ()
+    hidden = effect_errors(ALL[hidden_name], cause.size, cause.shapes, sessions)
+    shapes = (twins.fixed_parts(sessions) if twins.fixed_parts else {}).get(other, {})
+    if ALL[other].is_linear:
         phases = ([{'phase': 0.0}, {'phase': 0.5 * math.pi}]
                   if other in ('heading_sensitivity', 'reference_once_per_rev') else [{}])
-        columns = [errors(ALL[other], 1.0, {**shapes, **phase}, sessions) for phase in phases]
+        columns = [
+            effect_errors(ALL[other], 1.0, {
+                **shapes,
+                **phase
+            }, sessions) for phase in phases
+        ]
         gram = metric.gram([hidden, *columns], known)
         scale = np.sqrt(np.diag(gram))
         gram = gram / np.outer(scale, scale)
@@ -288,28 +302,28 @@ def left_over(hidden_name, other, log, sessions, twins):
     guess = {'sine_response': math.sqrt(6.0 * abs(cause.size))}.get(other, abs(cause.size))
     sizes = guess * np.geomspace(0.5, 2.0, 61)
     return min(metric.norm(
-        [a - b for a, b in zip(hidden, errors(ALL[other], size, shapes, sessions))], known)
+        [a - b for a, b in zip(hidden, effect_errors(ALL[other], size, shapes, sessions))], known)
                for size in sizes)
 
 
-@pytest.mark.parametrize('pair', TWINS, ids='-'.join)
+@pytest.mark.parametrize('pair', LOOK_ALIKES, ids='-'.join)
 @pytest.mark.parametrize('first', [True, False], ids=['first', 'second'])
 def test_twins_are_alike_and_then_parted(generator, pair, first):
     name, other = pair if first else reversed(pair)
-    log = twin(pair, name, generator, duration=600.0, sample_rate=20.0)
-    assert left_over(name, other, log, [log.session], TWINS[pair]) < 3.0
-    if TWINS[pair].apart is None:
+    log = hide_look_alike(pair, name, generator, duration=600.0, sample_rate=20.0)
+    assert left_over(name, other, log, [log.session], LOOK_ALIKES[pair]) < 3.0
+    if LOOK_ALIKES[pair].separating_conditions is None:
         with pytest.raises(ValueError, match='another reference'):
-            part(pair, log, generator)
+            record_separating(pair, log, generator)
         return
-    again = part(pair, log, generator)
+    again = record_separating(pair, log, generator)
     assert again.truth.gyro == log.truth.gyro
-    assert left_over(name, other, log, [log.session, again.session], TWINS[pair]) > 4.2
+    assert left_over(name, other, log, [log.session, again.session], LOOK_ALIKES[pair]) > 4.2
 
 
 def test_what_is_outside_the_catalogue_is_mostly_not_explained_by_it(generator):
     causes = [hide([name], 3.0, generator, noise='white', **COARSE)[0].truth[name]
-              for name in OUTSIDE]
+              for name in OUTSIDE_CATALOGUE]
     assert np.mean([cause.likeness < 0.3 for cause in causes]) > 0.6, [(cause.name, cause.likeness)
                                                                        for cause in causes]
     assert all(cause.likeness <= cause.likeness_of_three + 0.02 for cause in causes)
@@ -327,12 +341,12 @@ def test_a_gyro_is_recorded_again_under_conditions_that_others_plan(generator):
     log, = hide(['bias_temperature'], 10.0, generator, **COARSE)
     time = np.arange(0.0, 200.0, 0.05)
     again = record(log.truth.gyro,
-                   described(generator, time, np.sin(0.3 * time), 25.0 + 0.05 * time), generator,
-                   run=1)
+                   session_from_motion(generator, time, np.sin(0.3 * time), 25.0 + 0.05 * time),
+                   generator, run=1)
     truth = again.truth
     assert truth.rate == pytest.approx(np.sin(0.3 * time), abs=0.1)
     slope = np.polyfit(again.session.temperature,
-                       truth.added - truth.scale_factor_error * truth.rate, 1)[0]
+                       truth.added_rate - truth.scale_factor_error * truth.rate, 1)[0]
     assert slope == pytest.approx(log.truth['bias_temperature'].size, rel=1e-6)
 
 

@@ -13,8 +13,13 @@
 from dataclasses import replace
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.diagnosis.data_quality import inspect
-from gyro_calibration.diagnosis.gates import MOST_ROWS, prepared, refuse, rests
+from gyro_calibration.diagnosis.data_quality import inspect_record
+from gyro_calibration.diagnosis.gates import (
+    is_at_rest,
+    MAX_TABLE_ROWS,
+    refuse_unusable,
+    select_reference,
+)
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
@@ -43,10 +48,10 @@ STILL = Log(output=gyro(np.zeros(COUNT)), time=TIME)
 def test_a_reference_of_nan_alone_is_none():
     """Beside a heading that says all, and at rest."""
     nothing = np.full(COUNT, np.nan)
-    by_heading, by_none = (prepared(replace(log, reference_rate=nothing))[0]
+    by_heading, by_none = (select_reference(replace(log, reference_rate=nothing))[0]
                            for log in (replace(LOG, reference_heading=HEADING), STILL))
     assert by_heading.reference_rate is None and by_heading.reference_heading is HEADING
-    assert by_none.reference_rate is None and rests(by_none)
+    assert by_none.reference_rate is None and is_at_rest(by_none)
     assert not diagnose([replace(STILL, reference_heading=nothing)],
                         np.random.default_rng(1)).findings
 
@@ -54,10 +59,10 @@ def test_a_reference_of_nan_alone_is_none():
 def test_a_rate_that_is_known_at_times_gives_way_to_the_heading():
     some = np.where(np.arange(COUNT) < 50, RATE, np.nan)
     log = replace(LOG, reference_rate=some, reference_heading=np.round(HEADING / 1e-3) * 1e-3)
-    quality = inspect(log)
+    quality = inspect_record(log)
     assert (quality.heading_step == pytest.approx(1e-3)
             and 'known in 50 samples only' in ' '.join(quality.remarks))
-    assert prepared(log)[0].reference_rate is None
+    assert select_reference(log)[0].reference_rate is None
 
 
 # noise is no motion
@@ -78,9 +83,9 @@ def noisy(kind):
 @pytest.mark.parametrize('kind', ['odometry', 'simulator', 'motion capture', 'encoder'])
 def test_the_noise_of_a_reference_at_rest_is_no_motion(kind):
     log = replace(STILL, **noisy(kind))
-    refuse(log)
-    assert rests(log) and not np.nan_to_num(prepared(log)[0].reference_rate).any()
-    assert 'taken to be at rest' in ' '.join(inspect(log).remarks)
+    refuse_unusable(log)
+    assert is_at_rest(log) and not np.nan_to_num(select_reference(log)[0].reference_rate).any()
+    assert 'taken to be at rest' in ' '.join(inspect_record(log).remarks)
 
 
 def test_a_gyro_at_rest_beside_a_noisy_reference_has_no_findings():
@@ -96,12 +101,12 @@ def test_a_small_motion_that_the_gyro_sees_stays_motion(size):
         noise = next(iter(noisy(kind).values()))
         motion = {'odometry': {'reference_rate': 0.1 * noise + np.gradient(swing, TIME)},
                   'motion capture': {'reference_heading': 0.1 * noise + swing}}[kind]
-        assert not rests(replace(STILL, output=gyro(np.gradient(swing, TIME)), **motion))
+        assert not is_at_rest(replace(STILL, output=gyro(np.gradient(swing, TIME)), **motion))
 
 
 @pytest.mark.parametrize('reference', [{'reference_rate': RATE}, {'reference_heading': HEADING}])
 def test_a_gyro_that_sees_nothing_of_a_motion_is_not_at_rest(reference):
-    assert not rests(replace(STILL, **reference))
+    assert not is_at_rest(replace(STILL, **reference))
 
 
 # what is refused
@@ -125,21 +130,22 @@ def test_a_log_of_which_a_limit_leaves_nothing_is_refused_in_a_sentence():
     rate = 0.5 * np.sin(0.7 * TIME)
     noise = 0.3 * np.random.default_rng(3).standard_normal(COUNT)
     log = Log(output=np.clip(rate + noise, -1.0, 1.0), time=TIME, reference_rate=rate)
-    assert inspect(log).trusted.sum() < 100
+    assert inspect_record(log).usable.sum() < 100
     with pytest.raises(DataRefused, match='samples can be used, at least 100 are needed'):
         diagnose([log], np.random.default_rng(1))
 
 
 def test_samples_without_time_are_not_taken_for_a_rate_table():
-    rows = MOST_ROWS + 1
+    rows = MAX_TABLE_ROWS + 1
     with pytest.raises(DataRefused,
-                       match=f'{rows} rows, where a rate table has at most {MOST_ROWS}: .*--rate'):
+                       match=f'{rows} rows, where a rate table has at most {MAX_TABLE_ROWS}: '
+                             '.*--rate'):
         diagnose_table(Log(output=LOG.output[:rows], reference_rate=RATE[:rows]), None,
                        np.random.default_rng(1))
 
 
 @pytest.mark.parametrize('first', [0.0, -np.pi])
-@pytest.mark.parametrize('use', [refuse, calibrate_encoder])
+@pytest.mark.parametrize('use', [refuse_unusable, calibrate_encoder])
 def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
     heading = np.where(TIME % 7.0 < 0.1, np.nan, (TURNED - first) % (2.0 * np.pi) + first)
     with pytest.raises(DataRefused,
@@ -150,8 +156,8 @@ def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
 def test_turns_in_gaps_or_between_slow_samples_are_no_wrapped_heading(
 ):
     lost = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + 2.0 * np.pi * (TIME > 32.0))
-    refuse(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=lost))
+    refuse_unusable(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=lost))
     slow = np.arange(1000) * 1.0
     turned = np.cumsum(2.0 * np.pi * (np.sin(0.05 * slow) > 0.0))
     rate = np.gradient(turned, slow)
-    refuse(Log(output=gyro(rate), time=slow, reference_heading=turned))
+    refuse_unusable(Log(output=gyro(rate), time=slow, reference_heading=turned))

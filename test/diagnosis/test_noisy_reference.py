@@ -14,21 +14,21 @@ from dataclasses import replace
 
 from diagnosed import judged_findings, log_of
 from gyro_calibration.diagnosis.data_quality import (
-    heading_errors,
-    limits,
+    classify_reference,
+    heading_difference,
+    is_reference_limiting,
     rate_noise_share,
-    reference_of,
 )
-from gyro_calibration.diagnosis.noisy_reference import search
+from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.spans import Column, fit_spans, spans_of
-from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.spans import CauseTerm, fit_spans, lay_out_spans
+from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
-from gyro_calibration.logs.recording import interpolated
+from gyro_calibration.logs.recording import interpolate_with_gaps
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration_bench.hidden.reference import hide_beside, Imperfect
+from gyro_calibration_bench.hidden.reference import hide_with_reference, ImperfectReference
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt
@@ -64,7 +64,7 @@ def drive(seed, duration=240.0, hidden=lambda time, rate, heading, temperature: 
 
 
 def diagnosed(log, model=None, kind=None):
-    return diagnose([log], np.random.default_rng(0), model, kind=kind)
+    return diagnose([log], np.random.default_rng(0), model, reference_kind=kind)
 
 
 def value(model, name):
@@ -75,7 +75,8 @@ def value(model, name):
 def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed):
     found = diagnosed(drive(seed))
     named = {each.effect: each for each in found.findings if each.status == 'established'}
-    assert found.reference.kind == 'course' and set(named) <= {'time_offset'}, lines(found)
+    assert found.reference.kind == 'course' and set(named) <= {'time_offset'
+                                                               }, terminal_lines(found)
     assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.03 * DEGREE)
     assert value(found.model, 'scale_factor_error') == pytest.approx(SCALE, abs=0.012)
     assert named['time_offset'].parameters['time_offset'].estimate == pytest.approx(
@@ -92,8 +93,8 @@ HIDDEN = {
 def test_a_large_effect_is_established_by_a_course_and_its_model_predicts_the_heading(name):
     found = diagnosed(drive(5, hidden=HIDDEN[name]))
     first = next(each for each in found.findings if each.effect not in ('time_offset',))
-    assert name in (first.effect, *first.ambiguous_with) and first.status == 'established', lines(
-        found)
+    assert name in (first.effect,
+                    *first.ambiguous_with) and first.status == 'established', terminal_lines(found)
     assert (sum(first.probability.values()) == pytest.approx(1.0, abs=0.05)
             and first.share_of_heading_error is not None)
     assert found.gain.models['extended'] < 0.7 * found.gain.models['plain']
@@ -128,7 +129,7 @@ def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate
     assert 'Fewer than three stretches' in ' '.join(found.remarks)
     follow = {'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
               'reference_once_per_rev'}
-    assert not follow & {each.effect for each in found.findings}, lines(found)
+    assert not follow & {each.effect for each in found.findings}, terminal_lines(found)
     assert all('three stretches' in found.cannot_show[name] for name in follow)
 
 
@@ -146,31 +147,39 @@ def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_reported()
 
 def test_the_answer_is_about_heading_and_is_reported_in_all_files():
     found = diagnosed(drive(8))
-    told = found.figures()
+    told = found.to_dict()
     assert (told['schema'].endswith('/2') and told['reference']['kind'] == 'course'
             and told['reference']['noise']['reference'] > 0.0)
     assert (sum(told['heading_shares'].values()) == pytest.approx(1.0, abs=0.02)
             and told['heading_shares']['bias'] > 0.5)
     assert {'given', 'plain', 'extended'} <= set(told['gain']) and all(
         gate['passed'] for gate in told['gates'])
-    assert 'course over ground' in ' '.join(lines(found)) and 'course over ground' in report(found)
+    assert ('course over ground' in ' '.join(terminal_lines(found))
+            and 'course over ground' in render_report(found))
 
 
 def test_the_kind_of_a_reference_is_given_or_found():
     log = drive(9)
     exact = replace(log, reference_heading=np.cumsum(log.output) / RATE)
-    assert reference_of(log).kind == 'course' and limits(log, reference_of(log))
-    assert reference_of(exact).kind == 'motion_capture' and not limits(exact, reference_of(exact))
-    assert reference_of(exact, 'odometry').kind == 'odometry' and limits(
-        exact, reference_of(exact, 'odometry'))
-    assert reference_of(replace(log, reference_rate=log.output)).kind == 'rate_command'
-    assert reference_of(replace(log, reference_heading=None)).kind == 'rest'
-    assert reference_of(replace(log, reference_rate=np.nan * log.output)).kind == 'course'
-    assert not limits(replace(exact, reference_rate=np.nan * exact.output), reference_of(exact))
+    assert (classify_reference(log).kind == 'course'
+            and is_reference_limiting(log, classify_reference(log)))
+    assert (classify_reference(exact).kind == 'motion_capture'
+            and not is_reference_limiting(exact, classify_reference(exact)))
+    assert classify_reference(exact, 'odometry').kind == 'odometry' and is_reference_limiting(
+        exact, classify_reference(exact, 'odometry'))
+    assert classify_reference(replace(log, reference_rate=log.output)).kind == 'rate_command'
+    assert classify_reference(replace(log, reference_heading=None)).kind == 'rest'
+    assert classify_reference(replace(log, reference_rate=np.nan * log.output)).kind == 'course'
+    assert (not is_reference_limiting(replace(exact, reference_rate=np.nan * exact.output),
+                                      classify_reference(exact)))
 
 
-ERRING = [Imperfect('rate', 0.1), Imperfect('rate', 0.5), Imperfect('capture', 0.05),
-          Imperfect('encoder', 0.5)]
+ERRING = [
+    ImperfectReference('rate', 0.1),
+    ImperfectReference('rate', 0.5),
+    ImperfectReference('capture', 0.05),
+    ImperfectReference('encoder', 0.5)
+]
 
 
 def established(hidden):
@@ -183,9 +192,10 @@ def established(hidden):
     for place, each in enumerate(ERRING)], ids=str)
 def test_the_noise_of_a_reference_is_no_effect_of_the_gyro(reference):
     # taken for exact, it was named dead zone, bandwidth or delay in nearly every such log
-    hidden = hide_beside([], 0.0, np.random.default_rng(0), reference)
+    hidden = hide_with_reference([], 0.0, np.random.default_rng(0), reference)
     found, named = established(hidden)
-    assert limits(log_of(hidden), found.reference) and not named, lines(found)
+    assert is_reference_limiting(log_of(hidden),
+                                 found.reference) and not named, terminal_lines(found)
     assert ('times that of the gyro' in ' '.join(found.remarks)) == (reference.kind == 'rate')
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
 
@@ -193,28 +203,32 @@ def test_the_noise_of_a_reference_is_no_effect_of_the_gyro(reference):
 # not the coarse encoder: sizes take its rounding as new each sample, which at rest it is not
 @pytest.mark.parametrize('reference', ERRING[:3], ids=str)
 def test_an_effect_of_the_rate_is_established_beside_the_noise_of_a_reference(reference):
-    hidden = hide_beside(['scale_factor_asymmetry'], 5.0, np.random.default_rng(1), reference)
+    hidden = hide_with_reference(['scale_factor_asymmetry'], 5.0, np.random.default_rng(1),
+                                 reference)
     found, named = established(hidden)
-    assert judged_findings(hidden, named).right, lines(found)
+    assert judged_findings(hidden, named).is_right, terminal_lines(found)
     assert named[0].minimum_detectable > 0.0
 
 
 def test_motion_capture_that_was_smoothed_and_an_encoder_with_late_stamps_are_not_exact():
     # samples of smoothed motion capture have hardly white noise, but the heading errs the same
-    hidden = hide_beside([], 0.0, np.random.default_rng(2), Imperfect('encoder', 0.0055))
+    hidden = hide_with_reference([], 0.0, np.random.default_rng(2),
+                                 ImperfectReference('encoder', 0.0055))
     log, generator = log_of(hidden), np.random.default_rng(5)
     noise = 0.1 * DEGREE * generator.standard_normal(len(log))
     smooth = replace(log, reference_heading=hidden.truth.heading + sosfiltfilt(
         butter(2, 4.0, fs=1.0 / np.median(np.diff(log.time)), output='sos'), noise))
-    assert reference_of(smooth).kind == 'motion_capture' and limits(smooth, reference_of(smooth))
-    errors = heading_errors(smooth)
-    assert errors.error == pytest.approx(
+    assert (classify_reference(smooth).kind == 'motion_capture'
+            and is_reference_limiting(smooth, classify_reference(smooth)))
+    errors = heading_difference(smooth)
+    assert errors.constant_error == pytest.approx(
         float(np.std(smooth.reference_heading - hidden.truth.heading)), rel=0.4)
-    assert not limits(log, reference_of(log))
+    assert not is_reference_limiting(log, classify_reference(log))
     late = 0.01 * generator.uniform(-1.0, 1.0, len(log))
     jitter = replace(log, reference_heading=log.reference_heading + 0.0055 * DEGREE * np.rint(
         late * hidden.truth.rate / (0.0055 * DEGREE)))
-    assert reference_of(jitter).kind == 'encoder' and limits(jitter, reference_of(jitter))
+    assert (classify_reference(jitter).kind == 'encoder'
+            and is_reference_limiting(jitter, classify_reference(jitter)))
 
 
 def swing(seed, rate, noise, interval=0.04, duration=150.0):
@@ -239,7 +253,8 @@ def test_noise_is_no_effect_of_a_motion_in_which_effects_look_alike(seed):
     # is left of their columns is the noise of the rate that they are made of
     log = swing(seed, lambda time: 0.08 * np.cos(time / 7.0), 6e-4)
     found = diagnosed(log)
-    assert not [each for each in found.findings if each.status == 'established'], lines(found)
+    assert not [each
+                for each in found.findings if each.status == 'established'], terminal_lines(found)
     assert value(found.model, 'scale_factor_error') == pytest.approx(0.01, abs=0.004)
 
 
@@ -251,7 +266,8 @@ def test_the_noise_of_a_reference_rate_is_seen_in_the_only_short_rest():
         log = swing(seed, by_hand, 1e-4)
         assert rate_noise_share(log) == pytest.approx(0.3, rel=0.25)
         exact = replace(log, reference_rate=by_hand(log.time))
-        assert limits(log, reference_of(log)) and not limits(exact, reference_of(exact))
+        assert (is_reference_limiting(log, classify_reference(log))
+                and not is_reference_limiting(exact, classify_reference(exact)))
 
 
 @pytest.mark.parametrize('interval', [0.05, 0.1])
@@ -266,11 +282,13 @@ def test_the_noise_of_a_reference_rate_is_seen_between_two_quick_reversals(inter
 
 
 def test_a_fine_encoder_and_an_exact_rate_are_taken_as_they_are():
-    hidden = hide_beside([], 0.0, np.random.default_rng(2), Imperfect('encoder', 0.0055))
+    hidden = hide_with_reference([], 0.0, np.random.default_rng(2),
+                                 ImperfectReference('encoder', 0.0055))
     log = log_of(hidden)
-    assert reference_of(log).kind == 'encoder' and not limits(log, reference_of(log))
+    assert (classify_reference(log).kind == 'encoder'
+            and not is_reference_limiting(log, classify_reference(log)))
     exact = replace(log, reference_heading=None, reference_rate=hidden.truth.rate)
-    assert not limits(exact, reference_of(exact))
+    assert not is_reference_limiting(exact, classify_reference(exact))
 
 
 def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always():
@@ -281,8 +299,9 @@ def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always
     log = Log(time=time, output=np.gradient(heading, time)
               + walk * generator.standard_normal(len(time)),
               reference_heading=np.floor(heading / 0.002) * 0.002)
-    assert reference_of(log).kind == 'encoder' and limits(log, reference_of(log))
-    assert not heading_errors(log).larger
+    assert (classify_reference(log).kind == 'encoder'
+            and is_reference_limiting(log, classify_reference(log)))
+    assert not heading_difference(log).is_significant
 
 
 def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
@@ -293,7 +312,8 @@ def test_an_encoder_whose_codes_pass_evenly_is_not_exact():
         log = Log(time=time, output=np.gradient(heading, time)
                   + 7e-5 * np.random.default_rng(6).standard_normal(len(time)),
                   reference_heading=np.floor(heading / step) * step)
-        assert reference_of(log).kind == 'encoder' and limits(log, reference_of(log)) == even
+        assert (classify_reference(log).kind == 'encoder'
+                and is_reference_limiting(log, classify_reference(log)) == even)
 
 
 def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
@@ -303,15 +323,15 @@ def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
     heading = np.cumsum(rate) * 0.01 - 0.005 * rate + 2.1 * DEGREE
     log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
               reference_heading=np.floor(heading / step) * step)
-    fit, found = search(fit_spans(spans_of(log, 'encoder')), 0.01, lambda words: None)
-    assert not fit.causes and not any(each.established for each in found)
+    fit, found = search_causes(fit_spans(lay_out_spans(log, 'encoder')), 0.01, lambda words: None)
+    assert not fit.causes and not any(each.is_established for each in found)
 
 
 def test_intervals_hold_nothing_where_few_turning_points_of_a_swing_show_it():
     # at an even rate each way, scale, cubic and once a revolution differ at the turns alone
     generator, time = np.random.default_rng(12), np.arange(0.0, 220.0, 0.01)
     sigmas = []
-    for start in range(6):
+    for _ in range(6):
         period = generator.choice([8.0, 10.0, 12.0])
         knots = period * np.array([0.0, 0.04, 0.46, 0.54, 0.96, 1.0])
         size = 69.0 * DEGREE / (0.46 * period) * np.array([0.0, 1.0, 1.0, -1.0, -1.0, 0.0])
@@ -320,25 +340,26 @@ def test_intervals_hold_nothing_where_few_turning_points_of_a_swing_show_it():
         log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
                   reference_heading=np.floor(heading / (0.4 * DEGREE)) * 0.4 * DEGREE)
         for name in ('cubic_nonlinearity', 'reference_once_per_rev'):
-            found = fit_spans(spans_of(log, 'encoder'), [Column(name)])
-            sigmas += [1.96 * found.values[place] / found.half(place)
+            found = fit_spans(lay_out_spans(log, 'encoder'), [CauseTerm(name)])
+            sigmas += [1.96 * found.values[place] / found.half_width(place)
                        for place in range(3, len(found.values))]
-            sigmas.append(1.96 * (found.values[0] - 0.004) / found.half(0))
+            sigmas.append(1.96 * (found.values[0] - 0.004) / found.half_width(0))
     assert np.sqrt(np.mean(np.square(sigmas))) < 1.3, np.round(sigmas, 1)
 
 
 @pytest.mark.parametrize('seed', [1, 2])
 def test_a_coarse_encoder_shows_the_noise_of_the_gyro_and_no_delay(seed):
     # the error of a code that stands while the shaft rests was taken for a random walk
-    hidden = hide_beside([], 0.0, np.random.default_rng(seed), Imperfect('encoder', 0.5))
-    found = fit_spans(spans_of(log_of(hidden), 'encoder'))
+    hidden = hide_with_reference([], 0.0, np.random.default_rng(seed),
+                                 ImperfectReference('encoder', 0.5))
+    found = fit_spans(lay_out_spans(log_of(hidden), 'encoder'))
     true = hidden.truth.expected
-    assert found.size('angle_random_walk') < 3.0 * true['angle_random_walk']
+    assert found.noise_size('angle_random_walk') < 3.0 * true['angle_random_walk']
     log, scale = log_of(hidden), 1.0 + true['scale_factor_error']
     for value, sought in ((found.values[0], scale - 1.0), (found.values[2], 0.0),
                           (found.values[1], np.mean(log.output - scale * hidden.truth.rate))):
         place = int(np.flatnonzero(found.values == value)[0])
-        assert abs(value - sought) < 2.0 * found.half(place), (place, value, sought)
+        assert abs(value - sought) < 2.0 * found.half_width(place), (place, value, sought)
 
 
 @pytest.mark.parametrize('begins, ends', [(0.03, 0.03), (1.5, 0.5)])
@@ -350,8 +371,8 @@ def test_odometry_that_begins_after_the_gyro_is_no_course(begins, ends):
     heading = np.interp(at, time, np.cumsum(rate) * 0.01)
     log = Log(output=1.02 * np.interp(time - 0.02, time, rate) + BIAS_TRUE
               + 1e-3 * generator.standard_normal(len(time)), time=time,
-              reference_heading=interpolated(time, at, heading + 3e-4
-                                             * generator.standard_normal(len(at))))
+              reference_heading=interpolate_with_gaps(time, at, heading + 3e-4
+                                                      * generator.standard_normal(len(at))))
     assert np.isnan(log.reference_heading[[0, -1]]).all()
-    reference = reference_of(log)
-    assert reference.kind == 'motion_capture' and 'lost' not in reference.known
+    reference = classify_reference(log)
+    assert reference.kind == 'motion_capture' and 'lost' not in reference.evidence

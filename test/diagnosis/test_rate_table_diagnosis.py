@@ -14,7 +14,7 @@ from dataclasses import replace
 import json
 import re
 
-from gyro_calibration.calibration.dwells import join
+from gyro_calibration.calibration.dwells import join_dwells
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.scatter import rms, Scatter
 from gyro_calibration.diagnosis import dwell_fit
@@ -26,9 +26,9 @@ from gyro_calibration.model.effects import (
     CATALOGUE,
     rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
-    STEADY,
+    STATIC_EFFECTS,
 )
-from gyro_calibration.model.gyro_model import GyroModel, same_effects, SelfCalibration, Term
+from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, SelfCalibration, Term
 from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 import pytest
@@ -52,16 +52,17 @@ LARGE = {'bias': 0.05, 'scale_factor_error': 0.05, 'scale_factor_asymmetry': 0.0
 @pytest.fixture
 def without_gain(monkeypatch):
     """Leave out what takes most of the time, where it does not matter."""
-    monkeypatch.setattr(diagnosis, '_gain', lambda *given: None)
+    monkeypatch.setattr(diagnosis, '_cross_validated_gain', lambda *given: None)
 
 
 def gyro(name, size):
     """Return a gyro with bias, scale factor and one effect; temperature counts from 25 degC."""
     terms = {term.effect.name: term for term in LINEAR}
     known = terms[name].values[-1] if name in terms else 0.0
-    values = {'sine_response': (size, 1.0)}.get(name) or (*[25.0] * len(STEADY[name].shapes),
-                                                          known + size)
-    return GyroModel(tuple({**terms, name: Term(STEADY[name], values)}.values()))
+    values = {
+        'sine_response': (size, 1.0)
+    }.get(name) or (*[25.0] * len(STATIC_EFFECTS[name].nonlinear_parameters), known + size)
+    return GyroModel(tuple({**terms, name: Term(STATIC_EFFECTS[name], values)}.values()))
 
 
 def diagnosed(table, truth, generator, model=None):
@@ -79,7 +80,7 @@ def names(found):
 
 # hidden effects
 
-@pytest.mark.parametrize('name', STEADY)
+@pytest.mark.parametrize('name', STATIC_EFFECTS)
 def test_an_effect_at_twice_and_five_times_the_smallest_size_is_found(without_gain, name):
     generator = np.random.default_rng(1)
     model = GyroModel(LINEAR) if name in NUISANCES else None
@@ -121,7 +122,7 @@ def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(withou
     fast = np.tile([rate, -rate], 4)
     noise = more.output - truth.output(more.rate, more.temperature)
     more = replace(more, rate=fast, output=truth.output(fast, more.temperature) + noise)
-    (found,) = diagnose_table(join([table, more]), None).findings
+    (found,) = diagnose_table(join_dwells([table, more]), None).findings
     assert members(found) == {'sine_response'}
 
 
@@ -142,7 +143,7 @@ def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_aga
     (found,) = diagnose_table(up, None).findings
     assert members(found) >= {'bias_temperature', 'rate_ramp'} and 'cool' in found.separate_by
     down = replace(Table(), temperatures=Table().temperatures[::-1]).measure(truth, generator)
-    (found,) = diagnose_table(join([up, down]), None).findings
+    (found,) = diagnose_table(join_dwells([up, down]), None).findings
     assert members(found) == {'bias_temperature'}
 
 
@@ -193,14 +194,14 @@ def test_effects_are_named_on_top_of_a_polynomial(without_gain):
     generator = np.random.default_rng(10)
     polynomial = fit_effects(WANDERING.measure(GyroModel(LINEAR), generator),
                              [rate_temperature_polynomial(3, 2)]).model
-    truth = GyroModel((*LINEAR, Term(STEADY['scale_factor_temperature'],
+    truth = GyroModel((*LINEAR, Term(STATIC_EFFECTS['scale_factor_temperature'],
                                      (polynomial.reference_temperature, 5e-4))))
     found = diagnosed(WANDERING, truth, generator, polynomial)
     assert (names(found) == ['scale_factor_temperature']
             and found.model.terms[0] == polynomial.terms[0])
     low, high = found.findings[0].parameters['scale_factor_temperature'].interval
-    assert (low < 5e-4 < high
-            and len(found.model.covariance) == sum(len(term.fitted) for term in found.model.terms))
+    assert (low < 5e-4 < high and len(found.model.covariance) == sum(
+        len(term.fitted_indices) for term in found.model.terms))
 
 
 def test_an_extension_by_a_table_holds_at_its_temperatures_and_says_what_came_before(without_gain):
@@ -238,12 +239,12 @@ def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_f
     table = Table().measure(GyroModel(LINEAR), generator)
     table = replace(table, output=table.output + 0.03 * DEGREE * np.sin(6.0 * table.rate + 1.0))
     fit = fit_effects(table, [term.effect for term in LINEAR])
-    certain = np.zeros((np.count_nonzero(fit.scatter.kept), 1))
-    probes = dwell_fit._probes(table)
-    found = dwell_fit.what_is_left(fit, 1e-3, certain)[0][0]
-    monkeypatch.setattr(dwell_fit, '_probes',
+    certain = np.zeros((np.count_nonzero(fit.scatter.inliers), 1))
+    probes = dwell_fit._structure_curves(table)
+    found = dwell_fit.find_structure(fit, 1e-3, certain)[0][0]
+    monkeypatch.setattr(dwell_fit, '_structure_curves',
                         lambda dwells: {found.along: probes[found.along]})
-    alone = dwell_fit.what_is_left(fit, 1e-3, certain)[0][0]
+    alone = dwell_fit.find_structure(fit, 1e-3, certain)[0][0]
     tried = sum(columns.shape[1] > 0 for columns in probes.values())
     assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
 
@@ -263,7 +264,7 @@ def test_an_outlying_dwell_is_compared_with_what_the_others_foretell_of_it():
     table = replace(table, output=table.output + 0.4 * DEGREE * last)
     fit = fit_effects(table, [term.effect for term in LINEAR],
                       Scatter(0.03 * DEGREE, 0.0, 0.0, 0.0, ~last))
-    (found,) = diagnosis._outliers(table, fit, 1.0)
+    (found,) = diagnosis._outlier_findings(table, fit, 1.0)
     line, covariance = np.polyfit(table.rate[~last], (table.output - table.rate)[~last], 1,
                                   cov='unscaled')
     off = (table.output - table.rate)[12] - np.polyval(line, table.rate[12])
@@ -279,8 +280,8 @@ def test_tables_without_temperature_say_what_they_cannot_show():
                                    temperature=None), None)
     assert ('temperature_degc' in found.cannot_show['bias_temperature']
             and 'time' in found.cannot_show['thermal_lag'])
-    assert set(found.cannot_show) | set(STEADY) | {'outliers',
-                                                   'unit_error'} == set(diagnosis.CAUSES)
+    assert set(found.cannot_show) | set(STATIC_EFFECTS) | {'outliers',
+                                                           'unit_error'} == set(diagnosis.CAUSES)
 
 
 def test_columns_of_a_table_that_are_not_used_are_not_reported_as_missing(without_gain):
@@ -314,8 +315,9 @@ def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
     assert all(each.remedy for each in found.findings)
     write_model(tmp_path / 'model.yaml', found.model)
     written = read_model(tmp_path / 'model.yaml')
-    assert same_effects(written, found.model) and 'sine_response' in written.origin['ambiguous'][0]
-    json.dumps(found.figures(), allow_nan=False)
+    assert (have_same_effects(written, found.model)
+            and 'sine_response' in written.origin['ambiguous'][0])
+    json.dumps(found.to_dict(), allow_nan=False)
     rate = next(curve for curve in found.curves if curve.along == 'rate')
     assert rms(rate.after / rate.deviation) < 2.0 < rms(rate.before / rate.deviation)
 

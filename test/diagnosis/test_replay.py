@@ -12,13 +12,13 @@
 
 from dataclasses import replace
 
-from gyro_calibration.diagnosis.gates import refuse
+from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import simulate, turns
+from gyro_calibration.model.motion import constant_rate_motion, simulate
 from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
@@ -62,17 +62,17 @@ def laid_out(log):
 def test_effects_look_at_a_rate_without_gaps_and_lost_samples_are_not_compared(gaping):
     each = laid_out(gaping)
     assert np.isfinite(each.channels.rate).all()
-    assert not each.kept[np.isnan(gaping.reference_rate)].any()
+    assert not each.valid[np.isnan(gaping.reference_rate)].any()
 
 
 def test_a_smoothed_record_is_averaged_until_no_smoothing_is_seen(smoothed):
-    assert laid_out(smoothed).every > 1
+    assert laid_out(smoothed).decimation > 1
 
 
 def test_a_record_that_is_not_smoothed_is_left_as_it_is(smoothed):
     rate = np.sin(smoothed.time)
     noise = 1e-3 * np.random.default_rng(2).standard_normal(len(rate))
-    assert laid_out(replace(smoothed, output=rate + noise, reference_rate=rate)).every == 1
+    assert laid_out(replace(smoothed, output=rate + noise, reference_rate=rate)).decimation == 1
 
 
 def test_stamps_in_bursts_lose_no_sample():
@@ -80,7 +80,7 @@ def test_stamps_in_bursts_lose_no_sample():
     late = 0.04 * (np.arange(len(time)) // 4) + 1e-3 * (np.arange(len(time)) % 4)
     noise = 1e-3 * np.random.default_rng(3).standard_normal(len(time))
     each = laid_out(Log(time=late, output=noise))
-    assert each.place[-1] == len(time) - 1 and each.interval == pytest.approx(0.01, rel=1e-3)
+    assert each.grid_index[-1] == len(time) - 1 and each.interval == pytest.approx(0.01, rel=1e-3)
 
 
 def test_a_delay_is_named_as_one_beside_a_noisy_and_gaping_reference(gaping):
@@ -104,7 +104,7 @@ def test_a_held_reference_that_stands_is_not_bent_towards_what_comes_next():
     """Rests of 10 s were a ramp to the first value after them."""
     held = stepped(5)
     each = replay(Log(output=held + NOISE, time=TIME, reference_rate=held),
-                  np.ones(len(TIME), bool), np.random.default_rng(0), update=0.05)
+                  np.ones(len(TIME), bool), np.random.default_rng(0), update_interval=0.05)
     standing = (TIME % 20.0 > 0.5) & (TIME % 20.0 < 9.5)
     assert np.abs(each.reference - held)[standing].max() < 1e-12
     turning = (TIME % 20.0 > 10.5) & (TIME % 20.0 < 19.5)
@@ -116,7 +116,7 @@ def test_a_held_reference_that_stands_is_not_bent_towards_what_comes_next():
 def test_a_held_heading_that_stands_has_no_rate():
     heading = np.where(TIME < 60.0, 0.0, 0.5 * (TIME - 60.0))[np.arange(len(TIME)) // 5 * 5]
     each = replay(Log(output=NOISE, time=TIME, reference_heading=heading),
-                  np.ones(len(TIME), bool), np.random.default_rng(0), update=0.05)
+                  np.ones(len(TIME), bool), np.random.default_rng(0), update_interval=0.05)
     assert np.abs(each.reference[TIME < 59.5]).max() < 1e-9
 
 
@@ -128,10 +128,10 @@ def test_a_reference_that_is_slower_than_the_gyro_is_compared_with_all_samples(q
     given = np.where((np.arange(len(TIME)) % every == 0) & ~((TIME > 50.0) & (TIME < 52.0)),
                      values, np.nan)
     log = Log(output=0.5 * np.sin(0.7 * TIME) + NOISE, time=TIME, **{quantity: given})
-    refuse(log)
+    refuse_unusable(log)
     each = laid_out(log)
-    assert 0.97 * len(TIME) < np.count_nonzero(each.kept) < 0.985 * len(TIME)
-    assert (each.reference - 0.5 * np.sin(0.7 * TIME))[each.kept].std() < 0.02
+    assert 0.97 * len(TIME) < np.count_nonzero(each.valid) < 0.985 * len(TIME)
+    assert (each.reference - 0.5 * np.sin(0.7 * TIME))[each.valid].std() < 0.02
 
 
 def test_a_pattern_of_a_slow_reference_that_is_not_quite_even_is_no_loss():
@@ -139,7 +139,7 @@ def test_a_pattern_of_a_slow_reference_that_is_not_quite_even_is_no_loss():
     shown = np.isin(np.arange(len(TIME)), np.arange(0, len(TIME), 10.0 / 3.0).astype(int))
     each = laid_out(Log(output=0.5 * np.sin(TIME) + NOISE, time=TIME,
                         reference_rate=np.where(shown, 0.5 * np.sin(TIME), np.nan)))
-    assert np.count_nonzero(~each.kept) < 5
+    assert np.count_nonzero(~each.valid) < 5
 
 
 def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():
@@ -147,9 +147,9 @@ def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():
     lost = (TIME > 50.0) & (TIME < 51.5)
     each = laid_out(Log(output=0.5 * np.sin(2.0 * TIME) + NOISE, time=TIME,
                         reference_heading=np.where(lost, np.nan, heading)))
-    assert np.abs(each.reference - 0.5 * np.sin(2.0 * TIME))[each.kept].max() < 3e-3
+    assert np.abs(each.reference - 0.5 * np.sin(2.0 * TIME))[each.valid].max() < 3e-3
     # four beside each end, and where the fourth difference sees the bend of the gap
-    assert 8 <= np.count_nonzero(~each.kept & ~lost) < 24
+    assert 8 <= np.count_nonzero(~each.valid & ~lost) < 24
 
 
 def test_a_log_without_temperature_is_simulated_at_the_temperature_of_the_model():
@@ -160,11 +160,12 @@ def test_a_log_without_temperature_is_simulated_at_the_temperature_of_the_model(
     each = replay(Log(output=output, time=TIME, reference_rate=rate), np.ones(len(TIME), bool),
                   np.random.default_rng(0), model=model)
     assert abs(float(np.mean(each.channels.output - each.reference))) < 1e-4
-    assert 'temperature' not in each.has
+    assert 'temperature' not in each.available_channels
 
 
 def test_the_corners_of_a_motion_known_by_its_heading_pass_for_no_dead_zone():
-    motion = turns([(10, 0), (10, 38), (10, 0), (10, -58), (10, 0), (20, 29), (10, 0)] * 3, 2.0)
+    motion = constant_rate_motion([(10, 0), (10, 38), (10, 0), (10, -58), (10, 0), (20, 29),
+                                   (10, 0)] * 3, 2.0)
     noise = Noise(1.5e-4, 1e-5)
     log = simulate(GyroModel(noise=noise), motion, 20.0, np.random.default_rng(8))
     log = replace(log, reference_rate=None)

@@ -33,8 +33,14 @@ from gyro_calibration.diagnosis.findings import (
     Trace,
     Unexplained,
 )
-from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.words import chance, for_people, headline, lines, quantity
+from gyro_calibration.diagnosis.report import render_report
+from gyro_calibration.diagnosis.words import (
+    display_unit,
+    format_probability,
+    format_quantity,
+    headline,
+    terminal_lines,
+)
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -232,14 +238,14 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_well_formed_and_has_each_name_once(made):
-    page = Page(report(made))
+    page = Page(render_report(made))
     names = [attributes['id'] for _, attributes in page.elements if 'id' in attributes]
     assert len(names) == len(set(names))
     assert {tag for tag, _ in page.elements} >= {'h1', 'main', 'section', 'style', 'script'}
 
 
 def test_the_page_refers_to_nothing_outside_and_allows_itself_no_network(made):
-    elements = Page(report(made)).elements
+    elements = Page(render_report(made)).elements
     for tag, attributes in elements:
         assert tag not in ('img', 'link', 'iframe', 'object', 'embed', 'base', 'form', 'a')
         assert not {'src', 'href', 'srcset', 'action', 'style'} & set(attributes)
@@ -250,7 +256,7 @@ def test_the_page_refers_to_nothing_outside_and_allows_itself_no_network(made):
 
 
 def test_texts_of_others_stay_texts():
-    text = report(hostile())
+    text = render_report(hostile())
     page = Page(text)
     assert [tag for tag, _ in page.elements].count('script') == 1
     assert '<script>document.title' in page.text and '$title $body' in page.text
@@ -259,12 +265,12 @@ def test_texts_of_others_stay_texts():
 
 
 def test_no_number_is_written_as_a_computer_says_it(made):
-    text = Page(report(made)).text.split('The model', 1)[0]
+    text = Page(render_report(made)).text.split('The model', 1)[0]
     assert not [word for word in ('nan', 'inf ', 'None', 'e-0', 'np.float') if word in text]
 
 
 def test_every_chart_has_words_and_a_table_of_its_values(made):
-    page = Page(report(made))
+    page = Page(render_report(made))
     tags = [tag for tag, _ in page.elements]
     charts = [attributes for tag, attributes in page.elements if tag == 'svg'
               and attributes.get('role') == 'img']
@@ -274,17 +280,17 @@ def test_every_chart_has_words_and_a_table_of_its_values(made):
 
 
 def test_the_finding_stands_on_top_and_is_the_same_for_the_terminal(made):
-    text = Page(report(made)).text
+    text = Page(render_report(made)).text
     if made.logs != (HOSTILE,):
         assert all(sentence in text for sentence in headline(made))
     assert len(headline(made)) == 2
-    assert ' '.join(lines(made)).replace('\n', ' ').startswith(headline(made)[0])
+    assert ' '.join(terminal_lines(made)).replace('\n', ' ').startswith(headline(made)[0])
 
 
 def test_a_page_for_a_million_samples_is_small_and_keeps_the_extremes():
     whole = replace(extended(), heading=heading_curve(1_000_000))
     whole.heading.before[777_777] = 50.0 * DEGREE
-    text = report(whole)
+    text = render_report(whole)
     assert len(text.encode()) < 300_000
     assert '<td>50</td>' in text
 
@@ -292,14 +298,14 @@ def test_a_page_for_a_million_samples_is_small_and_keeps_the_extremes():
 # the words
 
 def test_a_set_is_named_with_the_experiment_that_distinguishes_it():
-    text = ' '.join(' '.join(lines(extended())).split())
+    text = ' '.join(' '.join(terminal_lines(extended())).split())
     assert 'bias temperature or rate ramp, which these data cannot distinguish' in text
     assert 'To distinguish them: heat and cool the gyro within one log.' in text
 
 
 def test_among_several_causes_a_set_is_in_brackets_and_sizes_are_in_data_sheet_units():
     assert 'time offset (or bandwidth), cubic nonlinearity and 2 more' in headline(several())[0]
-    text = ' '.join(lines(several()))
+    text = ' '.join(terminal_lines(several()))
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
 
 
@@ -315,29 +321,29 @@ def test_among_several_causes_a_set_is_in_brackets_and_sizes_are_in_data_sheet_u
      '20 % is scale factor error, refitted in any case, and 70 % is of the named causes.')])
 def test_what_is_refitted_in_any_case_is_not_of_the_named_causes(effect, shares, words):
     found = replace(temperature_finding(()), effect=effect)
-    text = Page(report(replace(extended(), findings=(found,), heading_shares=shares))).text
+    text = Page(render_report(replace(extended(), findings=(found,), heading_shares=shares))).text
     assert f'Of the mean square heading error over 60 s, {words}' in text
     assert 'Extended: causes were found' in text and 'each difference has a cause' not in text
 
 
 def test_a_verdict_says_that_no_cause_was_added_to_the_model():
     whole = extended()
-    text = Page(report(replace(whole, model=whole.before))).text
+    text = Page(render_report(replace(whole, model=whole.before))).text
     assert 'Not extended: causes were found, none was added to the model' in text
 
 
 def test_a_diagnosis_of_another_kind_leaves_out_what_it_did_not_measure():
-    text = Page(report(replace(adequate(), method='the dwells of a table were fitted',
-                               noise=Noise(), simulated=Noise()))).text
+    text = Page(render_report(replace(adequate(), method='the dwells of a table were fitted',
+                                      noise=Noise(), simulated=Noise()))).text
     assert ('The dwells of a table were fitted.' in text and 'replayed' not in text
             and 'angle random walk' not in text.split('The model')[0])
 
 
 def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
     whole = extended()
-    text = report(replace(whole, model=whole.before, gain=None, findings=(),
-                          unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
-    assert ('data-name="after"' in report(whole) and 'data-name="after"' not in text
+    text = render_report(replace(whole, model=whole.before, gain=None, findings=(),
+                                 unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
+    assert ('data-name="after"' in render_report(whole) and 'data-name="after"' not in text
             and 'before the extension, and up to' not in text)
 
 
@@ -351,12 +357,12 @@ def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
     (0.1, (0.1, 0.1), 'V', '0.1 V'), (0.5, (-np.inf, np.inf), 'Hz', '0.5 (−∞ to ∞) Hz')])
 def test_an_estimate_is_written_with_the_digits_that_its_interval_leaves(value, interval, unit,
                                                                          words):
-    assert str(quantity(Estimate(value, interval, unit))) == words
+    assert str(format_quantity(Estimate(value, interval, unit))) == words
 
 
 def test_noise_is_in_the_units_of_data_sheets():
     for unit, of_people in (('rad/√s', 'deg/√h'), ('rad/s/√s', 'deg/h/√h')):
-        assert for_people(unit) == (
+        assert display_unit(unit) == (
             of_people, pytest.approx(180.0 / np.pi * (60.0 if unit == 'rad/√s' else 60.0 ** 3)))
 
 
@@ -364,7 +370,7 @@ def test_noise_is_in_the_units_of_data_sheets():
                          [(0.0, 'below 1 in 10 000'), (1 / 250, '1 in 250'), (0.3, '30 %'),
                           (np.nan, 'not known')])
 def test_a_chance_is_reported_in_words(probability, words):
-    assert chance(probability) == words
+    assert format_probability(probability) == words
 
 
 @pytest.mark.parametrize('interval, words',
@@ -374,12 +380,12 @@ def test_a_gain_is_called_what_it_is(interval, words):
     whole = extended()
     gain = replace(whole.gain, heading=replace(whole.gain.heading, interval=interval))
     changed = replace(whole, gain=gain)
-    assert words in headline(changed)[1] and words in Page(report(changed)).text
+    assert words in headline(changed)[1] and words in Page(render_report(changed)).text
 
 
 def test_lines_for_a_terminal_are_not_too_long(made):
     if made.logs != (HOSTILE,):
-        assert max(len(line) for text in lines(made) for line in text.split('\n')) <= 120
+        assert max(len(line) for text in terminal_lines(made) for line in text.split('\n')) <= 120
 
 
 # the page in a browser
@@ -492,7 +498,7 @@ BEYOND = ('[...document.querySelectorAll("body *")].filter(each => !each.closest
 def test_the_page_fits_each_screen_and_opens_without_complaint_and_network(
         browser, made, tmp_path):
     path = tmp_path / 'report.html'
-    path.write_text(report(made), encoding='utf-8')
+    path.write_text(render_report(made), encoding='utf-8')
     for width, height in SCREENS.values():
         browser.show(path, width, height)
         methods = [event.get('method') for event in browser.events]
@@ -511,7 +517,7 @@ def test_the_page_fits_each_screen_and_opens_without_complaint_and_network(
 def whole_path(tmp_path_factory):
     """Return a file with the page that has every chart."""
     path = tmp_path_factory.mktemp('whole') / 'report.html'
-    path.write_text(report(extended()), encoding='utf-8')
+    path.write_text(render_report(extended()), encoding='utf-8')
     return path
 
 

@@ -10,16 +10,16 @@
 
 """The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
-from gyro_calibration.diagnosis.pipeline import _of_noise
-from gyro_calibration.diagnosis.regression import fitted, FittedValues, regression_problem
+from gyro_calibration.diagnosis.pipeline import _noise_findings
+from gyro_calibration.diagnosis.regression import build_problem, fit_causes, FittedValues
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.residuals import (
-    _Bands,
-    _fit,
-    _without_tones,
-    curves,
+    _BandEnergies,
+    _drop_tone_bands,
+    _fit_noise,
     NoiseParameters,
-    what_is_left,
+    residual_curves,
+    unbiased_residuals,
 )
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel
@@ -44,8 +44,11 @@ def record(noise, generator, duration, interval):
 def inside(log, generator):
     """Return which bins of all curves but the spectrum are within their bands, and how many."""
     laid = replay(log, np.ones(len(log.time), dtype=bool), generator)
-    found = FittedValues(fitted(regression_problem([laid]), []), (laid,))
-    shown = [each for each in curves(what_is_left(found), found) if each.along != 'frequency']
+    found = FittedValues(fit_causes(build_problem([laid]), []), (laid,))
+    shown = [
+        each for each in residual_curves(unbiased_residuals(found), found)
+        if each.along != 'frequency'
+    ]
     off = np.concatenate([np.abs(each.after) / each.deviation for each in shown])
     assert ({'time', 'rate', 'heading', 'temperature', 'specific_force'}
             <= {each.along for each in shown})
@@ -70,11 +73,11 @@ def test_a_vibration_is_not_in_the_angle_random_walk(tone):
     parts = np.column_stack([np.ones(60), 1.0 / frequency, 1.0 / frequency ** 2])
     energy = 4.0 * generator.chisquare(count)
     energy[56] *= tone
-    bands = _Bands(energy, count, parts, np.zeros(60))
-    used = _without_tones(bands)
+    bands = _BandEnergies(energy, count, parts, np.zeros(60))
+    used = _drop_tone_bands(bands)
     assert len(used.energy) == (60 if tone == 1.0 else 59)
-    assert np.exp(0.5 * _fit(used, {})[0][0]) == pytest.approx(2.0, rel=0.03)
-    assert tone == 1.0 or np.exp(0.5 * _fit(bands, {})[0][0]) > 2.2
+    assert np.exp(0.5 * _fit_noise(used, {})[0][0]) == pytest.approx(2.0, rel=0.03)
+    assert tone == 1.0 or np.exp(0.5 * _fit_noise(bands, {})[0][0]) > 2.2
 
 
 FIGURES = NoiseParameters(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3)},
@@ -86,4 +89,4 @@ FIGURES = NoiseParameters(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3
     ({'angle_random_walk': (0.9e-3, 1.04e-3)}, 1)], ids=['none', 'wide', 'narrow'])
 def test_noise_within_the_bounds_of_a_model_is_no_finding(bounds, found):
     model = GyroModel(noise=Noise(1e-3), noise_bounds=bounds)
-    assert len(_of_noise(FIGURES, model, 0.01, ())) == found
+    assert len(_noise_findings(FIGURES, model, 0.01, ())) == found

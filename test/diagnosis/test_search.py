@@ -17,26 +17,26 @@ import zlib
 from diagnosed import diagnosis_of, held
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
-    candidates,
-    columns_of,
-    effect,
-    fitted_shapes,
+    candidate_transforms,
+    effect_candidate,
+    fitted_shape_indices,
     generic_terms,
     is_named,
+    propose_candidates,
     with_shape,
 )
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression import fitted, Named, regression_problem
+from gyro_calibration.diagnosis.regression import build_problem, fit_causes, SelectedCause
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
-    begin,
-    evidence_of,
-    polished,
-    searched,
-    strongest,
-    SURELY,
-    sureness_of,
-    suspected,
+    evidence_for,
+    find_strongest,
+    find_suspected,
+    held_out_sigmas,
+    MIN_PREDICTION_SIGMAS,
+    refine_jointly,
+    search_causes,
+    start_search,
 )
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
@@ -64,12 +64,13 @@ def tone(size, frequency, time=TIME, phase=0.3):
 
 def found_in(replays):
     """Return a search, and what it names."""
-    search = begin(replays, np.random.default_rng(1))
-    return search, searched(search)
+    search = start_search(replays, np.random.default_rng(1))
+    return search, search_causes(search)
 
 
 def gained(search, named):
-    return fitted(search.problem, named).score - fitted(search.problem, []).score
+    return (fit_causes(search.problem, named).log_likelihood
+            - fit_causes(search.problem, []).log_likelihood)
 
 
 # sets and prices
@@ -99,25 +100,26 @@ def test_the_least_size_that_is_found_counts_the_frequencies(both):
 def test_what_may_be_anywhere_pays_for_the_places_to_the_end(cause, added, places):
     search, named = found_in([laid(resting(added))])
     assert [each.candidate.cause for each in named] == [cause]
-    assert evidence_of(search, named, 0) < gained(search, named) - math.log(places)
+    assert evidence_for(search, named, 0) < gained(search, named) - math.log(places)
 
 
 def test_what_one_stretch_shows_does_not_predict_the_others():
     lasting, brief = tone(4e-4, 3.3), np.where(abs(TIME - 203.0) < 2.0, tone(2e-2, 3.3), 0.0)
     search, named = found_in([laid(resting(lasting))])
-    assert sureness_of(search, named)[0] > SURELY
-    search = begin([laid(resting(brief))], np.random.default_rng(1))
-    named = polished(search, named)
-    assert evidence_of(search, named, 0) > 10.0 and sureness_of(search, named)[0] < SURELY
+    assert held_out_sigmas(search, named)[0] > MIN_PREDICTION_SIGMAS
+    search = start_search([laid(resting(brief))], np.random.default_rng(1))
+    named = refine_jointly(search, named)
+    assert (evidence_for(search, named, 0) > 10.0
+            and held_out_sigmas(search, named)[0] < MIN_PREDICTION_SIGMAS)
 
 
 def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
-    search = begin([laid(resting(5e-7 * TIME))], np.random.default_rng(1))
+    search = start_search([laid(resting(5e-7 * TIME))], np.random.default_rng(1))
     answers = []
     for level in np.geomspace(2e-2, 2e-5, 13):
-        at_level = replace(search, rate=level, found_before={})
-        answers.append('named' if strongest(at_level, ())[0]
-                       else 'suspected' if suspected(at_level, ()) else 'nothing')
+        at_level = replace(search, rate=level, step_cache={})
+        answers.append('named' if find_strongest(at_level, ())[0]
+                       else 'suspected' if find_suspected(at_level, ()) else 'nothing')
     assert list(dict.fromkeys(answers)) == ['named', 'suspected', 'nothing']
     assert answers.count('suspected') * np.log(1e3) / 12.0 == pytest.approx(np.log(5.0), abs=0.58)
 
@@ -126,30 +128,34 @@ def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
 
 def test_a_shape_that_is_fitted_stays_within_what_a_model_may_hold():
     for name, each in CATALOGUE.items():
-        candidate = effect(name, *(1.0 if shape.default is None else shape.default
-                                   for shape in each.shapes))
-        for place in fitted_shapes(candidate):
-            low, high = each.shapes[place].bounds
+        candidate = effect_candidate(name, *(1.0 if shape.default is None else shape.default
+                                             for shape in each.nonlinear_parameters))
+        for place in fitted_shape_indices(candidate):
+            low, high = each.nonlinear_parameters[place].bounds
             for value in (-1e12, 1e12):
                 assert low <= with_shape(candidate, place, value).shapes[place] <= high, name
 
 
 def test_a_shape_at_its_bound_has_a_deviation():
     rate = np.sin(0.7 * TIME) * np.sin(0.11 * TIME)
-    whole = regression_problem([laid(Log(output=rate + NOISE * np.random.default_rng(
+    whole = build_problem([laid(Log(output=rate + NOISE * np.random.default_rng(
         0).standard_normal(len(rate)), time=TIME, reference_rate=rate))])
-    assert (0, -1) in fitted(whole, [Named(effect('time_offset', 1.0), (1.0,))]).owner
+    assert ((0, -1) in fit_causes(whole,
+                                  [SelectedCause(effect_candidate('time_offset', 1.0),
+                                                 (1.0, ))]).column_owners)
 
 
 def test_what_a_tone_changes_by_with_its_frequency_is_its_derivative_in_a_long_log():
     time, frequency = np.arange(45_000) / 50.0, 20.0
     each = laid(resting(time=time))
-    done = fitted(regression_problem([each]),
-                  [Named(effect('interference_tone', frequency, run=0), (1.0, 0.0))])
-    column = done.columns[done.owner.index((0, -1))] * done.problem.deviation
+    done = fit_causes(
+        build_problem([each]),
+        [SelectedCause(effect_candidate('interference_tone', frequency, log_index=0), (1.0, 0.0))])
+    column = done.columns[done.column_owners.index((0, -1))] * done.problem.deviation
     phase = Candidate('', (), lambda replayed: (
         2.0 * np.pi * replayed.channels.time * np.cos(2.0 * np.pi * frequency * time),))
-    assert column == pytest.approx(columns_of(phase, [each])[0], abs=0.02 * np.abs(column).max())
+    assert (column == pytest.approx(
+        candidate_transforms(phase, [each])[0], abs=0.02 * np.abs(column).max()))
 
 
 @pytest.mark.parametrize('name, shape', [('dead_zone', 'dead_zone'), ('bias_step', 'step_time')])
@@ -163,7 +169,9 @@ def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
                         (size.interval[1] - size.interval[0]) / 3.92)
     assert 0.0 < abs(size.estimate - truth) + deviation < 5.0 * deviation, size
     assert held([cause], [finding], 4.0) == {name: True}
-    places = [(term.effect.name, value) for term in found.model.terms for value in term.fitted]
+    places = [
+        (term.effect.name, value) for term in found.model.terms for value in term.fitted_indices
+    ]
     if name == 'bias_step':  # it happens once
         assert (name, 0) not in places
         return
@@ -176,7 +184,7 @@ def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
 def test_a_tone_above_what_is_searched_has_its_own_frequency_and_size():
     time = np.arange(60_000) / 100.0
     each = laid(resting(tone(1e-3, 30.0, time), time))
-    assert each.every == 2
+    assert each.decimation == 2
     _, named = found_in([each])
     assert [known.candidate.cause for known in named] == ['interference_tone']
     assert (named[0].candidate.shapes[0] == pytest.approx(30.0, abs=1e-3)
@@ -187,7 +195,7 @@ def test_a_tone_in_one_of_four_logs_is_as_strong_as_it_is_there():
     time = TIME[:2000]
     _, named = found_in([laid(resting(tone(1e-3 * (run == 2), 3.3, time), time, run))
                          for run in range(4)])
-    assert [(known.candidate.cause, known.candidate.run)
+    assert [(known.candidate.cause, known.candidate.log_index)
             for known in named] == [('interference_tone', 2)]
     assert math.hypot(*named[0].values) == pytest.approx(1e-3, rel=0.15)
 
@@ -230,14 +238,16 @@ def test_a_step_is_found_between_the_places_that_are_tried_in_many_logs():
     time = TIME[:2000]
     replays = [laid(resting(6e-4 * (time >= 50.0) * (run == 1), time, run)) for run in range(5)]
     _, named = found_in(replays)
-    assert [(known.candidate.cause, known.candidate.run) for known in named] == [('bias_step', 1)]
+    assert ([(known.candidate.cause, known.candidate.log_index) for known in named
+             ] == [('bias_step', 1)])
     assert named[0].candidate.shapes[0] == pytest.approx(50.0, abs=1.0)
 
 
 def test_steps_are_looked_for_in_each_of_many_logs():
     each = laid(resting(time=TIME[:2000]))
-    assert {known.run
-            for known in candidates(70 * [each]) if known.cause == 'bias_step'} == set(range(70))
+    assert {
+        known.log_index for known in propose_candidates(70 * [each]) if known.cause == 'bias_step'
+    } == set(range(70))
 
 
 def test_what_a_log_cannot_show_is_not_searched_for():
@@ -250,7 +260,7 @@ def test_what_a_log_cannot_show_is_not_searched_for():
             'thermal_lag'} <= {name for name in shown if 'less than 0.2 K' in shown[name]}
     assert 'bias' in shown['scale_factor_asymmetry'] and 'quadratic_nonlinearity' not in shown
     replays = [laid(log)]
-    searched_for = {each.cause for each in (*candidates(replays), *generic_terms(replays))}
+    searched_for = {each.cause for each in (*propose_candidates(replays), *generic_terms(replays))}
     assert not [name for name in searched_for if 'temperature' in name
                 or shown.get(name, '').endswith('changes')]
-    assert 'rate_ramp' in {each.cause for each in candidates(replays) if is_named(each)}
+    assert 'rate_ramp' in {each.cause for each in propose_candidates(replays) if is_named(each)}

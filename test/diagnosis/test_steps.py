@@ -10,16 +10,20 @@
 
 """How far a diagnosis is: never less than before, and within the step that is under way."""
 
-from gyro_calibration.diagnosis.steps import Steps
+from gyro_calibration.diagnosis.steps import ProgressSteps
 
 
 def test_parts_of_unknown_number_stay_within_their_step():
     told = []
-    steps = Steps(lambda share, words: told.append((share, words)), {'a': 1, 'b': 8, 'c': 1})
+    steps = ProgressSteps(lambda share, words: told.append((share, words)), {
+        'a': 1,
+        'b': 8,
+        'c': 1
+    })
     steps.begin('a')
     steps.begin('b')
     for number in range(40):
-        steps.within(f'part {number}')
+        steps.begin_part(f'part {number}')
     steps.begin('c')
     shares = [share for share, _ in told]
     assert shares == sorted(shares) and shares[:3] == [0.0, 0.1, 0.1] and shares[-1] == 0.9

@@ -16,9 +16,9 @@ import random
 import threading
 
 from fake_port import BEGIN, Reading, World
-from gyro_calibration.driver.connection import Connection, PortError, resolve
+from gyro_calibration.driver.connection import Connection, PortError, resolve_port
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import numpy as np
 import pytest
 from serial_faults import damaged
@@ -40,7 +40,7 @@ def turning(rate=0.5, frequency=100.0):
 def test_samples_come_with_stamps_that_increase():
     """From a replay, which waits for its reader: no sample is lost on a busy machine."""
     changes, stop = [], threading.Event()
-    with Emulator(find('csv'), turning(), speed=2.0, wait_for_reader=True) as gyro:
+    with Emulator(find_protocol('csv'), turning(), speed=2.0, wait_for_reader=True) as gyro:
         connection = Connection(gyro.path, 'csv', on_change=changes.append)
         reading = connection.chunks(stop)
         chunks = list(itertools.takewhile(lambda _: connection.counts().samples < 100, reading))
@@ -66,12 +66,12 @@ def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
     before, stop = held(), threading.Event()
     for number in range(100):
         stop.clear()
-        with Emulator(find('csv'), turning(0.01 * number), link=tmp_path / 'gyro'):
+        with Emulator(find_protocol('csv'), turning(0.01 * number), link=tmp_path / 'gyro'):
             for chunk in connection.chunks(stop):
                 found.append(chunk.samples[-1].output)
                 stop.set()
         after.append(held())
-    assert set(after) == {before} and connection.openings == 100
+    assert set(after) == {before} and connection.open_count == 100
     assert found == pytest.approx([0.01 * number for number in range(100)])
 
 
@@ -80,12 +80,13 @@ def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_auto_finds_the_protocol_and_reports_it(name):
-    world = World(30.0, baud=find(name).baud)
+    world = World(30.0, baud=find_protocol(name).baud)
     world.gyro(name, settings=SETTINGS[name])
     reading = Reading(world, settings=SETTINGS[name])
-    assert reading.connection.protocol is find(name) and name in reading.connection.detected
+    assert (reading.connection.protocol is find_protocol(name)
+            and name in reading.connection.detected)
     assert reading.names == ['listening', 'reading'] and len(reading.samples) > 100
-    assert reading.connection.baud == find(name).baud
+    assert reading.connection.baud == find_protocol(name).baud
 
 
 def test_auto_with_a_baud_listens_at_that_one_only():
@@ -107,7 +108,8 @@ def test_another_gyro_in_the_same_place_is_recognized():
     world.gyro('kvh_dsp3000', end=20.0)
     world.gyro('minimu9', begin=20.0)
     reading = Reading(world)
-    assert reading.connection.protocol is find('minimu9') and reading.states[-1].name == 'reading'
+    assert (reading.connection.protocol is find_protocol('minimu9')
+            and reading.states[-1].name == 'reading')
     assert reading.connection.counts().samples == len(reading.samples) > 4000
 
 
@@ -117,7 +119,7 @@ def test_stamps_go_on_when_another_gyro_is_recognized():
     world.gyro('kvh_dsp3000', end=20.0)
     world.gyro('csv', settings=settings, begin=20.0, rate=200.0)
     reading = Reading(world, settings=settings)
-    assert reading.connection.protocol is find('csv') and min(reading.steps) > 0.0
+    assert reading.connection.protocol is find_protocol('csv') and min(reading.steps) > 0.0
 
 
 @pytest.mark.parametrize('protocol, state', [('auto', 'listening'), ('csv', 'failed')])
@@ -156,14 +158,14 @@ def test_several_ports_that_match_are_named(tmp_path):
         (tmp_path / name).touch()
     with pytest.raises(PortError,
                        match=r'2 ports match .*: .*gyro_a, .*gyro_b; set port to one of them'):
-        resolve(str(tmp_path / 'gyro_?'))
+        resolve_port(str(tmp_path / 'gyro_?'))
 
 
 def test_several_names_of_one_port_are_no_question(tmp_path):
     (tmp_path / 'tty').touch()
     for name in ('gyro_a', 'gyro_b'):
         (tmp_path / name).symlink_to(tmp_path / 'tty')
-    assert resolve(str(tmp_path / 'gyro_*')) == str(tmp_path / 'gyro_a')
+    assert resolve_port(str(tmp_path / 'gyro_*')) == str(tmp_path / 'gyro_a')
 
 
 def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
@@ -177,7 +179,7 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     waits = [state.waiting for state in reading.states if state.name == 'failed']
     doubling = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
     assert waits == pytest.approx([*doubling, *5 * [5.0], *doubling, 5.0])
-    assert reading.connection.waited == pytest.approx(31.3 + 10.0, abs=0.2)
+    assert reading.connection.waited_duration == pytest.approx(31.3 + 10.0, abs=0.2)
 
 
 def test_a_protocol_that_is_not_known_is_refused():
@@ -196,7 +198,7 @@ def test_a_gyro_that_falls_silent_is_opened_again():
     reading = Reading(world, 'csv')
     assert reading.names == ['reading', *(len(reading.names) - 2) * ['failed'], 'reading']
     assert reading.problems[0] == NOTHING and reading.times[1] == pytest.approx(7.0, abs=0.2)
-    assert reading.connection.openings > 1
+    assert reading.connection.open_count > 1
 
 
 @pytest.mark.parametrize('period', [1.5, 10.0])
@@ -226,7 +228,7 @@ def test_a_gyro_without_samples_is_reported_with_its_reason(protocol, line, reas
     reading = Reading(world, protocol)
     assert reading.problems[0].startswith(reason) and not reading.samples
     assert reading.times[0] == pytest.approx(2.0, abs=0.2)
-    assert 3 <= reading.connection.openings <= 5  # after 7 s each, as a board may restart
+    assert 3 <= reading.connection.open_count <= 5  # after 7 s each, as a board may restart
 
 
 @pytest.mark.parametrize('protocol', ['razor', 'auto'])
@@ -236,7 +238,7 @@ def test_a_board_that_restarts_when_it_is_opened_is_asked_until_it_answers(proto
         1.2, b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n')
     world.send(b'#YPR=-142.28,-5.38,33.52\r\n')
     reading = Reading(world, protocol)
-    assert len(reading.samples) > 500 and reading.connection.openings == 1
+    assert len(reading.samples) > 500 and reading.connection.open_count == 1
     assert len(world.asked) <= 4, 'asked although it sends'
 
 
@@ -247,7 +249,7 @@ def test_a_board_that_takes_long_to_restart_is_waited_for(protocol):
     world.restart = 4.5
     world.send(b'1.0\r\n')
     reading = Reading(world, protocol, settings=ONE_COLUMN)
-    assert reading.samples and reading.connection.openings == 1
+    assert reading.samples and reading.connection.open_count == 1
     assert reading.problems == [NOTHING]
 
 
@@ -256,16 +258,17 @@ def test_a_board_that_sends_something_else_while_it_starts_is_found_at_a_given_b
     world.send(b'\x00\x01\x02', end=3.0)
     world.send(b'1.0\r\n', begin=3.0)
     reading = Reading(world, settings=ONE_COLUMN, baud=115200)
-    assert reading.problems and reading.samples and reading.connection.openings == 1
+    assert reading.problems and reading.samples and reading.connection.open_count == 1
 
 
 def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known():
     """The rest of the frame is no bytes of another format."""
     world = World(10.0)
     world.gyro('kvh_dsp3000', end=4.0)
-    world.send(iter([find('kvh_dsp3000').encode(Sample(0.5))[:9]]), begin=4.0, end=4.01)
+    world.send(iter([find_protocol('kvh_dsp3000').encode(Sample(0.5))[:9]]), begin=4.0, end=4.01)
     reading = Reading(world)
-    assert reading.connection.protocol is find('kvh_dsp3000') and reading.problems[0] == NOTHING
+    assert (reading.connection.protocol is find_protocol('kvh_dsp3000')
+            and reading.problems[0] == NOTHING)
 
 
 # Counts and stamps
@@ -286,7 +289,7 @@ def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
 
 
 def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps():
-    generator, encode = random.Random(3), find('kvh_1750').encoder()
+    generator, encode = random.Random(3), find_protocol('kvh_1750').encoder()
     sent = [b'' if generator.random() < 0.02 else encode(Sample(1e-4 * number, sequence=number))
             for number in range(8_000)]
     world = World(8.0)
@@ -313,7 +316,7 @@ def test_invalid_and_refused_samples_are_counted_and_leave_a_gap():
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_a_bad_line_is_survived_and_counted(name, share):
     """Few long frames survive a tenth of faulty bytes; a good line shows right decoding."""
-    protocol, generator = find(name), np.random.default_rng(2)
+    protocol, generator = find_protocol(name), np.random.default_rng(2)
     encode = protocol.encoder(SETTINGS[name])
     frames = [encode(Sample(0.5, 25.0, number / 100.0, number)) for number in range(3000)]
     world = World(30.0)
@@ -326,5 +329,5 @@ def test_a_bad_line_is_survived_and_counted(name, share):
     assert exact == pytest.approx(0.5, abs=0.01) and set(last) == {exact} and len(last) > 900
     assert reading.connection.counts().discarded_bytes > 0 and min(reading.steps) > 0.0
     outputs = [sample.output for sample in reading.samples]
-    assert all(abs(output) <= protocol.limit(SETTINGS[name]) for output in outputs)
+    assert all(abs(output) <= protocol.effective_full_scale(SETTINGS[name]) for output in outputs)
     assert name != 'kvh_1750' or set(outputs) == {exact}, 'a CRC lets nothing wrong through'

@@ -10,7 +10,7 @@
 
 """The mean of several samples in place of each."""
 
-from gyro_calibration.driver.connection import Decimation
+from gyro_calibration.driver.connection import Decimator
 from gyro_calibration.driver.protocols import Sample
 import pytest
 
@@ -20,7 +20,7 @@ EPOCH = 1.7e9
 
 def means(size, numbers):
     """Return what becomes of samples that hold their numbers, as many periods after 1970."""
-    decimation = Decimation(size)
+    decimation = Decimator(size)
     samples = [Sample(1e-4 * number, 30.0, specific_force=9.81) for number in numbers]
     complete = list(decimation.add(samples,
                                    [EPOCH + PERIOD * number for number in numbers], PERIOD))
@@ -31,7 +31,7 @@ def test_one_sample_a_message_stays_as_it_is():
     complete, rest = means(1, range(5))
     assert ([mean.sample.output for mean in complete] == [1e-4 * number for number in range(5)]
             and not rest)
-    assert {mean.size for mean in complete} == {1}
+    assert {mean.sample_count for mean in complete} == {1}
 
 
 def test_a_mean_has_the_mean_time_of_its_samples():
@@ -40,7 +40,7 @@ def test_a_mean_has_the_mean_time_of_its_samples():
     assert [mean.stamp - EPOCH for mean in complete] == pytest.approx([4.5e-3, 14.5e-3], abs=1e-6)
     assert ({(mean.sample.temperature, round(mean.sample.specific_force, 9)) for mean in complete}
             == {(30.0, 9.81)})
-    assert [mean.size for mean in [*complete, *rest]] == [10, 10, 5]
+    assert [mean.sample_count for mean in [*complete, *rest]] == [10, 10, 5]
 
 
 @pytest.mark.parametrize('numbers, sizes', [([*range(4), *range(50, 60)], [4, 10]),
@@ -48,18 +48,18 @@ def test_a_mean_has_the_mean_time_of_its_samples():
                          ids=['a gap', 'stamps that are set back'])
 def test_a_jump_of_the_stamps_ends_a_group(numbers, sizes):
     complete, rest = means(10, numbers)
-    assert [mean.size for mean in [*complete, *rest]] == sizes
+    assert [mean.sample_count for mean in [*complete, *rest]] == sizes
 
 
 def test_a_group_that_has_begun_is_given_once():
-    decimation = Decimation(1000)
+    decimation = Decimator(1000)
     assert not list(decimation.add([Sample(0.1)], [EPOCH], PERIOD))
     assert ([mean.sample for mean in decimation.flush()] == [Sample(0.1)]
             and not list(decimation.flush()))
 
 
 def test_unknown_temperatures_do_not_count():
-    decimation = Decimation(3)
+    decimation = Decimator(3)
     samples = [Sample(0.0, 20.0), Sample(0.0), Sample(0.0, 30.0)]
     mean, = decimation.add(samples, [EPOCH + PERIOD * number for number in range(3)], PERIOD)
     assert mean.sample.temperature == 25.0 and mean.sample.specific_force is None

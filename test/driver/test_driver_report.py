@@ -19,12 +19,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
-from gyro_calibration.driver.connection import Connection, Mean
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.connection import Connection, SampleMean
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.ros.diagnostics import ERROR, OK, WARN
-from gyro_calibration.ros.driver_node import Messages, PARAMETERS, settings
+from gyro_calibration.ros.driver_node import PARAMETERS, SampleMessages, settings_from_parameters
 from gyro_calibration.ros.driver_report import DriverReport
-from gyro_calibration.ros.parameters import record
+from gyro_calibration.ros.parameters import parameter_values
 
 KEYS = {
     'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
@@ -49,26 +49,26 @@ KEYS = {
 ])
 def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
     with pytest.raises(ValueError, match=sentence) as refused:
-        values = record(PARAMETERS, given)
-        Connection(values.port, values.protocol, values.baud, settings(values))
+        values = parameter_values(PARAMETERS, given)
+        Connection(values.port, values.protocol, values.baud, settings_from_parameters(values))
     assert len(str(refused.value).splitlines()) == 1
 
 
 def test_parameters_become_settings():
     given = {'sensitivity': 0.002, 'invert': 'always', 'increments': 'never', 'axis': 'y',
              'full_scale': 2, 'columns': ['gyro_counts']}
-    assert settings(record(PARAMETERS, given)) == Settings(
+    assert settings_from_parameters(parameter_values(PARAMETERS, given)) == Settings(
         0.002, True, 'y', ('gyro_counts',), 2.0, False, None)
-    assert settings(record(PARAMETERS)) == Settings()
+    assert settings_from_parameters(parameter_values(PARAMETERS)) == Settings()
 
 
 # Messages
 
 
 def filled(sample, size=1, variance=1e-4):
-    messages = Messages('my_gyro')
+    messages = SampleMessages('my_gyro')
     messages.variance = variance
-    messages.fill(Mean(1_700_000_000.25, sample, size))
+    messages.fill(SampleMean(1_700_000_000.25, sample, size))
     return messages
 
 
@@ -98,7 +98,7 @@ def test_a_specific_force_along_z_is_reported_while_there_is_one():
     assert messages.imu.linear_acceleration.z == 9.81
     assert list(messages.imu.linear_acceleration_covariance) == pytest.approx(
         [1e6, 0, 0, 0, 1e6, 0, 0, 0, 0.01])
-    messages.fill(Mean(0.0, Sample(0.5), 1))
+    messages.fill(SampleMean(0.0, Sample(0.5), 1))
     assert messages.imu.linear_acceleration.z == 0.0
     assert list(messages.imu.linear_acceleration_covariance) == [-1.0, *8 * [0.0]]
 
@@ -106,7 +106,7 @@ def test_a_specific_force_along_z_is_reported_while_there_is_one():
 @pytest.mark.parametrize(('name', 'deviation'),
                          [('kvh_dsp3000', 0.0111), ('kvh_1750', 0.0088), ('csv', 0.5)])
 def test_the_assumed_noise_is_that_of_the_data_sheet_or_half_a_degree_a_second(name, deviation):
-    assert math.sqrt(find(name).variance(Settings())) == pytest.approx(
+    assert math.sqrt(find_protocol(name).sample_variance(Settings())) == pytest.approx(
         math.radians(deviation), rel=0.01)
 
 
@@ -173,7 +173,7 @@ def test_losses_of_the_last_second_are_a_warning_with_their_counts():
 
 def test_supply_and_source_current_are_reported_and_checked():
     world, given = World(10.0), Settings(sensitivity=1e-6)
-    encode = find('fizoptika').encoder(given)
+    encode = find_protocol('fizoptika').encoder(given)
     health = {'supply_v': 5.0, 'source_current_a': 0.05, 'diagnostic_v': 1.0}
     world.send((encode(Sample(0.1, 24.0, sequence=number, health=health))
                 for number in itertools.count()), rate=1000.0)
@@ -209,7 +209,7 @@ def test_steps_of_the_clock_are_counted():
 
 
 def test_listening_is_a_warning_and_what_was_recognized_is_reported():
-    world = World(30.0, baud=find('minimu9').baud)
+    world = World(30.0, baud=find_protocol('minimu9').baud)
     world.gyro('minimu9')
     reports = reported(world, 'auto')
     assert reports[0][:2] == (WARN, 'listening for a protocol')

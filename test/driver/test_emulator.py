@@ -19,7 +19,7 @@ import time
 
 from gyro_calibration.driver.connection import PortError, SerialPort
 from gyro_calibration.driver.emulator import emulate, Emulator
-from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import pytest
 from serial_faults import bursts
 
@@ -32,7 +32,8 @@ def samples(count=None, rate=100.0):
 
 def read_all(path, protocol, enough=None, settings=None, until=lambda received: True):
     """Read until the gyro is unplugged, or enough samples are there and a condition holds."""
-    port, decoder, received = SerialPort(str(path), 115200), find(protocol).decoder(settings), []
+    port, decoder, received = (SerialPort(str(path),
+                                          115200), find_protocol(protocol).decoder(settings), [])
     port.open()
     try:
         while enough is None or len(received) < enough or not until(received):
@@ -47,18 +48,19 @@ def read_all(path, protocol, enough=None, settings=None, until=lambda received: 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_a_reader_gets_every_sample(name, tmp_path):
     settings = Settings(sensitivity=1e-6 if name == 'fizoptika' else None)
-    emulator = Emulator(find(name), samples(200), settings, speed=math.inf, link=tmp_path / 'gyro',
-                        wait_for_reader=True)
+    emulator = Emulator(find_protocol(name), samples(200), settings, speed=math.inf,
+                        link=tmp_path / 'gyro', wait_for_reader=True)
     with emulator:
         received = read_all(emulator.path, name, 200, settings)
-    resolution = 1e-6 if name in ('csv', 'kvh_1750', 'fizoptika') else find(name).sensitivity
+    resolution = (1e-6 if name in ('csv', 'kvh_1750',
+                                   'fizoptika') else find_protocol(name).sensitivity)
     assert [sample.output for sample in received] == pytest.approx(
         [sample.output for sample in samples(200)], abs=resolution)
 
 
 def test_nothing_is_lost_when_the_samples_end(tmp_path):
-    emulator = Emulator(find('csv'), samples(5000), speed=math.inf, link=tmp_path / 'gyro',
-                        wait_for_reader=True)
+    emulator = Emulator(find_protocol('csv'), samples(5000), speed=math.inf,
+                        link=tmp_path / 'gyro', wait_for_reader=True)
     thread = threading.Thread(target=emulate, args=[emulator])
     thread.start()
     while not (tmp_path / 'gyro').exists():
@@ -77,7 +79,9 @@ def test_samples_come_at_their_times(speed):
         sent = (received[-1].time - received[0].time) / speed
         return (sent > 0.5 and arrivals[-1] - arrivals[0] == pytest.approx(sent, abs=0.05)
                 or arrivals[-1] - arrivals[0] > 20.0)
-    with Emulator(find('csv'), samples(rate=100.0), speed=speed, wait_for_reader=True) as emulator:
+
+    with Emulator(find_protocol('csv'), samples(rate=100.0), speed=speed,
+                  wait_for_reader=True) as emulator:
         read_all(emulator.path, 'csv', 1, until=is_in_time)
     assert arrivals[-1] - arrivals[0] < 20.0
 
@@ -85,13 +89,13 @@ def test_samples_come_at_their_times(speed):
 def test_samples_are_pulled_one_by_one():
     pulled = []
     source = (pulled.append(sample) or sample for sample in samples(rate=10.0))
-    with Emulator(find('csv'), source, wait_for_reader=True) as emulator:
+    with Emulator(find_protocol('csv'), source, wait_for_reader=True) as emulator:
         received = read_all(emulator.path, 'csv', enough=3)
         assert len(pulled) <= len(received) + 1
 
 
 def test_bytes_that_are_not_read_are_lost_in_real_time(wait_until):
-    with Emulator(find('csv'), samples(rate=1000.0)) as emulator:
+    with Emulator(find_protocol('csv'), samples(rate=1000.0)) as emulator:
         wait_until(lambda: emulator.lost_bytes > 1000)
         assert emulator.sent_bytes == 0
         first = read_all(emulator.path, 'csv', enough=1)[0]
@@ -99,16 +103,17 @@ def test_bytes_that_are_not_read_are_lost_in_real_time(wait_until):
 
 
 def test_a_replay_waits_for_its_reader():
-    with Emulator(find('csv'), samples(20000), speed=math.inf) as emulator:
+    with Emulator(find_protocol('csv'), samples(20000), speed=math.inf) as emulator:
         received = read_all(emulator.path, 'csv', enough=19990)
     assert emulator.lost_bytes == 0
     assert received[-1].time - received[0].time == pytest.approx(0.01 * (len(received) - 1))
 
 
 def test_what_the_driver_sends_is_ignored():
-    with Emulator(find('kvh_dsp3000'), samples(rate=100.0), wait_for_reader=True) as emulator:
+    with Emulator(find_protocol('kvh_dsp3000'), samples(rate=100.0),
+                  wait_for_reader=True) as emulator:
         port, decoder, received = (SerialPort(emulator.path, 38400),
-                                   find('kvh_dsp3000').decoder(), [])
+                                   find_protocol('kvh_dsp3000').decoder(), [])
         port.open()
         while len(received) < 30:
             port.write(b'RRR' * 100)
@@ -120,15 +125,15 @@ def test_what_the_driver_sends_is_ignored():
 def test_the_link_is_replaced_and_removed(tmp_path):
     link = tmp_path / 'gyro'
     link.symlink_to('/nonexistent')
-    with Emulator(find('csv'), samples(), link=link) as emulator:
+    with Emulator(find_protocol('csv'), samples(), link=link) as emulator:
         assert os.readlink(link) == emulator.path
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_link_that_another_gyro_has_taken_is_left_alone(tmp_path):
     link = tmp_path / 'gyro'
-    with Emulator(find('csv'), samples(), link=link):
-        second = Emulator(find('csv'), samples(), link=link)
+    with Emulator(find_protocol('csv'), samples(), link=link):
+        second = Emulator(find_protocol('csv'), samples(), link=link)
         second.open()
     assert os.readlink(link) == second.path
     second.close()
@@ -137,12 +142,12 @@ def test_a_link_that_another_gyro_has_taken_is_left_alone(tmp_path):
 def test_a_file_in_the_place_of_the_link_is_kept(tmp_path):
     (tmp_path / 'notes').write_text('precious')
     with pytest.raises(FileExistsError, match='give another path'):
-        Emulator(find('csv'), samples(), link=tmp_path / 'notes').open()
+        Emulator(find_protocol('csv'), samples(), link=tmp_path / 'notes').open()
     assert (tmp_path / 'notes').read_text() == 'precious'
 
 
 def test_stop_ends_an_endless_gyro_at_once():
-    emulator = Emulator(find('csv'), samples(rate=0.01))
+    emulator = Emulator(find_protocol('csv'), samples(rate=0.01))
     begin = time.monotonic()
     with emulator:
         pass
@@ -154,18 +159,19 @@ def test_stop_ends_an_endless_gyro_at_once():
     ({'settings': Settings(columns=('gyro_counts',))}, 'sensitivity')])
 def test_what_an_emulator_cannot_do_is_refused_before_the_start(given, words):
     with pytest.raises(ValueError, match=words):
-        Emulator(find('csv'), samples(), **given)
+        Emulator(find_protocol('csv'), samples(), **given)
 
 
 def test_a_sample_without_a_time_is_refused():
     with pytest.raises(ValueError, match='set Sample.time'):
-        emulate(Emulator(find('csv'), [Sample(0.5)]))
+        emulate(Emulator(find_protocol('csv'), [Sample(0.5)]))
 
 
 def test_samples_are_numbered():
     sent = []
     protocol = replace(
-        find('csv'), writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
+        find_protocol('csv'),
+        writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
     with Emulator(protocol, samples(100, 1e4)) as gyro:
         gyro.join()
     assert sent == list(range(100))
@@ -177,14 +183,14 @@ class Adapter(Emulator):
     _BATCH = 0.0
 
     def _frames(self):
-        return bursts(super()._frames())
+        return bursts(super()._timed_frames())
 
 
 def test_an_adapter_hands_over_in_bursts():
     """Sixteen samples of 1 ms each come together; a busy machine may take several at once."""
-    gyro = Adapter(find('csv'), samples(320, 1000.0), wait_for_reader=True)
+    gyro = Adapter(find_protocol('csv'), samples(320, 1000.0), wait_for_reader=True)
     with gyro:
-        port, decoder = SerialPort(gyro.path, 9600, timeout=0.5), find('csv').decoder()
+        port, decoder = SerialPort(gyro.path, 9600, timeout=0.5), find_protocol('csv').decoder()
         port.open()
         chunks = [port.read()]
         while chunks[-1] or gyro._thread.is_alive():
@@ -196,10 +202,11 @@ def test_an_adapter_hands_over_in_bursts():
 
 def test_eleven_thousand_samples_a_second_are_sent_in_time():
     """As fast as fizoptika sends. It waits for its reader: the buffer holds 40 ms at most."""
-    gyro = Emulator(find('kvh_ecore'), samples(11500, 5750.0), speed=2.0, wait_for_reader=True)
+    gyro = Emulator(find_protocol('kvh_ecore'), samples(11500, 5750.0), speed=2.0,
+                    wait_for_reader=True)
     with gyro:
         port, decoder, count, begin, used = (SerialPort(gyro.path, 921600),
-                                             find('kvh_ecore').decoder(),
+                                             find_protocol('kvh_ecore').decoder(),
                                              0, math.inf, time.process_time())
         port.open()
         while count < 11500 and time.monotonic() < begin + 20.0:

@@ -13,10 +13,10 @@
 import itertools
 import math
 
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 import pytest
 
-PROTOCOL = find('fizoptika')
+PROTOCOL = find_protocol('fizoptika')
 ONE_COUNT = Settings(sensitivity=1.0)
 HEALTH = {'supply_v': 5.0, 'source_current_a': 0.1, 'diagnostic_v': 1.0}
 
@@ -61,8 +61,9 @@ def test_all_values_come_round_and_are_good():
     assert ([sample.temperature for sample in samples if sample.temperature is not None]
             == pytest.approx([-12.5] * 2, abs=0.01))
     health = {name: value for sample in samples for name, value in sample.health.items()}
-    assert health == pytest.approx(HEALTH, abs=1e-4) and health.keys() == PROTOCOL.good.keys()
-    assert all(low < health[name] < high for name, (low, high) in PROTOCOL.good.items())
+    assert (health == pytest.approx(HEALTH, abs=1e-4)
+            and health.keys() == PROTOCOL.normal_ranges.keys())
+    assert all(low < health[name] < high for name, (low, high) in PROTOCOL.normal_ranges.items())
 
 
 @pytest.mark.parametrize('count', [1, 2, 3])

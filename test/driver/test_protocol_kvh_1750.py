@@ -13,7 +13,7 @@
 import math
 import struct
 
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import FrameSplitter
 import pytest
 
@@ -22,7 +22,7 @@ GOLDEN = bytes.fromhex('FE81FF5537A96A6E38586C1FB75BF862BF803E78BB650D283B0A37AC
 ROTATION = {'x': 2.019593e-5, 'y': 5.159911e-5, 'z': -1.3111248e-5}  # rad since the last sample
 FORCE = {'x': -1.00191, 'y': -0.003495, 'z': 0.002109}  # g
 GRAVITY = 9.80665
-PROTOCOL = find('kvh_1750')
+PROTOCOL = find_protocol('kvh_1750')
 
 
 def with_status(status, axis='z'):

@@ -10,10 +10,10 @@
 
 """The Razor firmware: axes right and down, negated accelerations, and lines of other kinds."""
 
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 import pytest
 
-PROTOCOL = find('razor')
+PROTOCOL = find_protocol('razor')
 #: At rest and level the axis that points down has 256.
 LINE = b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n'
 

@@ -13,10 +13,10 @@
 import math
 import struct
 
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 import pytest
 
-PROTOCOL = find('witmotion')
+PROTOCOL = find_protocol('witmotion')
 GRAVITY = 9.80665
 
 

@@ -21,7 +21,7 @@ import math
 import random
 import time
 
-from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import pytest
 
 ALL = sorted(PROTOCOLS)
@@ -64,14 +64,14 @@ def stream(name, count=20, seed=1):
     samples = [Sample(generator.uniform(-1.0, 1.0),
                       generator.uniform(-40.0, 85.0) if timed else None,
                       0.01 * k if timed else None) for k in range(count)]
-    protocol = find(name)
+    protocol = find_protocol(name)
     return samples, protocol.preamble + b''.join(map(protocol.encoder(SETTINGS[name]), samples))
 
 
 def opened(name, settings=None):
     """Return a decoder that knows where the next frame begins."""
-    decoder = find(name).decoder(settings or SETTINGS[name])
-    decoder.feed(find(name).preamble)
+    decoder = find_protocol(name).decoder(settings or SETTINGS[name])
+    decoder.feed(find_protocol(name).preamble)
     return decoder
 
 
@@ -83,7 +83,7 @@ def test_frames_of_the_documented_layout_are_read(name, data, rate):
 
 def test_clockwise_on_a_dsp3000_is_negative():
     """The DSP-3000 counts clockwise positive, ROS counter-clockwise (REP-103)."""
-    sample, = find('kvh_dsp3000').decoder().feed(b'      10.000000   1\r\n')
+    sample, = find_protocol('kvh_dsp3000').decoder().feed(b'      10.000000   1\r\n')
     assert sample.output == pytest.approx(-10.0 * DPS)
 
 
@@ -92,12 +92,12 @@ def test_decoding_undoes_encoding(name):
     for invert, part in itertools.product((True, False), (-1.0, -0.3, 0.0, 1e-3, 1.0)):
         settings = replace(SETTINGS[name], invert=invert)
         output = part * LARGEST[name] * DPS
-        sample, = opened(name, settings).feed(find(name).encode(Sample(output), settings))
+        sample, = opened(name, settings).feed(find_protocol(name).encode(Sample(output), settings))
         assert sample.output == pytest.approx(output, abs=0.51 * RESOLUTION[name] * DPS)
 
 
 def test_csv_keeps_time_and_temperature():
-    sample, = opened('csv').feed(find('csv').encode(Sample(0.5, 21.25, 1700000000.125)))
+    sample, = opened('csv').feed(find_protocol('csv').encode(Sample(0.5, 21.25, 1700000000.125)))
     assert (sample.time, sample.temperature, sample.specific_force, sample.health) == (
         1700000000.125, 21.25, None, {})
 
@@ -105,7 +105,7 @@ def test_csv_keeps_time_and_temperature():
 @pytest.mark.parametrize('force', [9.81, -9.81, 0.0, 98.0665, None])
 @pytest.mark.parametrize('name, step', [('kvh_1750', 1e-9), ('witmotion', 0.003)])
 def test_a_specific_force_keeps_its_sign(name, step, force):
-    sample, = opened(name).feed(find(name).encode(Sample(0.1, specific_force=force)))
+    sample, = opened(name).feed(find_protocol(name).encode(Sample(0.1, specific_force=force)))
     assert sample.specific_force == (
         force if force is None else pytest.approx(force, rel=1e-6, abs=step))
 
@@ -114,7 +114,7 @@ def test_a_specific_force_keeps_its_sign(name, step, force):
 def test_a_temperature_that_cannot_be_sent_does_not_stop_an_emulated_gyro(name):
     """A log has nan where its sensor failed."""
     for value in (math.nan, math.inf, 1e9, -1e9):
-        sample, = opened(name).feed(find(name).encode(
+        sample, = opened(name).feed(find_protocol(name).encode(
             Sample(0.1, value, 0.1, specific_force=math.nan), SETTINGS[name]))
         assert sample.output == pytest.approx(0.1, abs=RESOLUTION[name] * DPS)
 
@@ -124,7 +124,7 @@ def test_csv_takes_acceleration_and_supply_by_the_words_of_the_log_format():
     first, second = opened('csv', settings).feed(b'4.98,0.5,-9.81\nnan,0.5,\n')
     assert (first.health, first.specific_force, second.health, second.specific_force) == (
         {'supply_v': 4.98}, -9.81, {}, None)
-    again, = opened('csv', settings).feed(find('csv').encode(first, settings))
+    again, = opened('csv', settings).feed(find_protocol('csv').encode(first, settings))
     assert again == first
 
 
@@ -132,14 +132,15 @@ def test_csv_takes_acceleration_and_supply_by_the_words_of_the_log_format():
 def test_half_a_number_is_no_number(name):
     """A port is opened in the middle of a line, where 120.5 looks like 20.5."""
     _, data = stream(name, 2)
-    whole = {sample.output for sample in find(name).decoder().feed(data)}
-    for start in range(len(find(name).preamble) + 1, len(data)):
-        assert {sample.output for sample in find(name).decoder().feed(data[start:])} <= whole
+    whole = {sample.output for sample in find_protocol(name).decoder().feed(data)}
+    for start in range(len(find_protocol(name).preamble) + 1, len(data)):
+        assert ({sample.output for sample in find_protocol(name).decoder().feed(data[start:])}
+                <= whole)
 
 
 @pytest.mark.parametrize('name', ['kvh_1750', 'kvh_ecore', 'fizoptika', 'witmotion'])
 def test_a_flipped_bit_gives_no_wrong_rate(name):
-    encode = find(name).encoder(SETTINGS[name])
+    encode = find_protocol(name).encoder(SETTINGS[name])
     frames = [encode(Sample(rate * DPS, 20.0, None, number, 0, 9.8))
               for number, rate in enumerate((1.0, -2.0, 3.0, 4.0, 5.0))]
     good = [sample.output for sample in opened(name).feed(b''.join(frames))]
@@ -160,7 +161,7 @@ def test_a_flipped_bit_gives_no_wrong_rate(name):
 @pytest.mark.parametrize('name', ALL)
 def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
     _, data = stream(name)
-    protocol, decoder = find(name), opened(name)
+    protocol, decoder = find_protocol(name), opened(name)
     frames = [protocol.encode(Sample(0.1 * number, 20.0, 0.01 * number), SETTINGS[name])
               for number in range(1, 9)]
     frames[3] = frames[3][:2] + b'\x55' + frames[3][4:]
@@ -170,12 +171,12 @@ def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
 
 @pytest.mark.parametrize('name', ['kvh_dsp3000', 'kvh_1750'])
 def test_samples_that_the_device_calls_invalid_are_missing_and_faults(name):
-    protocol, decoder = find(name), opened(name)
+    protocol, decoder = find_protocol(name), opened(name)
     data = [protocol.encode(Sample(0.1, sequence=number), valid=number not in (3, 4))
             for number in range(7)]
     samples = decoder.feed(b''.join(data))
     assert [sample.missing for sample in samples] == [0, 0, 0, 2, 0]
-    assert (decoder.faults, decoder.discarded_bytes) == (2, 0)
+    assert (decoder.device_faults, decoder.discarded_bytes) == (2, 0)
 
 
 LENGTH = 300_000
@@ -240,11 +241,11 @@ def test_a_temperature_that_no_sensor_reports_is_refused_and_the_rate_is_kept(te
 
 @pytest.mark.parametrize('name', ALL)
 def test_every_protocol_has_an_assumed_noise_and_a_full_scale_at_which_it_saturates(name):
-    protocol, settings = find(name), SETTINGS[name]
-    assert 0.0 < protocol.limit(settings) < math.inf
-    assert 0.0 < protocol.variance(settings) <= (0.5 * DPS) ** 2
+    protocol, settings = find_protocol(name), SETTINGS[name]
+    assert 0.0 < protocol.effective_full_scale(settings) < math.inf
+    assert 0.0 < protocol.sample_variance(settings) <= (0.5 * DPS) ** 2
     sample, = opened(name).feed(protocol.encode(Sample(-1000.0), settings))
-    assert sample.output == pytest.approx(-protocol.limit(settings), rel=2e-4)
+    assert sample.output == pytest.approx(-protocol.effective_full_scale(settings), rel=2e-4)
 
 
 def test_a_full_scale_that_is_set_goes_before_that_of_the_protocol():
@@ -254,10 +255,10 @@ def test_a_full_scale_that_is_set_goes_before_that_of_the_protocol():
 
 @pytest.mark.parametrize(('name', 'data', 'settings'), [
     ('kvh_dsp3000', b'     501.000000   1\r\n', Settings()),  # manual of the DSP-3000, table 2
-    ('kvh_ecore', find('kvh_ecore').encode(Sample(59.0 * DPS)), Settings(full_scale=0.5)),
+    ('kvh_ecore', find_protocol('kvh_ecore').encode(Sample(59.0 * DPS)), Settings(full_scale=0.5)),
     ('minimu9', b'!ANG:0,0,0,AN:0,0,40000,0,0,0,0,0,0\r\n', Settings()),  # counts have 16 bits
     # rad/s, taken for angles
-    ('kvh_1750', find('kvh_1750').encode(Sample(0.501 * DPS), Settings(increments=False)),
+    ('kvh_1750', find_protocol('kvh_1750').encode(Sample(0.501 * DPS), Settings(increments=False)),
      Settings()),
     ('razor', b'#YPRAG=0,0,0,0,0,0,0,0,2290.0\r\n', Settings()),
     ('csv', b'0.1,501.0,20.0\n', Settings(full_scale=500.0 * DPS)),
@@ -270,7 +271,10 @@ def test_a_rate_that_the_device_cannot_mean_is_refused(name, data, settings):
 
 def test_the_axis_chooses_among_three():
     line = b'!ANG:0.10,-0.20,90.00,AN:100,200,300,4,5,250,7,8,9\r\n'
-    rates = [find('minimu9').decoder(Settings(axis=axis)).feed(line)[0].output for axis in 'xyz']
+    rates = [
+        find_protocol('minimu9').decoder(Settings(axis=axis)).feed(line)[0].output
+        for axis in 'xyz'
+    ]
     assert rates == pytest.approx([7.0 * DPS, 14.0 * DPS, 21.0 * DPS])
 
 
@@ -287,8 +291,8 @@ def test_csv_columns_have_the_units_of_their_names(columns, sensitivity, line):
 def test_full_scale_follows_the_sensitivity():
     """A MinIMU-9 set to 250 deg/s still has 16 bits: all its counts are good."""
     settings = Settings(sensitivity=0.00875 * DPS)
-    sample, = find('minimu9').decoder(settings).feed(
-        find('minimu9').encode(Sample(280.0 * DPS), settings))
+    sample, = find_protocol('minimu9').decoder(settings).feed(
+        find_protocol('minimu9').encode(Sample(280.0 * DPS), settings))
     assert sample.output == pytest.approx(280.0 * DPS, rel=1e-4)
 
 
@@ -319,16 +323,16 @@ def test_impossible_settings_are_refused(values, message):
                          [Settings(columns=('gyro_counts',)), Settings(sensitivity=0.1)])
 def test_csv_wants_a_sensitivity_for_counts_and_only_for_them(settings):
     with pytest.raises(ValueError, match='sensitivity'):
-        find('csv').decoder(settings)
+        find_protocol('csv').decoder(settings)
 
 
 def test_increments_are_refused_where_the_device_sends_rates():
     for name in set(ALL) - {'kvh_1750'}:
         with pytest.raises(ValueError, match='sends rates'):
-            find(name).decoder(replace(SETTINGS[name], increments=True))
+            find_protocol(name).decoder(replace(SETTINGS[name], increments=True))
 
 
 @pytest.mark.parametrize('name', ['kvh_dsp_3000', ''])
 def test_an_unknown_protocol_is_refused_with_the_known_ones(name):
     with pytest.raises(ValueError, match=rf'^protocol .*: choose one of {", ".join(PROTOCOLS)}$'):
-        find(name)
+        find_protocol(name)

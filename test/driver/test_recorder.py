@@ -14,11 +14,11 @@
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.driver.recorder import (
-    about,
     AtomicAppender,
     CsvRecorder,
     DiskFull,
     McapRecorder,
+    recording_notes,
 )
 from gyro_calibration.logs.log import LogError, read_log
 from gyro_calibration.logs.recording import read_recording
@@ -185,9 +185,9 @@ def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
         recorder.flush()
     recorder.close()
     np.testing.assert_array_equal(read_log(tmp_path / 'a.csv').supply, 200 * [5.0] + 200 * [4.9])
-    assert recorder.missed == {'source_current_a'}
+    assert recorder.late_columns == {'source_current_a'}
 
 
 def test_about_names_the_program_and_leaves_out_what_is_not_known():
-    known = about(port='/dev/ttyUSB0', protocol='', baud=None)
+    known = recording_notes(port='/dev/ttyUSB0', protocol='', baud=None)
     assert set(known) == {'recorded by', 'date', 'port'}

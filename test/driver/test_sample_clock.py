@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from gyro_calibration.driver.protocols import Sample
-from gyro_calibration.driver.timestamps import LowerLine, NodeTime, SampleClock
+from gyro_calibration.driver.timestamps import LowerLine, NodeTimeConverter, SampleClock
 import numpy as np
 import pytest
 
@@ -75,7 +75,7 @@ def play(clock, times, arrivals, kept=None, **said):
     samples = samples or [Sample(0.0)] * int(kept.sum())
     stamps = []
     for part, arrival in chunks(arrivals[kept]):
-        stamps += clock.stamp(samples[part], arrival)
+        stamps += clock.stamp_samples(samples[part], arrival)
     return Run(clock, times[kept], np.array(stamps), arrivals[kept], int(times.size - kept.sum()))
 
 
@@ -98,7 +98,7 @@ def test_stamps_are_right_where_samples_come_in_bursts_on_a_busy_host(rate, off,
     run = play(SampleClock(rate), times, arrivals_of(times, generator, stalls=(20.0, 40.3)))
     assert run.error() < min(0.0015, 0.35 / rate)
     assert (np.diff(run.stamps) > 0.0).all()
-    assert run.clock.lost <= 3
+    assert run.clock.lost_count <= 3
     assert run.stamps[-1] - run.stamps[0] == pytest.approx(times[-1] - times[0], abs=BURST)
     assert run.clock.period == pytest.approx(np.diff(times)[-1], rel=3e-4)
     before, after = run.clock.jitter
@@ -138,7 +138,7 @@ def test_lost_samples_are_counted_exactly_by_the_sequence(rate, generator):
     kept[[0, -1]] = True  # nobody sees these lost
     run = play(SampleClock(rate, 128), times, arrivals_of(times, generator, stalls=(30.0,)), kept,
                sequence=sequence(times))
-    assert run.clock.lost == run.truly_lost
+    assert run.clock.lost_count == run.truly_lost
     # For 0.3 s the number of wraps of the sequence is unknown.
     late = (run.times > 45.0) | (run.times < 40.0)
     assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < 0.7 / rate
@@ -153,7 +153,7 @@ def test_a_sequence_that_stands_still_loses_no_sample(rate, begin, generator):
     kept = lose(times, ((12.0, 100),))
     run = play(SampleClock(rate, 128), times, arrivals_of(times, generator, stalls=(11.0,)), kept,
                sequence=said)
-    assert run.clock.lost == pytest.approx(100, abs=2)
+    assert run.clock.lost_count == pytest.approx(100, abs=2)
     late = (run.times > 13.0) | (run.times < 12.0)  # a loss without a trace shows after 0.3 s
     assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < BURST
     assert (np.diff(run.stamps) > 0.0).all()
@@ -163,7 +163,7 @@ def test_a_loss_of_one_round_of_the_sequence_is_no_standstill(generator):
     times = true_times(1000, 0.01, 20.0)
     run = play(SampleClock(1000.0, 128), times, arrivals_of(times, generator),
                lose(times, ((10.0, 127),)), sequence=sequence(times))
-    assert run.clock.lost == 127
+    assert run.clock.lost_count == 127
 
 
 @pytest.mark.parametrize('rate', [10, 100, 1000])
@@ -171,7 +171,7 @@ def test_samples_lost_without_a_trace_are_counted_by_the_time_that_passed(rate, 
     times = true_times(rate, 0.02, 80.0)
     kept = lose(times, ((10.0, 1), (20.0, 50), (40.0, 300)))
     run = play(SampleClock(rate), times, arrivals_of(times, generator), kept)
-    assert run.clock.lost == run.truly_lost
+    assert run.clock.lost_count == run.truly_lost
     assert np.abs(run.stamps - run.times)[run.times > 78.0].max() < 0.35 / rate
 
 
@@ -181,7 +181,7 @@ def test_one_percent_lost_without_a_trace_is_counted_nearly(rate, tolerance, gen
     times = true_times(rate, 0.02, 60.0)
     kept = (generator.random(times.size) >= 0.01) | (times < 10.0)
     run = play(SampleClock(rate), times, arrivals_of(times, generator), kept)
-    assert run.clock.lost == pytest.approx(run.truly_lost, rel=tolerance, abs=1)
+    assert run.clock.lost_count == pytest.approx(run.truly_lost, rel=tolerance, abs=1)
 
 
 @pytest.mark.parametrize('rate', [10, 100, 500])
@@ -191,7 +191,7 @@ def test_what_was_counted_too_often_is_taken_back(rate, generator):
     missing = ((generator.random(times.size) < min(0.05, 2.5 / rate)) & (times > LEARNED)).astype(
         int)
     run = play(SampleClock(rate), times, arrivals_of(times, generator), missing=missing)
-    assert run.clock.lost <= 1 + 0.05 * missing.sum() < missing.sum()
+    assert run.clock.lost_count <= 1 + 0.05 * missing.sum() < missing.sum()
     assert run.error() < 0.003
 
 
@@ -202,7 +202,7 @@ def test_what_damage_hides_is_counted_as_the_decoder_says(generator):
     missing = np.zeros(times.size, int)
     missing[kept] = np.diff(np.flatnonzero(kept), prepend=-1) - 1
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, missing=missing)
-    assert run.clock.lost == pytest.approx(run.truly_lost, abs=2)
+    assert run.clock.lost_count == pytest.approx(run.truly_lost, abs=2)
     assert run.error() < 0.0015
 
 
@@ -214,7 +214,7 @@ def test_the_time_of_the_device_is_fitted_like_a_number(generator):
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept,
                time=50.0 + times / 1.02)
     assert run.error() < 0.001
-    assert run.clock.lost == run.truly_lost
+    assert run.clock.lost_count == run.truly_lost
 
 
 @pytest.mark.parametrize('jump', [-20.0, 1.0, 2000.0])
@@ -224,7 +224,7 @@ def test_a_damaged_time_of_the_device_harms_for_a_moment_only(jump, generator):
     said[1500] += jump
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
     assert run.error(25.0) < 0.001
-    assert run.clock.lost <= 1
+    assert run.clock.lost_count <= 1
     assert (np.diff(run.stamps) > 0.0).all()
 
 
@@ -242,7 +242,7 @@ def test_times_of_the_device_that_are_often_damaged_lose_no_sample(damage, gener
     said = np.round([damage(time, generator) if generator.random() < 0.05 else time
                      for time in 50.0 + times], 3)
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
-    assert run.clock.lost < 0.5 * np.count_nonzero(said != np.round(50.0 + times, 3))
+    assert run.clock.lost_count < 0.5 * np.count_nonzero(said != np.round(50.0 + times, 3))
     assert abs(run.stamps - times).max() < 0.1
 
 
@@ -256,14 +256,14 @@ def test_a_long_damaged_field_loses_no_more_samples_than_the_time_has_room_for(g
     every[kept] = missing
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, missing=every,
                time=50.0 + times)
-    assert run.clock.lost == run.truly_lost
+    assert run.clock.lost_count == run.truly_lost
 
 
 def test_a_first_interval_that_is_too_short_loses_no_sample_later(generator):
     times = true_times(100, 0.0, 10.0)
     said = np.concatenate([[50.0 + times[1] - 1e-4], 50.0 + times[1:]])
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
-    assert run.clock.lost == 0 and run.clock.period == pytest.approx(0.01, rel=0.01)
+    assert run.clock.lost_count == 0 and run.clock.period == pytest.approx(0.01, rel=0.01)
 
 
 def test_a_device_that_was_restarted_begins_anew(generator):
@@ -293,7 +293,7 @@ def test_a_pause_of_the_port_is_no_loss_and_the_stamps_go_on_behind_it(generator
     first = play(clock, times[:2000], arrivals[:2000])
     clock.interrupt()
     second = play(clock, times[3000:], arrivals[3000:])
-    assert clock.lost == 0
+    assert clock.lost_count == 0
     assert second.stamps[0] > first.stamps[-1]
     assert np.abs(second.stamps - times[3000:])[500:].max() < 0.002
 
@@ -304,19 +304,19 @@ def test_a_gyro_that_becomes_ten_times_slower_or_faster_has_lost_nothing(generat
     for first, second in ((fast, slow), (slow, fast)):
         times = np.concatenate([first, first[-1] + second])
         run = play(SampleClock(1000.0), times, arrivals_of(times, generator))
-        assert run.clock.lost <= 2
+        assert run.clock.lost_count <= 2
         assert run.error(30.0) < 0.002
         assert (np.diff(run.stamps) > 0.0).all()
 
 
 def test_many_samples_at_one_instant_still_increase():
     clock = SampleClock(1000.0)
-    stamps = [stamp for _ in range(100) for stamp in clock.stamp([Sample(0.0)] * 3, 17.0)]
+    stamps = [stamp for _ in range(100) for stamp in clock.stamp_samples([Sample(0.0)] * 3, 17.0)]
     assert all(later > earlier for earlier, later in pairwise(stamps))
 
 
 def test_no_samples_have_no_stamps():
-    assert SampleClock(100.0).stamp([], 1.0) == []
+    assert SampleClock(100.0).stamp_samples([], 1.0) == []
 
 
 def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(generator):
@@ -329,16 +329,16 @@ def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(ge
     sums = [(y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i))).sum() for i in range(30)
             for j in range(i + 1, 30)
             if (y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i)) > -1e-9).all()]
-    assert sum(y - [line.at(each) for each in x]) == pytest.approx(min(sums))
+    assert sum(y - [line.value_at(each) for each in x]) == pytest.approx(min(sums))
 
 
 @pytest.mark.parametrize('by', [-HOUR, HOUR])
 def test_another_clock_is_followed_slowly_and_at_once_where_it_was_set(by):
-    node, others = NodeTime(), []
+    node, others = NodeTimeConverter(), []
     for k in range(2000):
         steady = 100.0 + 0.01 * k
-        node.watch(steady, 1.7e9 + 1.0005 * steady + by * (k >= 1000))
-        others.append(node.of(steady))
+        node.update(steady, 1.7e9 + 1.0005 * steady + by * (k >= 1000))
+        others.append(node.convert(steady))
     true = [1.7e9 + 1.0005 * (100.0 + 0.01 * k) + by * (k >= 1000) for k in range(2000)]
     assert others == pytest.approx(true, rel=0.0, abs=0.002)
     steps = np.diff(others)
@@ -346,9 +346,9 @@ def test_another_clock_is_followed_slowly_and_at_once_where_it_was_set(by):
 
 
 def test_another_clock_that_runs_at_half_speed_or_stands_puts_no_stamp_back():
-    node, others = NodeTime(), []
+    node, others = NodeTimeConverter(), []
     for k in range(2000):
-        node.watch(0.01 * k, min(0.005 * k, 8.0))
-        others.append(node.of(0.01 * k - 0.002))
+        node.update(0.01 * k, min(0.005 * k, 8.0))
+        others.append(node.convert(0.01 * k - 0.002))
     assert (np.diff(others) > 0.0).all()
     assert others[1500] == pytest.approx(7.5, abs=0.15)

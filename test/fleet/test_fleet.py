@@ -27,17 +27,23 @@ from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.files import InputError
-from gyro_calibration.fleet.pooling import changes, Observed, outliers, Pooled
-from gyro_calibration.fleet.report import report, tables
-from gyro_calibration.fleet.run import cluster, finished, Lost, processes
-from gyro_calibration.fleet.summary import counted, data, models, sentences, summarized
-from gyro_calibration.fleet.table import described, entries, Entry, pattern
-from gyro_calibration.fleet.work import done, Task
+from gyro_calibration.fleet.pooling import find_changes, find_outliers, Observations, PooledValue
+from gyro_calibration.fleet.report import render_report, table_files
+from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
+from gyro_calibration.fleet.summary import (
+    build_models,
+    count_effects,
+    data,
+    describe_type,
+    summarize_types,
+)
+from gyro_calibration.fleet.table import compile_file_pattern, describe_log, find_logs, FleetLog
+from gyro_calibration.fleet.work import LogTask, process_log
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import from_rates
+from gyro_calibration.model.motion import motion_from_rates
 import numpy as np
 import pytest
 from recordings import MCAP, record, text
@@ -66,9 +72,9 @@ def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     (tmp_path / 'fleet.csv').write_text('log,unit,drive,date,temperature\n'
                                         'a.csv,7,n,2026-03-01,21\nb.csv,8,n,,\n')
     (tmp_path / 'a.csv').touch()
-    assert entries([str(tmp_path / 'fleet.csv')]) == [
-        Entry(str(tmp_path / 'a.csv'), '7', '', 'n', '2026-03-01', 21.0),
-        Entry(str(tmp_path / 'b.csv'), '8', '', 'n')]
+    assert find_logs([str(tmp_path / 'fleet.csv')]) == [
+        FleetLog(str(tmp_path / 'a.csv'), '7', '', 'n', '2026-03-01', 21.0),
+        FleetLog(str(tmp_path / 'b.csv'), '8', '', 'n')]
 
 
 @pytest.mark.parametrize(('text', 'wanted'), [
@@ -82,7 +88,7 @@ def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
 def test_a_table_that_is_wrong_is_refused_in_one_sentence(tmp_path, text, wanted):
     (tmp_path / 'fleet.csv').write_text(text)
     with pytest.raises(InputError, match=wanted):
-        entries([str(tmp_path / 'fleet.csv')])
+        find_logs([str(tmp_path / 'fleet.csv')])
 
 
 def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_path):
@@ -93,7 +99,7 @@ def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_p
 
     def found(path):
         return [os.path.relpath(entry.log, tmp_path)
-                for entry in entries([str(tmp_path / path)], without=tmp_path / 'x/out')]
+                for entry in find_logs([str(tmp_path / path)], excluded_folder=tmp_path / 'x/out')]
     assert found('x') == ['x/b.csv', 'x/bag', 'x/y/a.mcap']
     assert found('x/*/*.mcap') == ['x/y/a.mcap']
     assert found('list.txt') == ['x/b.csv']
@@ -105,7 +111,7 @@ def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_p
         (tmp_path / 'x/earlier' / name).touch()
     assert found('x') == ['x/b.csv', 'x/bag', 'x/y/a.mcap']
     (tmp_path / 'x/table.csv').write_text('log,unit\nb.csv,7\n')
-    assert {entry.log[-5:]: entry.unit for entry in entries([str(tmp_path / 'x')])} == {
+    assert {entry.log[-5:]: entry.unit for entry in find_logs([str(tmp_path / 'x')])} == {
         'b.csv': '7', 'x/bag': '', 'c.csv': '', '.mcap': ''}
 
 
@@ -126,26 +132,26 @@ def test_notes_metadata_and_names_say_what_a_table_does_not(tmp_path):
         (tmp_path / name).write_bytes(content)
 
     def of(name, named=None):
-        found = described(Entry(str(tmp_path / name)), named)
+        found = describe_log(FleetLog(str(tmp_path / name)), named)
         return found.unit, found.type, found.drive, found.date, found.temperature
     assert of('plain.csv') == ('1', '', 'h', '', None)
     assert of('keyed.csv') == ('SN-12', 'DOT', '', '2026-03-01', None)
     assert of('bag.mcap') == ('9', '', 'm', '', 21.5)
     assert of('rc_car_h_unit3.csv') == ('3', '', 'rc_car_h', '', None)
-    assert of('rc_car_h_unit3.csv', pattern('{type}_{drive}_unit{unit}')) == (
+    assert of('rc_car_h_unit3.csv', compile_file_pattern('{type}_{drive}_unit{unit}')) == (
         '3', 'rc', 'car_h', '', None)
     assert of('aimless.csv') == ('', '', '', '', None)
     with pytest.raises(ValueError, match='wanted a file name'):
-        pattern('rc_car')
+        compile_file_pattern('rc_car')
 
 
 # workers
 
 def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
-    with processes(2, 1e9) as create:
-        found = dict(finished(task, range(10), 2, create))
+    with process_executors(2, 1e9) as create:
+        found = dict(run_tasks(task, range(10), 2, create))
     lost = found.pop(KILLS)
-    assert isinstance(lost, Lost) and 'killed' in str(lost)
+    assert isinstance(lost, WorkerLost) and 'killed' in str(lost)
     assert found.pop(TAKES_ALL_MEMORY) == 'no memory'
     assert found == {number: number for number in {*range(10)} - {KILLS, TAKES_ALL_MEMORY}}
 
@@ -244,7 +250,7 @@ def test_names_may_hold_any_characters(tmp_path):
 def test_who_interrupts_is_told_how_to_continue(tmp_path, capsys, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
-    monkeypatch.setattr('gyro_calibration.cli.fleet.finished', interrupted)
+    monkeypatch.setattr('gyro_calibration.cli.fleet.run_tasks', interrupted)
     (tmp_path / 'a.csv').touch()
     assert run(tmp_path, '--out', tmp_path / 'out') == 1
     assert 'interrupted after 0 of 1 logs; run the same command' in capsys.readouterr().err
@@ -252,16 +258,17 @@ def test_who_interrupts_is_told_how_to_continue(tmp_path, capsys, monkeypatch):
 
 def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):
     write_log(tmp_path / 'a_unit1.csv', drive(0.01, 0))
-    one = Task(Entry(str(tmp_path / 'a_unit1.csv')), str(tmp_path / 'out'))
-    first, stamp, kept = done(one), one.record.stat().st_mtime_ns, one.record.read_bytes()
-    assert first == done(one) and one.record.stat().st_mtime_ns == stamp
+    one = LogTask(FleetLog(str(tmp_path / 'a_unit1.csv')), str(tmp_path / 'out'))
+    first, stamp, kept = (process_log(one), one.record_path.stat().st_mtime_ns,
+                          one.record_path.read_bytes())
+    assert first == process_log(one) and one.record_path.stat().st_mtime_ns == stamp
     assert first['unit'] == '1' and first['values']['bias']['value'] == pytest.approx(
         0.01, abs=4.0 * first['values']['bias']['deviation'])
-    renamed = done(replace(one, entry=Entry(one.entry.log, unit='7', temperature=21.0)))
+    renamed = process_log(replace(one, entry=FleetLog(one.entry.log, unit='7', temperature=21.0)))
     assert renamed == {**first, 'unit': '7', 'temperature': 21.0}
-    assert one.record.stat().st_mtime_ns == stamp
-    one.record.write_text('{"key": "of another version"}')
-    assert done(one) == first and one.record.read_bytes() == kept
+    assert one.record_path.stat().st_mtime_ns == stamp
+    one.record_path.write_text('{"key": "of another version"}')
+    assert process_log(one) == first and one.record_path.read_bytes() == kept
 
 
 @pytest.mark.parametrize(('make', 'code', 'wanted'), [
@@ -279,13 +286,13 @@ def test_where_nothing_can_be_done_one_sentence_says_why(tmp_path, capsys, make,
 def crossed(values, deviation=1e-6):
     """Return values of units by drives, each with a small error of its own."""
     unit, drive = np.indices(values.shape).reshape(2, -1)
-    return Observed(values.ravel(), np.full(values.size, deviation), unit, drive)
+    return Observations(values.ravel(), np.full(values.size, deviation), unit, drive)
 
 
 def test_balanced_data_give_the_variances_of_an_analysis_of_variance():
     values = np.random.default_rng(5).standard_normal((6, 5))
     values += 3.0 * np.arange(6)[:, None] + 2.0 * np.arange(5)
-    found = Pooled(crossed(values)).components
+    found = PooledValue(crossed(values)).components
     units, drives = values.mean(axis=1), values.mean(axis=0)
     rest = np.sum((values - units[:, None] - drives + values.mean()) ** 2) / 20.0
     for name, wanted in (('units', np.var(units, ddof=1) - rest / 5.0),
@@ -296,8 +303,8 @@ def test_balanced_data_give_the_variances_of_an_analysis_of_variance():
 
 def test_the_interval_of_one_more_unit_is_that_of_student():
     values = np.random.default_rng(6).standard_normal(6)
-    pooled = Pooled(Observed(values, np.full(6, 1e-6), np.arange(6), np.full(6, -1)))
-    found = pooled.estimate(pooled.wanted(units=1.0))
+    pooled = PooledValue(Observations(values, np.full(6, 1e-6), np.arange(6), np.full(6, -1)))
+    found = pooled.estimate(pooled.linear_functions(units=1.0))
     half = stats.t.ppf(0.975, 5) * np.std(values, ddof=1) * np.sqrt(1.0 + 1.0 / 6.0)
     assert found.low[0] == pytest.approx(values.mean() - half, abs=0.03 * half)
     assert found.high[0] == pytest.approx(values.mean() + half, abs=0.03 * half)
@@ -307,9 +314,9 @@ def test_what_the_units_of_a_drive_share_does_not_move_a_unit():
     """The error of the reference of one drive is many times the difference between units."""
     values = np.array([[1.0, 1.1, 1.0, 0.9], [2.0, 1.9, 2.0, 2.1], [3.1, 3.0, 3.0, 2.9],
                        [4.0, 4.0, 4.1, 4.0]]) + np.array([0.0, 0.0, 0.0, 40.0])
-    pooled = Pooled(crossed(values))
+    pooled = PooledValue(crossed(values))
     rows = np.zeros((4, 1))
-    apart = pooled.estimate(pooled.wanted(unit=np.arange(4), fixed=rows)).value
+    apart = pooled.estimate(pooled.linear_functions(unit=np.arange(4), fixed=rows)).value
     assert apart - apart[0] == pytest.approx([0.0, 1.0, 2.0, 3.0], abs=0.1)
 
 
@@ -317,13 +324,14 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     generator = np.random.default_rng(8)
     values = generator.standard_normal((12, 1)) + 0.2 * generator.standard_normal((12, 6))
     date = np.tile(np.arange(6), 12)
-    assert outliers(crossed(values), 'units', 0.01) == []
-    assert changes(crossed(values), date, 0.01) == []
+    assert find_outliers(crossed(values), 'units', 0.01) == []
+    assert find_changes(crossed(values), date, 0.01) == []
     values[3] += 12.0
     values[7, 4:] += 3.0
-    assert [each.number for each in outliers(crossed(values), 'units', 0.01)] == [3]
-    (change,) = changes(crossed(values), date, 0.01)
-    assert (change.unit, change.since) == (7, 4) and change.size == pytest.approx(3.0, abs=0.5)
+    assert [each.group for each in find_outliers(crossed(values), 'units', 0.01)] == [3]
+    (change,) = find_changes(crossed(values), date, 0.01)
+    assert ((change.unit, change.first_date) == (7, 4)
+            and change.size == pytest.approx(3.0, abs=0.5))
 
 
 def test_units_that_drift_apart_have_slopes_of_their_own():
@@ -333,12 +341,13 @@ def test_units_that_drift_apart_have_slopes_of_their_own():
     age, slopes = np.linspace(-1.5, 1.5, 6)[drive], np.linspace(-2.0, 4.0, 8)
     values = (unit + slopes[unit] * age + 10.0 * generator.standard_normal(6)[drive]
               + 0.1 * generator.standard_normal(48))
-    pooled = Pooled(Observed(values, np.full(48, 0.1), unit, drive, age[:, None], 1))
+    pooled = PooledValue(Observations(values, np.full(48, 0.1), unit, drive, age[:, None], 1))
     assert pooled.components['slopes_0'].low < np.std(slopes) < pooled.components['slopes_0'].high
-    apart = pooled.estimate(pooled.wanted(unit=np.arange(8), fixed=np.zeros((8, 2)), part=1))
+    apart = pooled.estimate(
+        pooled.linear_functions(unit=np.arange(8), fixed=np.zeros((8, 2)), part=1))
     assert apart.value - apart.value.mean() == pytest.approx(slopes - 1.0, abs=0.2)
-    whole = pooled.estimate(pooled.wanted(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)),
-                                          part=1))
+    whole = pooled.estimate(
+        pooled.linear_functions(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)), part=1))
     # the mean slope contains that of the references, the differences between units do not
     assert (whole.high - whole.low).min() > 2.0 * (apart.high - apart.low).max()
 
@@ -361,8 +370,8 @@ def records(ramp=0.0, wander=1.0):
 
 @pytest.mark.parametrize(('ramp', 'said'), [(0.0, 'none repeats'), (12.0, 'the type lacks it')])
 def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
-    (found,) = summarized(records(ramp))
-    told = '; '.join(sentences(found))
+    (found,) = summarize_types(records(ramp))
+    told = '; '.join(describe_type(found))
     assert 'bias is an error of the unit' in told
     assert 'time offset is an error of the reference' in told
     assert said in told and 'differs from its type' not in told
@@ -376,15 +385,15 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
              'outliers': lambda unit, drive: drive == 'j',
              'quantization': lambda unit, drive: (unit, drive) in (('1', 'h'), ('3', 'k')),
              'bias': lambda unit, drive: True}
-    (found,) = summarized([{**each, 'diagnosis': {'findings': [
+    (found,) = summarize_types([{**each, 'diagnosis': {'findings': [
         {'effect': name, 'status': 'established'} for name, of in shown.items()
         if of(each['unit'], each['drive'])] + [{'effect': 'dead_zone', 'status': 'suspected'}]}}
         for each in records()])
-    assert {each.effect: (each.owner, each.name, each.logs) for each in counted(found)} == {
+    assert {each.effect: (each.owner, each.name, each.logs) for each in count_effects(found)} == {
         'hysteresis': ('type', '', 20), 'reference_scale': ('type', '', 20),
         'bandwidth': ('unit', '2', 4),
         'outliers': ('drive', 'j', 5), 'quantization': ('', '', 2)}
-    told = '; '.join(sentences(found))
+    told = '; '.join(describe_type(found))
     assert 'hysteresis: established in 20 of 20 logs, of 5 of 5 units: the model' in told
     assert 'reference scale: established in 20 of 20 logs, of 5 of 5 units: the ref' in told
 
@@ -392,26 +401,26 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
 # models
 
 def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
-    (found,) = summarized(records())
-    said = dict(models(found))
+    (found,) = summarize_types(records())
+    said = dict(build_models(found))
     assert set(said) == {'', *'01234'}
     bias = found.values['bias']
-    for name, interval, place in (('', bias.new_unit, 0), ('3', bias.next_log, 3)):
+    for name, interval, place in (('', bias.new_unit, 0), ('3', bias.next_power_on, 3)):
         write_model(tmp_path / 'model.yaml', said[name])
         model = read_model(tmp_path / 'model.yaml')
         values = {term.effect.name: term.values[0] for term in model.terms}
-        assert np.isinf(model.prior[0])  # the logs do not determine the scale
-        spread = model.prior[1]
+        assert np.isinf(model.prior_deviations[0])  # the logs do not determine the scale
+        spread = model.prior_deviations[1]
         assert set(values) == {'bias'} and model.gyro['name'] == 'DOT'
         assert values['bias'] - 1.96 * spread == pytest.approx(interval.low[place])
         assert values['bias'] + 1.96 * spread == pytest.approx(interval.high[place])
-    assert GyroModel(tolerance=Tolerance(bias=1.0)).prior is None
+    assert GyroModel(tolerance=Tolerance(bias=1.0)).prior_deviations is None
 
 
 def test_a_run_of_20_s_is_drawn_to_the_prior_as_far_as_it_leaves_the_values_open():
     """The scale of a gyro whose type is known to 0.1 %, against wheels that slip."""
     time = np.arange(0.0, 20.0, 0.02)
-    motion = from_rates(time, 0.5 * np.sin(2.0 * np.pi * time / 10.0))
+    motion = motion_from_rates(time, 0.5 * np.sin(2.0 * np.pi * time / 10.0))
     noise = 1e-3 * np.random.default_rng(3).standard_normal(len(time))
     rate = 1.01 * motion.rate_at(time) + 0.002 + noise
     alone, drawn = (self_calibrate(time, rate, motion, prior=prior)
@@ -432,12 +441,12 @@ def test_a_diagnosis_by_a_course_takes_what_is_usual_of_a_fleet_as_its_prior():
     log = Log(time=time, output=output, reference_heading=seen)
     given = GyroModel((Term(CATALOGUE['bias'], (0.01,)),), np.zeros((1, 1)),
                       tolerance=Tolerance(bias=5e-4), origin={'fleet': {'logs': 5}})
-    alone, drawn, kept = (diagnose([log], generator, model, kind='course').model
+    alone, drawn, kept = (diagnose([log], generator, model, reference_kind='course').model
                           for model in (None, given, replace(given, origin={})))
     values, deviations = zip(*(_bias(model) for model in (alone, drawn)))
     assert deviations[1] < 5e-4 < deviations[0]
     assert abs(values[1] - 0.0105) < 3.0 * deviations[1]
-    assert drawn.prior is None and drawn.tolerance == Tolerance()
+    assert drawn.prior_deviations is None and drawn.tolerance == Tolerance()
     assert kept.terms == given.terms  # the tolerance of a laboratory is no prior
 
 
@@ -454,7 +463,7 @@ def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
             for each in records()]
     left = {'log': 'x/<b>.csv', 'type': '', 'unit': '', 'drive': '', 'date': '',
             'reason': 'holds no gyro'}
-    text = report(summarized(logs), [*logs, left])
+    text = render_report(summarize_types(logs), [*logs, left])
     assert all(f'<td data-key="&lt;{unit}&gt;">&lt;{unit}&gt;</td>' in text for unit in range(5))
     assert 'href="logs/a.html"' in text and 'holds no gyro' in text and '<b>' not in text
     assert 'class="sortable"' in text and '1 more logs are excluded' in text
@@ -464,7 +473,7 @@ def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
 
 def test_tables_hold_a_row_for_each_log_and_for_each_value_of_a_unit():
     logs = records()
-    content = tables(summarized(logs), logs)
+    content = table_files(summarize_types(logs), logs)
     rows = list(csv.DictReader(content['units.csv'].decode().splitlines()))
     assert [row['unit'] for row in rows if row['value'] == 'bias'] == list('01234')
     assert len(content['logs.csv'].decode().splitlines()) == 1 + len(logs)
@@ -475,7 +484,7 @@ def test_tables_hold_a_row_for_each_log_and_for_each_value_of_a_unit():
 def test_a_cluster_gives_what_processes_give():
     distributed = pytest.importorskip('distributed')
     with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None,
-                                  protocol='tcp') as local, cluster(
+                                  protocol='tcp') as local, cluster_executors(
                                       local.scheduler_address) as create:
-        assert dict(finished(abs, range(-3, 3), 2, create)) == {
+        assert dict(run_tasks(abs, range(-3, 3), 2, create)) == {
             number: abs(number) for number in range(-3, 3)}

@@ -30,20 +30,20 @@ from bias_history import (
 )
 from gyro_calibration.heading.bias_table import (
     BiasTable,
-    BIN,
-    ENTRIES,
+    BIN_WIDTH,
     Entry,
-    INTERVAL,
     Jump,
+    MAX_ENTRIES,
+    MIN_WRITE_INTERVAL,
     model_digest,
     Prior,
-    propagated,
+    propagate_calibration,
     read_bias_table,
     write_bias_table,
 )
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE
-from gyro_calibration.model.gyro_model import GyroModel, same_effects, Term
+from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
@@ -90,7 +90,7 @@ def test_outliers_are_held_back_and_reported():
 def test_an_empty_table_knows_nothing():
     table = BiasTable(MODEL)
     assert table.predict(20.0, 0.0) == (0.0, math.inf)
-    changes = [table.difference(20.0, 20.0 + distance, 0.0) for distance in (0.0, 5.0, 10.0)]
+    changes = [table.bias_difference(20.0, 20.0 + distance, 0.0) for distance in (0.0, 5.0, 10.0)]
     assert [change for change, _ in changes] == [0.0] * 3
     assert (changes[0][1] == 0.0
             and math.sqrt(changes[2][1]) == pytest.approx(10.0 * Prior().coefficient, rel=0.3))
@@ -104,9 +104,9 @@ def test_a_single_run_at_one_temperature_determines_the_offset_alone():
     assert (bias == pytest.approx(1.0 * DEGREE, abs=1e-4 * DEGREE)
             and math.sqrt(variance) < 0.02 * DEGREE)
     for there in (10.0, 21.0, 60.0):
-        change, of_change = table.difference(20.0, there, 1200.0)
-        assert (change == pytest.approx(0.0, abs=1e-12)
-                and of_change == pytest.approx(empty.difference(20.0, there, 1200.0)[1], rel=1e-6))
+        change, of_change = table.bias_difference(20.0, there, 1200.0)
+        assert (change == pytest.approx(0.0, abs=1e-12) and of_change == pytest.approx(
+            empty.bias_difference(20.0, there, 1200.0)[1], rel=1e-6))
 
 
 def test_the_variance_grows_with_the_distance_and_with_the_age():
@@ -148,7 +148,7 @@ def test_a_jump_is_noticed_and_shifts_the_whole_curve():
     table, said, history = jumped()
     assert (['not used' in text for text in said] == [True, True, False, False, False]
             and 'jumped' in said[2] and not any(said[3:]))
-    assert table.held_back == 0
+    assert table.held_back_count == 0
     here, there, time = (history.temperature[3, 20], float(history.temperature[:3].min()),
                          history.time[3, 20])
     bias, variance = table.predict(there, time)
@@ -162,7 +162,8 @@ def test_what_is_off_and_does_not_agree_is_no_jump():
         table.add(before, 0.0, WHITE, 60.0 * number)
     said = [table.add(before, off * DEGREE, WHITE, 300.0 + 60.0 * number)
             for number, off in enumerate([0.5, -0.5, 1.0, 2.0, 0.5, 0.5])]
-    assert all('not used' in text for text in said) and table.held_back == 6 and not table.jumps
+    assert (all('not used' in text for text in said) and table.held_back_count == 6
+            and not table.jumps)
     assert not table.add(before, 0.0, WHITE, 700.0)
     # the two of before no longer count
     assert 'not used' in table.add(before, 0.5 * DEGREE, WHITE, 760.0)
@@ -171,21 +172,22 @@ def test_what_is_off_and_does_not_agree_is_no_jump():
 
 def test_many_jumps_and_runs_leave_a_table_that_works():
     table, generator = BiasTable(MODEL), np.random.default_rng(4)
-    for run in range(ENTRIES + 10):
+    for run in range(MAX_ENTRIES + 10):
         for number in range(4):
             table.add(20.0 + run % 7, 1.0 * DEGREE * run, WHITE, DAY * run + 60.0 * number)
         table.begin_run()
-    assert len(table.entries) == ENTRIES and 0 < len(table.jumps) <= ENTRIES
-    assert np.isfinite(table.predict(generator.uniform(20.0, 27.0), DAY * (ENTRIES + 10))).all()
+    assert len(table.entries) == MAX_ENTRIES and 0 < len(table.jumps) <= MAX_ENTRIES
+    assert np.isfinite(table.predict(generator.uniform(20.0, 27.0), DAY *
+                                     (MAX_ENTRIES + 10))).all()
 
 
 def test_the_oldest_entry_of_the_fullest_bin_is_dropped():
     table = BiasTable(MODEL)
     table.add(-10.0, 0.0, WHITE, 0.0)
-    for run in range(ENTRIES + 20):
+    for run in range(MAX_ENTRIES + 20):
         table.begin_run()
         table.add(20.0, 0.0, WHITE, DAY * run)
-    assert (len(table.entries) == ENTRIES and table.entries[0].temperature == -10.0
+    assert (len(table.entries) == MAX_ENTRIES and table.entries[0].temperature == -10.0
             and table.entries[1].time == 21 * DAY)
 
 
@@ -193,7 +195,7 @@ def test_rests_of_a_run_in_a_bin_become_one_entry_that_knows_its_time():
     table = BiasTable(MODEL)
     for number, temperature in enumerate((20.9, 21.0, 21.1)):
         table.add(temperature, 0.0, WHITE, 60.0 * number)
-    table.add(21.0 + BIN, 0.0, WHITE, 240.0)
+    table.add(21.0 + BIN_WIDTH, 0.0, WHITE, 240.0)
     first, second = table.entries
     assert (first.time == 120.0 and 20.9 < first.temperature < 21.1
             and WHITE / 3.0 < first.variance < WHITE and second.time == 240.0)
@@ -209,11 +211,12 @@ def test_what_no_gyro_has_is_not_used(given):
 
 def test_a_model_that_compensates_leaves_less_inside_its_range_and_as_much_outside():
     known, plain = BiasTable(COMPENSATED), BiasTable(MODEL)
-    inside, outside = known.difference(15.0, 35.0, 0.0)[1], known.difference(40.0, 60.0, 0.0)[1]
-    of_plain = plain.difference(40.0, 60.0, 0.0)[1]
-    assert (math.sqrt(inside / of_plain) == pytest.approx(Prior().compensated, rel=1e-6)
+    inside, outside = (known.bias_difference(15.0, 35.0,
+                                             0.0)[1], known.bias_difference(40.0, 60.0, 0.0)[1])
+    of_plain = plain.bias_difference(40.0, 60.0, 0.0)[1]
+    assert (math.sqrt(inside / of_plain) == pytest.approx(Prior().compensated_share, rel=1e-6)
             and 1.0 < outside / of_plain < 2.5)
-    assert known.difference(-10.0, 5.0, 0.0)[1] > 10.0 * inside
+    assert known.bias_difference(-10.0, 5.0, 0.0)[1] > 10.0 * inside
 
 
 def test_what_is_known_as_well_as_can_be_still_can_be_read(tmp_path):
@@ -249,9 +252,9 @@ def test_a_table_makes_a_carried_calibration_better(carried):
 
 
 def test_a_fresh_calibration_is_used_as_it_is():
-    now = propagated(CALIBRATION, BiasTable(MODEL), 0.0, DAY, 20.0, this_run=True)
-    assert (now.change == 0.0 and not now.sentence
-            and now.variance == pytest.approx(NOISE.wander(10.0, 10.0), rel=1e-6))
+    now = propagate_calibration(CALIBRATION, BiasTable(MODEL), 0.0, DAY, 20.0, this_run=True)
+    assert (now.bias_change == 0.0 and not now.message and now.variance_growth == pytest.approx(
+        NOISE.mean_change_variance(10.0, 10.0), rel=1e-6))
     assert now.calibration.covariance[0] == pytest.approx(CALIBRATION.covariance[0])
 
 
@@ -260,8 +263,8 @@ def test_a_fresh_calibration_is_used_as_it_is():
     (60.0, 45.0, '1 minutes ago at 20.0 degC, and now it is 45.0'),
     (7 * 3600.0, None, '7 hours ago at a temperature that is not known')])
 def test_age_and_distance_are_reported_where_they_matter(age, temperature, words):
-    now = propagated(CALIBRATION, BiasTable(MODEL), age, 500 * DAY, temperature)
-    assert words in now.sentence and now.variance > OWN ** 2 and now.change == 0.0
+    now = propagate_calibration(CALIBRATION, BiasTable(MODEL), age, 500 * DAY, temperature)
+    assert words in now.message and now.variance_growth > OWN ** 2 and now.bias_change == 0.0
 
 
 def test_a_table_moves_a_calibration_to_the_temperature_of_now_and_keeps_its_covariance_one():
@@ -269,18 +272,19 @@ def test_a_table_moves_a_calibration_to_the_temperature_of_now_and_keeps_its_cov
                        lambda temperature: 0.05 * DEGREE * (temperature - 20.0), outliers=0.0)
     table = learned(history, 6)
     high = max(each.temperature for each in table.entries)
-    now = propagated(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0, 6 * DAY, high,
-                     this_run=True)
+    now = propagate_calibration(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0,
+                                6 * DAY, high, this_run=True)
     expected = 0.05 * DEGREE * (high - 20.0)
-    assert (now.change == pytest.approx(expected, rel=0.1)
-            and now.calibration.bias == CALIBRATION.bias + now.change)
+    assert (now.bias_change == pytest.approx(expected, rel=0.1)
+            and now.calibration.bias == CALIBRATION.bias + now.bias_change)
     assert np.linalg.eigvalsh(now.calibration.covariance).min() > 0.0
 
 
 def test_a_calibration_of_which_nobody_knows_how_good_it_is_keeps_no_variance():
-    now = propagated(replace(CALIBRATION, covariance=None), BiasTable(MODEL), DAY, 2 * DAY, 30.0)
-    assert (now.calibration.covariance is None and math.isnan(now.variance)
-            and not now.sentence)
+    now = propagate_calibration(replace(CALIBRATION, covariance=None), BiasTable(MODEL), DAY,
+                                2 * DAY, 30.0)
+    assert (now.calibration.covariance is None and math.isnan(now.variance_growth)
+            and not now.message)
 
 
 def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():
@@ -288,9 +292,10 @@ def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():
     table.add(20.0, 0.0, WHITE, 1000.0)
     table.begin_run()
     stored = replace(CALIBRATION, bias=0.0)
-    near, far = (propagated(stored, table, DAY - made, DAY, 20.0).variance
+    near, far = (propagate_calibration(stored, table, DAY - made, DAY, 20.0).variance_growth
                  for made in (1060.0, 20000.0))
-    alone = propagated(stored, BiasTable(MODEL), DAY - 1060.0, DAY, 20.0).variance
+    alone = (propagate_calibration(stored, BiasTable(MODEL), DAY - 1060.0, DAY,
+                                   20.0).variance_growth)
     assert far < 0.7 * alone < 0.75 * near
 
 
@@ -300,7 +305,7 @@ def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not(
     stored = replace(CALIBRATION, bias=history.bias[3, 20], temperature=temperature)
     unjumped = BiasTable(MODEL, jumps=table.jumps)
     after, before, in_this_run = (
-        propagated(stored, unjumped, age, time, temperature, this_run).variance
+        propagate_calibration(stored, unjumped, age, time, temperature, this_run).variance_growth
         for age, this_run in ((60.0, False), (3 * DAY, False), (3000.0, True)))
     assert min(before, in_this_run) > after + 0.9 * table.jumps[0].variance
 
@@ -393,7 +398,7 @@ def test_the_digest_tells_models_apart_as_same_effects_does():
               replace(COMPENSATED, terms=(Term(CATALOGUE['bias'], (1e-4,)),))]
     for first in models:
         assert [model_digest(first) == model_digest(other) for other in models] == [
-            same_effects(first, other) for other in models]
+            have_same_effects(first, other) for other in models]
     assert model_digest(MODEL) != model_digest(replace(MODEL, gyro={'serial_number': '7'}))
 
 
@@ -408,29 +413,32 @@ def test_a_clock_that_is_set_moves_all_dates_since_the_table_began_and_no_others
         table.add(20.0, 1.0 * DEGREE * (number > 1) + 1.0 * DEGREE * (number > 4), WHITE,
                   begin + 60.0 * number)
     write_bias_table(tmp_path / 'table.yaml', table, begin + 360.0)
-    assert [each.run for each in table.entries] == [0, 1, 2, 3] and not table.due(begin + 1e4)
-    table.clock_was_set(step)
+    assert ([each.run for each in table.entries] == [0, 1, 2, 3]
+            and not table.is_write_due(begin + 1e4))
+    table.shift_clock(step)
     assert [each.time for each in table.entries] == [
         1.6e9, begin + step, begin + step + 60.0, begin + step + 240.0]
     assert [each.time for each in table.jumps] == [1.6e9, begin + step + 120.0]
-    assert table.due(begin + step + 1e4), 'what is in the file has the old dates'
+    assert table.is_write_due(begin + step + 1e4), 'what is in the file has the old dates'
     table.add(20.0, 2.0 * DEGREE, WHITE, begin + step + 420.0)
     assert table.jumps[-1].time == begin + step + 300.0, 'that of what was held back'
-    table.kept(begin + step + 420.0)
-    assert not table.due(begin + step + 1e4)
+    table.mark_written(begin + step + 420.0)
+    assert not table.is_write_due(begin + step + 1e4)
 
 
 def test_it_is_written_seldom_and_only_when_it_learned():
     table = BiasTable(MODEL)
-    assert not table.due(0.0) and not table.due(0.0, ending=True)
+    assert not table.is_write_due(0.0) and not table.is_write_due(0.0, ending=True)
     table.add(20.0, 0.0, WHITE, 0.0)
-    assert table.due(0.0)
-    table.kept(0.0)
-    assert not table.due(INTERVAL, ending=True)
+    assert table.is_write_due(0.0)
+    table.mark_written(0.0)
+    assert not table.is_write_due(MIN_WRITE_INTERVAL, ending=True)
     table.add(25.0, 0.0, WHITE, 60.0)
-    assert [table.due(now) for now in (60.0, INTERVAL - 1.0, INTERVAL, -INTERVAL)] == [
-        False, False, True, True]
-    assert table.due(60.0, ending=True)
+    assert [
+        table.is_write_due(now)
+        for now in (60.0, MIN_WRITE_INTERVAL - 1.0, MIN_WRITE_INTERVAL, -MIN_WRITE_INTERVAL)
+    ] == [False, False, True, True]
+    assert table.is_write_due(60.0, ending=True)
 
 
 def test_rests_that_say_the_same_again_are_not_worth_a_write():
@@ -438,5 +446,5 @@ def test_rests_that_say_the_same_again_are_not_worth_a_write():
     for number in range(2000):
         table.add(20.0, 0.0, WHITE, 10.0 * number)
         if number == 1000:
-            table.kept(10.0 * number)
-    assert not table.due(20000.0, ending=True)
+            table.mark_written(10.0 * number)
+    assert not table.is_write_due(20000.0, ending=True)

@@ -19,7 +19,7 @@ from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
-from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -68,7 +68,7 @@ def by_samples(tracker, time, rate, sensitivity, still, wheels):
         tracker.add(float(time[place]), float(rate[place]), sensitivity[place],
                     None if wheels is None else wheels[place], still)
         found[place] = (tracker.heading, tracker.variance, tracker.rate, tracker.rate_variance,
-                        tracker.resting)
+                        tracker.is_resting)
     return found
 
 
@@ -84,12 +84,14 @@ def test_whole_blocks_at_once_give_the_heading_of_single_samples(with_wheels):
     sensitivity = rate_sensitivity(model, output, corrected, 25.0).T
     still = rate_sensitivity(model, 0.0, 0.0, 25.0)
     wheels = [bool(each) for each in rate != 0.0] if with_wheels else None
-    single, whole = (HeadingTracker(NOISE, covariance(model), Settings(), 0.0) for _ in range(2))
+    single, whole = (HeadingTracker(NOISE, uncertainty_covariance(model), Settings(), 0.0)
+                     for _ in range(2))
     expected = by_samples(single, time, corrected, sensitivity, still, wheels)
     found = whole.follow(time, corrected, sensitivity, wheels, still)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-    assert single.intervals.lost == whole.intervals.lost > 0
-    assert single.outliers == whole.outliers == 1 and single.refused == whole.refused == 1
+    assert single.intervals.lost_samples == whole.intervals.lost_samples > 0
+    assert (single.outlier_count == whole.outlier_count == 1
+            and single.refused_count == whole.refused_count == 1)
 
 
 @pytest.mark.parametrize('calibration', [None, CALIBRATED], ids=['uncalibrated', 'calibrated'])
@@ -108,16 +110,16 @@ def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibrat
     expected = np.empty((len(time), 6))
     for place, (at, degc) in enumerate(zip(time.tolist(), temperature.tolist())):
         if degc == degc:
-            single.take_temperature(at, degc)
+            single.add_temperature(at, degc)
         single.add(at, float(output[place]), NOW + at)
         tracker = single.tracker
         expected[place] = (tracker.heading, tracker.variance, single.rate, tracker.rate_variance,
-                           tracker.resting, single.corrected)
+                           tracker.is_resting, single.corrected_rate)
     found = whole.follow(time, output, NOW, temperature)
     np.testing.assert_allclose(found[:, :6], expected, rtol=1e-11, atol=1e-12)
-    assert single.beginnings == whole.beginnings > 2, 'the tracker begins anew where it is warm'
-    assert single.refused == whole.refused == 1
-    assert single.refused_temperatures == whole.refused_temperatures == 1
+    assert single.restart_count == whole.restart_count > 2, 'a warm tracker begins anew'
+    assert single.refused_count == whole.refused_count == 1
+    assert single.refused_temperature_count == whole.refused_temperature_count == 1
     assert [entry.bias for entry in whole.table.entries] == pytest.approx(
         [entry.bias for entry in single.table.entries], rel=1e-9)
 
@@ -155,7 +157,7 @@ def test_a_log_at_once_takes_a_third_of_the_operations_of_single_samples():
     still = rate_sensitivity(model, 0.0, 0.0, 25.0)
 
     def follower():
-        return HeadingTracker(NOISE, covariance(model), Settings(), 0.0)
+        return HeadingTracker(NOISE, uncertainty_covariance(model), Settings(), 0.0)
     singly = operations(lambda: by_samples(follower(), time, corrected, sensitivity, still, None))
     at_once = operations(lambda: follower().follow(time, corrected, sensitivity, None, still))
     assert at_once < singly / 3.0
@@ -171,7 +173,7 @@ def test_a_single_absurd_sample_is_no_turn(interval):
         tracker.add(index * interval, rate, np.zeros(0))
     error = tracker.heading - 0.3 * 999 * interval
     assert abs(error) < 3.0 * math.sqrt(tracker.variance) and abs(error) < 0.01
-    assert tracker.outliers == tracker.intervals.lost == 1
+    assert tracker.outlier_count == tracker.intervals.lost_samples == 1
 
 
 def test_a_single_absurd_sample_is_no_turn_in_hindsight():
@@ -188,7 +190,7 @@ def test_a_rate_that_jumps_and_stays_is_followed_and_less_sure():
     for index in range(1000):
         tracker.add(index * INTERVAL, 30.0 * (index >= 500), np.zeros(0))
     assert tracker.heading == pytest.approx(30.0 * 4.995, abs=0.01)
-    assert math.sqrt(tracker.variance) > 0.1 and tracker.outliers == 0
+    assert math.sqrt(tracker.variance) > 0.1 and tracker.outlier_count == 0
 
 
 def scores(gyro, kind, minutes, seeds):

@@ -15,19 +15,19 @@ from functools import cache
 import math
 
 from gyro_calibration.calibration.fit_quality import (
-    allow_asymmetry,
-    ASYMMETRY,
-    look_slower,
-    refuse_repeating,
-    refuse_useless,
+    add_asymmetry_variance,
+    ASYMMETRY_DEVIATION,
+    refit_bias_by_windows,
+    refuse_no_improvement,
+    refuse_repeatable_error,
 )
-from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.calibration.self_calibration import calibrate_bias, Limits, self_calibrate
+from gyro_calibration.calibration.likelihood import fit_likelihood, ScaleBiasFit
+from gyro_calibration.calibration.self_calibration import calibrate_bias, RunLimits, self_calibrate
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.compensation import quadratic_form
-from gyro_calibration.model.motion import CALIBRATION, from_headings
+from gyro_calibration.model.motion import CALIBRATION_MOTION, motion_from_headings
 from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
@@ -81,8 +81,9 @@ def calibrated(part, seconds, limits=None, noise=None):
         time, output, heading = part(start)
         run = time <= seconds
         try:
-            fit = self_calibrate(time[run], output[run], from_headings(time[run], heading[run]),
-                                 limits=limits, noise=noise)
+            fit = self_calibrate(time[run], output[run],
+                                 motion_from_headings(time[run], heading[run]), limits=limits,
+                                 noise=noise)
         except DataRefused:
             fit = None
         yield fit, time, output, heading
@@ -101,7 +102,7 @@ def test_a_gyro_that_shakes_on_its_mount_is_not_refused_for_being_louder_than_at
 def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibration_is_refused(
         recording, seconds):
     name, part = recording
-    found = list(calibrated(part, seconds, Limits(repeating=math.inf)))
+    found = list(calibrated(part, seconds, RunLimits(max_repeatable_error=math.inf)))
     errors = [(*follow(*run), rms(integrate(run[1], run[2]) - run[3]))
               for run in found if run[0] is not None]
     for error, deviation, raw in errors:
@@ -146,11 +147,11 @@ def test_one_axis_that_tilts_has_another_bias_about_the_vertical_than_at_rest(da
 
 
 def test_a_heading_that_is_off_again_and_again_is_refused():
-    fit = Fit(0.0, 0.0, np.zeros((2, 2)), repeating=1.6 * DEGREE)
+    fit = ScaleBiasFit(0.0, 0.0, np.zeros((2, 2)), repeatable_error=1.6 * DEGREE)
     with pytest.raises(DataRefused,
                        match=r'heading error is 1\.6 deg rms and repeats.*at most 1 deg.*slowly'):
-        refuse_repeating(fit, 1.0 * DEGREE)
-    refuse_repeating(fit, 2.0 * DEGREE)
+        refuse_repeatable_error(fit, 1.0 * DEGREE)
+    refuse_repeatable_error(fit, 2.0 * DEGREE)
 
 
 def test_a_fast_swing_is_known_better_by_what_is_slow_in_it(data):
@@ -159,9 +160,9 @@ def test_a_fast_swing_is_known_better_by_what_is_slow_in_it(data):
     biases = []
     for part in parts:
         time, output = even_times(log.time[part] - log.time[part][0]), -log.output[part]
-        motion = from_headings(time, log.reference_heading[part])
+        motion = motion_from_headings(time, log.reference_heading[part])
         blocks = fit_likelihood(time, output, motion, 0.25)
-        slow = look_slower(blocks, time, output, motion)
+        slow = refit_bias_by_windows(blocks, time, output, motion)
         assert slow.covariance[1, 1] < 0.1 * blocks.covariance[1, 1]
         biases.append(slow.bias)
     assert np.std(biases) < 3.0 * math.sqrt(slow.covariance[1, 1])
@@ -170,20 +171,23 @@ def test_a_fast_swing_is_known_better_by_what_is_slow_in_it(data):
 def test_noise_that_adds_up_is_not_looked_at_again():
     time = np.arange(2001) * 0.01
     generator, again = np.random.default_rng(1), 0
-    motion = from_headings(time, CALIBRATION.heading_at(time))
+    motion = motion_from_headings(time, CALIBRATION_MOTION.heading_at(time))
     for _ in range(40):
-        output = CALIBRATION.rate_at(time) + 0.5 * DEGREE * generator.standard_normal(len(time))
+        output = (CALIBRATION_MOTION.rate_at(time)
+                  + 0.5 * DEGREE * generator.standard_normal(len(time)))
         fit = fit_likelihood(time, output, motion, 0.1)
-        again += look_slower(fit, time, output, motion) is not fit
+        again += refit_bias_by_windows(fit, time, output, motion) is not fit
     assert again <= 1
 
 
 def test_an_asymmetry_is_inside_what_is_allowed_for():
     time = np.arange(0.0, 20.0, 0.01)
     rate = 300.0 * DEGREE * np.sign(np.sin(2.0 * math.pi * time + 0.1))
-    fit = allow_asymmetry(Fit(0.0, 0.0, np.zeros((2, 2))), rate)
-    assert math.sqrt(fit.covariance[1, 1]) == pytest.approx(ASYMMETRY * 300.0 * DEGREE, rel=0.01)
-    resting = allow_asymmetry(Fit(0.0, 0.0, np.zeros((2, 2))), np.where(time < 10.0, 0.0, rate))
+    fit = add_asymmetry_variance(ScaleBiasFit(0.0, 0.0, np.zeros((2, 2))), rate)
+    assert (math.sqrt(fit.covariance[1, 1]) == pytest.approx(ASYMMETRY_DEVIATION * 300.0 * DEGREE,
+                                                             rel=0.01))
+    resting = add_asymmetry_variance(ScaleBiasFit(0.0, 0.0, np.zeros((2, 2))),
+                                     np.where(time < 10.0, 0.0, rate))
     assert resting.covariance[1, 1] < 0.3 * fit.covariance[1, 1]
 
 
@@ -199,12 +203,12 @@ def test_stamps_that_jitter_become_even_and_others_stay():
 def test_a_gyro_that_samples_unevenly_is_believed_its_stamps():
     generator = np.random.default_rng(3)
     time = np.cumsum(generator.uniform(0.002, 0.018, 2000))
-    output = (1.02 * CALIBRATION.rate_at(time)
+    output = (1.02 * CALIBRATION_MOTION.rate_at(time)
               + 0.05 * DEGREE * generator.standard_normal(len(time)))
     assert np.abs(even_times(time) - time).max() > 0.01
     fit = self_calibrate(
-        time, output, from_headings(np.arange(2001) * 0.01,
-                                    CALIBRATION.heading_at(np.arange(2001) * 0.01)))
+        time, output, motion_from_headings(np.arange(2001) * 0.01,
+                                           CALIBRATION_MOTION.heading_at(np.arange(2001) * 0.01)))
     assert fit.scale_factor_error == pytest.approx(0.02, abs=3e-4)
 
 
@@ -213,7 +217,7 @@ def test_a_calibration_that_makes_a_heading_worse_is_refused_and_a_good_one_is_n
     poor, good = (np.diag([1e-6, (deviation * DEGREE) ** 2]) for deviation in (0.3, 0.01))
     with pytest.raises(DataRefused, match=r'0\.300 deg/s only.*drift by 90 deg.*'
                        r'without the calibration it is 15 deg.*slowly'):
-        refuse_useless(Fit(0.0, 0.05 * DEGREE, poor), limit)
-    refuse_useless(Fit(0.0, 0.0, good), limit)
-    refuse_useless(Fit(0.0, 1.0 * DEGREE, poor), limit)
-    refuse_useless(Fit(0.3, 0.0, poor), limit)
+        refuse_no_improvement(ScaleBiasFit(0.0, 0.05 * DEGREE, poor), limit)
+    refuse_no_improvement(ScaleBiasFit(0.0, 0.0, good), limit)
+    refuse_no_improvement(ScaleBiasFit(0.0, 1.0 * DEGREE, poor), limit)
+    refuse_no_improvement(ScaleBiasFit(0.3, 0.0, poor), limit)

@@ -19,7 +19,7 @@ samples, over many drives.
 import math
 
 from faulty_heading import one
-from gyro_calibration.heading.gaps import Gaps, Intervals
+from gyro_calibration.heading.gaps import GapModel, Intervals
 from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
 from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
@@ -59,12 +59,12 @@ def lost_heading(true, comes, generator, noise=WHITE):
     """Return the heading change by lost samples, rad, and the variance stated for it, rad²."""
     time = np.arange(len(true)) * INTERVAL
     rate = true + simulate_noise(noise, len(true), INTERVAL, generator)
-    gaps, said = Gaps(noise), 0.0
+    gaps, said = GapModel(noise), 0.0
     late, values = time[comes].tolist(), rate[comes].tolist()
     for index in range(1, len(late)):
         gap = gaps.add(late[index] - late[index - 1], values[index], values[index - 1])
         said += gap.variance if gap else 0.0
-    assert gaps.intervals.lost == (~comes).sum()
+    assert gaps.intervals.lost_samples == (~comes).sum()
     return integrate(time[comes], rate[comes])[-1] - integrate(time, rate)[-1], said
 
 
@@ -79,9 +79,9 @@ def test_lost_samples_are_counted_where_stamps_are_even_or_jitter(interval, jitt
     intervals = Intervals()
     for step in np.diff(stamps).tolist():
         intervals.add(step)
-    assert (intervals.lost == (~comes).sum()
-            and intervals.usual == pytest.approx(interval, rel=0.05 + jitter))
-    assert intervals.longest == pytest.approx(np.diff(stamps).max())
+    assert (intervals.lost_samples == (~comes).sum()
+            and intervals.usual_interval == pytest.approx(interval, rel=0.05 + jitter))
+    assert intervals.longest_gap == pytest.approx(np.diff(stamps).max())
 
 
 def test_samples_that_come_late_or_in_bursts_are_not_lost():
@@ -93,13 +93,14 @@ def test_samples_that_come_late_or_in_bursts_are_not_lost():
         intervals = Intervals()
         for step in np.diff(stamps).tolist():
             intervals.add(step)
-        assert intervals.lost == 0
+        assert intervals.lost_samples == 0
 
 
 def test_a_gyro_that_is_set_to_another_rate_loses_samples_for_a_while_only():
     intervals = Intervals()
     lost = [intervals.add(step) for step in [0.01] * 500 + [0.02] * 1000]
-    assert sum(lost[:500]) == 0 < sum(lost) and not any(lost[-800:]) and intervals.usual == 0.02
+    assert (sum(lost[:500]) == 0 < sum(lost) and not any(lost[-800:])
+            and intervals.usual_interval == 0.02)
 
 
 # what they leave unknown
@@ -158,8 +159,8 @@ def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
     resting = found.resting[(time[comes] > 2.0) & (time[comes] < 50.0)]
     assert resting.all() and not found.resting[time[comes] > 51.0].any()
     assert abs(found.heading[-1] - 0.5 * 9.7) < 3.0 * math.sqrt(found.variance[-1]) < 0.5
-    assert (found.intervals.lost == (~comes).sum()
-            and found.intervals.longest == pytest.approx(0.9, abs=0.02))
+    assert (found.intervals.lost_samples == (~comes).sum()
+            and found.intervals.longest_gap == pytest.approx(0.9, abs=0.02))
 
 
 @pytest.mark.parametrize('false_alarms', [0.0, 0.1])
@@ -170,9 +171,9 @@ def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap
     for index in range(400 * (losses + 1)):
         said = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
         assert bool(said) == (gap > 1.0 and index % 400 == 0 < index)
-    assert (tracker.intervals.lost == losses * lost
-            and tracker.intervals.longest == pytest.approx(gap + INTERVAL))
-    assert tracker.intervals.usual == pytest.approx(INTERVAL)
+    assert (tracker.intervals.lost_samples == losses * lost
+            and tracker.intervals.longest_gap == pytest.approx(gap + INTERVAL))
+    assert tracker.intervals.usual_interval == pytest.approx(INTERVAL)
 
 
 def test_a_rest_that_goes_on_after_a_gap_takes_over_nothing_of_a_correction_that_waits():
@@ -184,11 +185,11 @@ def test_a_rest_that_goes_on_after_a_gap_takes_over_nothing_of_a_correction_that
     for index, output in enumerate(outputs.tolist()):
         time = INTERVAL * index + (3.0 if index >= 2000 else 0.0)
         if index == 3000:
-            tracker.set(Settings(maximum_gap=0.9))
+            tracker.configure(Settings(maximum_gap=0.9))
         said = tracker.add(time, output, np.array([-output, -1.0]), None, still)
         assert bool(said) == (index == 2000)
         headings.append(tracker.heading)
-    assert tracker.resting and math.sqrt(tracker.variance) > 1.0 * DEGREE, 'a correction waits'
+    assert tracker.is_resting and math.sqrt(tracker.variance) > 1.0 * DEGREE, 'a correction waits'
     assert np.ptp(headings[1500:]) < 0.4 * DEGREE and np.ptp(headings[2900:]) == 0.0
 
 
@@ -207,7 +208,7 @@ def test_a_log_in_blocks_says_the_same_as_sample_by_sample():
     assert heading == pytest.approx(tracked.heading, abs=1e-9)
     # sample by sample the calibration's part is counted once a second
     assert (deviation ** 2 == pytest.approx(tracked.variance, rel=1e-3)
-            and integrator.intervals.lost == tracked.intervals.lost > 0)
+            and integrator.intervals.lost_samples == tracked.intervals.lost_samples > 0)
     whole = track(np.arange(len(true)) * INTERVAL, true, sensitivity_of(true), WHITE, KNOWN,
                   Settings(false_alarms=0.0))
     assert whole.variance[-1] < 0.7 * tracked.variance[-1]

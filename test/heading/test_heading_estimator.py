@@ -20,22 +20,22 @@ from datetime import datetime, timezone
 import math
 
 from gyro_calibration.heading.assumptions import (
-    assumed,
     Assumptions,
-    sensitive,
     TemperatureCorrection,
-    uncertain,
+    uncertain_covariance,
+    uncertain_sensitivity,
+    with_assumed_covariance,
 )
 from gyro_calibration.heading.bias_table import BiasTable, Entry, Prior
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import XV3500
-from gyro_calibration.ros.health_monitor import changed
+from gyro_calibration.ros.health_monitor import describe_change
 import numpy as np
 import pytest
 
@@ -52,7 +52,7 @@ def begun(model=MODEL, table=None, assumptions=None, settings=None, now=NOW, tem
     live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(),
                             settings or Settings(), 10.0, now)
     if temperature is not None:
-        live.take_temperature(0.0, temperature)
+        live.add_temperature(0.0, temperature)
     return live
 
 
@@ -74,14 +74,14 @@ class Gyro:
         for degc, wandering in zip(known, noise):
             self.time += INTERVAL
             if temperature is not None:
-                self.live.take_temperature(self.time, degc)
+                self.live.add_temperature(self.time, degc)
             offset = self._bias + self._coefficient * (0.0 if temperature is None else degc - 25.0)
             now = self.now + self.time
             self.said.append(self.live.add(self.time, rate + offset + wandering, now,
                                            wheels=wheels))
             self.headings.append(self.live.tracker.heading)
             if round(self.time / INTERVAL) % 25 == 0:
-                self.live.learn(now)
+                self.live.update_table(now)
         self.turned += INTERVAL * (rate * (count - 1) + 0.5 * (rate + self._rate))
         self._rate = rate
         return self
@@ -105,7 +105,7 @@ def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_be
         live = begun(now=begin, temperature=temperature)
         for index in range(100):
             live.add(INTERVAL * index, 0.3, begin)
-        live.clock_was_set(later - begin)
+        live.shift_clock(later - begin)
         headings.append(live.tracker.heading)
         live.add(INTERVAL * 100, 0.3, later)
         deviations.append(live.tracker.bias[1])
@@ -118,31 +118,34 @@ def test_a_clock_that_is_set_by_seconds_lets_the_tracker_go_on():
     live = begun()
     for index in range(10):
         live.add(INTERVAL * index, 0.0, NOW)
-    before = live.beginnings
-    live.clock_was_set(5.0)
+    before = live.restart_count
+    live.shift_clock(5.0)
     live.add(INTERVAL * 10, 0.0, NOW + 5.0)
-    assert live.beginnings == before
+    assert live.restart_count == before
 
 
 def test_what_nobody_calibrated_is_assumed_and_what_is_known_is_left_alone():
     assumptions, temperature = Assumptions(), (0.03 * DEGREE) ** 2
     expected = np.diag([temperature, 0.03 ** 2, (0.5 * DEGREE) ** 2])
-    assert uncertain(assumed(GyroModel(), assumptions), assumptions) == pytest.approx(expected)
+    assert (uncertain_covariance(with_assumed_covariance(GyroModel(), assumptions),
+                                 assumptions) == pytest.approx(expected))
     of_nobody_knows = GyroModel(self_calibration=SelfCalibration(0.01, 0.02))
-    assert uncertain(assumed(of_nobody_knows, assumptions), assumptions) == pytest.approx(expected)
-    assert assumed(of_nobody_knows, assumptions).self_calibration.bias == 0.02
-    assert assumed(MODEL, assumptions) is MODEL
+    assert (uncertain_covariance(with_assumed_covariance(of_nobody_knows, assumptions),
+                                 assumptions) == pytest.approx(expected))
+    assert with_assumed_covariance(of_nobody_knows, assumptions).self_calibration.bias == 0.02
+    assert with_assumed_covariance(MODEL, assumptions) is MODEL
     model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-6]]))
-    assert (assumed(model, assumptions) is model
-            and uncertain(model, assumptions) == pytest.approx(np.diag([1e-6, temperature])))
+    assert (with_assumed_covariance(model, assumptions) is model and uncertain_covariance(
+        model, assumptions) == pytest.approx(np.diag([1e-6, temperature])))
 
 
 def test_sensitivities_have_the_order_of_the_covariance_and_foretell_what_the_rate_changes_by():
     model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-6]]), self_calibration=CALIBRATED)
-    found = sensitive(model, rate_sensitivity(model, 0.5, 0.5, 25.0), distance=3.0)
+    found = uncertain_sensitivity(model, rate_sensitivity(model, 0.5, 0.5, 25.0),
+                                  temperature_distance=3.0)
     assert found == pytest.approx([-1.0, -3.0, -0.5, -1.0])
-    inside = uncertain(model, Assumptions())
-    assert np.delete(np.delete(inside, 1, 0), 1, 1) == pytest.approx(covariance(model))
+    inside = uncertain_covariance(model, Assumptions())
+    assert np.delete(np.delete(inside, 1, 0), 1, 1) == pytest.approx(uncertainty_covariance(model))
 
 
 def test_a_temperature_correction_is_the_table_at_its_steps_and_between_and_does_not_learn():
@@ -150,22 +153,22 @@ def test_a_temperature_correction_is_the_table_at_its_steps_and_between_and_does
                                       for t in (20.0, 25.0, 30.0, 35.0)])
     correction = TemperatureCorrection(table, 25.0, NOW, 0.03 * DEGREE)
     for temperature in (25.0, 25.13, 31.7, 19.9):
-        expected, variance = table.difference(25.0, temperature, NOW)
-        change, distance = correction.at(temperature)
+        expected, variance = table.bias_difference(25.0, temperature, NOW)
+        change, distance = correction.change_at(temperature)
         assert change == pytest.approx(expected, abs=2e-6)
         assert distance == pytest.approx(
             math.copysign(math.sqrt(variance) / (0.03 * DEGREE), temperature - 25.0), abs=0.1)
-    before = correction.at(40.0)
+    before = correction.change_at(40.0)
     for number in range(5):
         table.add(40.0, 0.05, 1e-10, NOW + number)
     anew = TemperatureCorrection(table, 25.0, NOW, 0.03 * DEGREE)
-    assert correction.at(40.0) == before != anew.at(40.0)
+    assert correction.change_at(40.0) == before != anew.change_at(40.0)
 
 
 def test_an_uncalibrated_gyro_learns_its_bias_at_rest_but_not_its_scale():
     gyro = Gyro(begun(GyroModel(noise=NOISE)), bias=0.3 * DEGREE).go(60.0)
     stood = gyro.error
-    assert gyro.live.tracker.resting and abs(stood) < 0.5 * DEGREE
+    assert gyro.live.tracker.is_resting and abs(stood) < 0.5 * DEGREE
     gyro.go(10.0, 0.5).go(5.0)
     assert (abs(gyro.error - stood) < 0.5 * DEGREE
             and gyro.deviation == pytest.approx(5.0 * 0.03, rel=0.1))
@@ -186,7 +189,7 @@ def test_a_drive_with_stops_stands_at_rest_and_stays_inside_what_it_says(seed):
         gyro.go(10.0, rate).go(3.0)
         begin = len(gyro.headings)
         gyro.go(17.0)
-        assert (gyro.live.tracker.resting and np.ptp(gyro.headings[begin:]) == 0.0
+        assert (gyro.live.tracker.is_resting and np.ptp(gyro.headings[begin:]) == 0.0
                 and gyro.live.rate == 0.0)
     assert abs(gyro.error) < 4.0 * gyro.deviation < 4.0 * DEGREE
 
@@ -230,7 +233,7 @@ def test_what_one_run_learned_of_the_temperature_serves_the_next_without_compens
 
 def test_the_tracker_begins_anew_where_it_is_warm_and_the_heading_does_not_jump():
     gyro = heated(begun())
-    assert 3 <= gyro.live.beginnings <= 8
+    assert 3 <= gyro.live.restart_count <= 8
     steps = np.abs(np.diff(gyro.headings))
     assert steps.max() < 0.5 * INTERVAL and abs(gyro.error) < 3.0 * gyro.deviation
 
@@ -240,8 +243,8 @@ def test_a_stored_calibration_is_worth_what_power_age_and_temperature_leave_of_i
     for days, temperature in ((0.0, 25.0), (300.0, 25.0), (0.0, 45.0)):
         live = begun(now=NOW + 86400.0 * days, temperature=temperature)
         live.add(0.1, 0.0, NOW + 86400.0 * days)
-        assert ('let the robot rest, or calibrate again' in live.sentence
-                and f'{temperature:.1f} degC' in live.sentence)
+        assert ('let the robot rest, or calibrate again' in live.calibration_message
+                and f'{temperature:.1f} degC' in live.calibration_message)
         deviations.append(math.sqrt(live.covariance[-1, -1]) / DEGREE)
     on, old, far = deviations
     # deg/s; a gyro that was turned off and on is at least 0.05 deg/s off
@@ -252,14 +255,15 @@ def test_a_stored_calibration_is_worth_what_power_age_and_temperature_leave_of_i
 def test_a_calibration_of_now_is_used_as_it_is(temperature):
     live = begun(temperature=temperature)
     live.add(0.1, 0.0, NOW)
-    live.use(MODEL, NOW)
+    live.use_calibration(MODEL, NOW)
     live.add(0.2, 0.0, NOW)
-    assert math.sqrt(live.covariance[-1, -1]) == pytest.approx(0.01 * DEGREE) and not live.sentence
+    assert (math.sqrt(live.covariance[-1, -1]) == pytest.approx(0.01 * DEGREE)
+            and not live.calibration_message)
 
 
 def test_a_gyro_that_was_without_power_may_have_another_bias():
     gyro = Gyro(begun()).go(40.0)
-    gyro.live.use(MODEL, gyro.now + gyro.time)
+    gyro.live.use_calibration(MODEL, gyro.now + gyro.time)
     heading, variance = gyro.live.tracker.heading, gyro.live.covariance[-1, -1]
     gyro.live.begin_run(gyro.now + gyro.time)
     assert gyro.live.tracker.heading == heading and gyro.live.covariance[-1, -1] > 9.0 * variance
@@ -272,8 +276,8 @@ def test_a_gyro_that_was_without_power_may_have_another_bias():
 def test_a_rest_corrects_an_old_calibration_and_ends_the_remark():
     gyro = Gyro(begun(now=NOW + 1e7), now=NOW + 1e7)
     gyro.go(INTERVAL)
-    assert gyro.live.sentence
-    assert not gyro.go(20.0).live.sentence
+    assert gyro.live.calibration_message
+    assert not gyro.go(20.0).live.calibration_message
 
 
 def test_a_gyro_that_compensates_its_temperature_by_itself_has_no_variance_by_it():
@@ -289,7 +293,7 @@ def test_a_calibrated_model_takes_the_bias_of_earlier_runs():
     table = BiasTable(model, entries=[Entry(25.0, 0.003, 1e-10, NOW - 100.0, 0)])
     live = begun(model, table)
     live.add(0.1, 0.0, NOW)
-    assert (live.used.self_calibration.bias == pytest.approx(0.003, abs=1e-4)
+    assert (live.current_model.self_calibration.bias == pytest.approx(0.003, abs=1e-4)
             and live.model.self_calibration is None)
 
 
@@ -297,13 +301,13 @@ def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_know
     model = GyroModel((Term(BIAS_TEMPERATURE, (25.0, 0.03 * DEGREE)),), np.array([[1e-14]]),
                       noise=NOISE, self_calibration=CALIBRATED)
     gyro = Gyro(begun(model), coefficient=0.03 * DEGREE).go(30.0, temperature=30.0)
-    known, rate = gyro.live.tracker.bias[1], gyro.live.corrected
-    assert not gyro.live.temperature_is_lost
+    known, rate = gyro.live.tracker.bias[1], gyro.live.corrected_rate
+    assert not gyro.live.is_temperature_lost
     gyro.go(1.0, 0.3, temperature=30.0)
     gyro._bias += 5.0 * 0.03 * DEGREE  # it stays as warm as it is, but nobody says so
     before = len(gyro.headings)
     gyro.go(60.0, 0.3, None)
-    assert (gyro.live.temperature_is_lost and gyro.live.tracker.bias[1] > 2.0 * known
+    assert (gyro.live.is_temperature_lost and gyro.live.tracker.bias[1] > 2.0 * known
             and abs(rate) < 2.0 * DEGREE)
     assert np.abs(np.diff(gyro.headings[before:])).max() < 2.0 * 0.3 * INTERVAL
     assert abs(gyro.error) < 3.0 * gyro.deviation
@@ -320,12 +324,12 @@ def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(ter
     gyro = Gyro(begun(model, table), bias=0.0).go(20.0)
     gyro._bias = 0.3 * DEGREE  # it has become warmer by 10 K, but nobody says so
     gyro.go(20.0, temperature=None)
-    assert gyro.live.temperature_is_lost
+    assert gyro.live.is_temperature_lost
     calibration = SelfCalibration(0.0, 0.3 * DEGREE,
                                   ((1e-8, 0.0), (0.0, (0.002 * DEGREE) ** 2)), DATE)
-    gyro.live.use(replace(model, self_calibration=calibration), gyro.now + gyro.time)
+    gyro.live.use_calibration(replace(model, self_calibration=calibration), gyro.now + gyro.time)
     before = gyro.go(4.0, 0.3, None).error
-    assert not gyro.live.tracker.resting
+    assert not gyro.live.tracker.is_resting
     gyro.go(40.0, 0.3, 35.0)
     assert abs(gyro.error - before) < 2.0 * DEGREE, (
         'what the table knows of 10 K makes 12 degrees of it')
@@ -335,10 +339,10 @@ def test_the_longer_no_temperature_came_since_a_calibration_the_less_its_bias_is
     known = []
     for seconds in (1.0, 300.0, 3600.0):
         gyro = Gyro(begun()).go(1.0).go(20.0, temperature=None)
-        gyro.live.use(MODEL, gyro.now + gyro.time)
+        gyro.live.use_calibration(MODEL, gyro.now + gyro.time)
         gyro.live.add(gyro.time + seconds, 0.0, NOW)
         known.append(gyro.live.bias_variance)
-        gyro.live.take_temperature(gyro.time + seconds + INTERVAL, 25.0)
+        gyro.live.add_temperature(gyro.time + seconds + INTERVAL, 25.0)
         gyro.live.add(gyro.time + seconds + INTERVAL, 0.0, NOW)
         assert gyro.live.bias_variance == pytest.approx(known[-1], rel=0.01)
     assert known[0] < 1.1 * (0.01 * DEGREE) ** 2 and 9.0 * known[0] < known[1] < known[2]
@@ -349,7 +353,7 @@ def test_a_temperature_that_comes_no_more_is_less_and_less_known_on_either_side(
     live, known = begun(), []
     for second in range(0, 1200, 60):
         if second < 120:
-            live.take_temperature(second, 25.0 + away * (second > 0))
+            live.add_temperature(second, 25.0 + away * (second > 0))
         live.add(second, 0.0, NOW + second)
         known.append(live.bias_variance)
     assert (np.diff(known) >= 0.0).all() and known[-1] > known[1]
@@ -361,28 +365,30 @@ def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
                for degc in range(15, 45)] if known else []
     live = begun(table=BiasTable(MODEL, entries=entries))
     live.add(0.1, 0.0, NOW)
-    live.use(MODEL, NOW)
-    assert live.claimed.bias == pytest.approx(CALIBRATED.bias)
+    live.use_calibration(MODEL, NOW)
+    assert live.current_calibration.bias == pytest.approx(CALIBRATED.bias)
     for index in range(100):
-        live.take_temperature(INTERVAL * index, 35.0)
+        live.add_temperature(INTERVAL * index, 35.0)
         live.add(INTERVAL * index, 0.4 * DEGREE, NOW)
     warm = replace(CALIBRATED, bias=0.4 * DEGREE, temperature=35.0)
-    assert (not changed(live.claimed, warm, NOISE, 300.0)
-            and changed(CALIBRATED, warm, NOISE, 300.0))
-    assert bool(changed(live.claimed, replace(warm, bias=0.1 * DEGREE), NOISE, 300.0)) == known
+    assert (not describe_change(live.current_calibration, warm, NOISE, 300.0)
+            and describe_change(CALIBRATED, warm, NOISE, 300.0))
+    assert (bool(
+        describe_change(live.current_calibration, replace(warm, bias=0.1 * DEGREE), NOISE,
+                        300.0)) == known)
 
 
 def test_a_model_without_a_calibration_claims_no_scale():
     live = begun(GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE))
     live.add(0.1, 0.0, NOW)
-    assert (live.claimed.covariance == ((math.inf, 0.0), (0.0, pytest.approx(1e-8)))
-            and live.claimed.bias == 0.0)
+    assert (live.current_calibration.covariance == ((math.inf, 0.0), (0.0, pytest.approx(1e-8)))
+            and live.current_calibration.bias == 0.0)
 
 
 def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
     gyro = Gyro(begun()).go(12.0)
     assert not gyro.live.table.entries
-    gyro.live.learn(gyro.now + gyro.time, ending=True)
+    gyro.live.update_table(gyro.now + gyro.time, ending=True)
     assert len(gyro.live.table.entries) == 1
 
 
@@ -400,10 +406,10 @@ def test_a_rest_in_which_the_robot_turned_slowly_does_not_enter_the_table():
 @pytest.mark.parametrize('rested', [12.0, 25.0])
 def test_a_rest_that_is_decided_on_when_it_is_warmer_enters_the_table_all_the_same(rested):
     gyro = Gyro(begun(temperature=25.0), coefficient=0.02 * DEGREE)
-    gyro.live.learn = lambda now: ''
+    gyro.live.update_table = lambda now: ''
     gyro.go(rested).go(5.0, 0.3, temperature=35.0).go(8.0, temperature=35.0).go(
         1.0, 0.3, temperature=35.0)
-    del gyro.live.learn
-    gyro.live.learn(gyro.now + gyro.time)
+    del gyro.live.update_table
+    gyro.live.update_table(gyro.now + gyro.time)
     assert [entry.bias for entry in gyro.live.table.entries] == [
         pytest.approx(0.1 * DEGREE, abs=0.05 * DEGREE)]

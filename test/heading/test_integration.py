@@ -20,10 +20,14 @@ from gyro_calibration.heading.integration import (
     ThresholdFilter,
 )
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import CACHED, DEGREE
-from gyro_calibration.model.compensation import compensate, covariance, rate_sensitivity
+from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, DEGREE
+from gyro_calibration.model.compensation import (
+    compensate,
+    rate_sensitivity,
+    uncertainty_covariance,
+)
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
-from gyro_calibration.model.motion import ROBOT
+from gyro_calibration.model.motion import ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -35,14 +39,14 @@ XV3500 = Noise(2.5 * DEGREE / 60)
 def noisy_robot(seed=0):
     """Return times and rates of the robot with the XV3500's white noise."""
     time = np.arange(16001) * INTERVAL
-    return time, ROBOT.rate_at(time) + simulate_noise(XV3500, len(time), INTERVAL,
-                                                      np.random.default_rng(seed))
+    return time, ROBOT_MOTION.rate_at(time) + simulate_noise(XV3500, len(time), INTERVAL,
+                                                             np.random.default_rng(seed))
 
 
 def filtered_singly(settings, time, rate):
     """Return what the filter makes of samples that come one by one."""
     threshold = ThresholdFilter(settings)
-    return np.array([threshold.filter(*sample) for sample in zip(time.tolist(), rate.tolist())])
+    return np.array([threshold.apply(*sample) for sample in zip(time.tolist(), rate.tolist())])
 
 
 def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
@@ -68,10 +72,11 @@ def test_a_log_in_blocks_of_any_size_is_filtered_and_integrated_as_in_one_piece(
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
     time, rate = noisy_robot()
     sensitivity = rate_sensitivity(model, rate, rate, 25.0)
-    whole = BlockIntegrator(settings, XV3500, covariance(model)).add(time, rate, sensitivity)
+    whole = BlockIntegrator(settings, XV3500,
+                            uncertainty_covariance(model)).add(time, rate, sensitivity)
     cuts = np.sort(np.random.default_rng(0).choice(len(time), 40))
     cuts = [0, 0, 1, 2, *cuts.tolist(), 9000, 9001, 9001, len(time)]
-    integrator = BlockIntegrator(settings, XV3500, covariance(model))
+    integrator = BlockIntegrator(settings, XV3500, uncertainty_covariance(model))
     pieces = [integrator.add(time[i:j], rate[i:j], sensitivity[:, i:j])
               for i, j in zip(sorted(cuts), sorted(cuts)[1:])]
     filtered, heading, deviation = (np.concatenate(parts) for parts in zip(*pieces))
@@ -82,7 +87,7 @@ def test_a_log_in_blocks_of_any_size_is_filtered_and_integrated_as_in_one_piece(
 
 
 def test_a_log_longer_than_the_cache_is_integrated_by_the_trapezoid_rule():
-    generator, count = np.random.default_rng(0), 2 * CACHED + 5
+    generator, count = np.random.default_rng(0), 2 * CACHE_BLOCK_SAMPLES + 5
     time, rate = np.cumsum(generator.uniform(0.001, 0.1, count)), generator.normal(size=count)
     steps = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
     assert np.array_equal(integrate(time, rate, 0.25), np.cumsum([0.25, *steps]))
@@ -129,9 +134,9 @@ def test_the_rest_test_takes_noise_for_rest():
 def test_a_cleared_window_knows_nothing_of_before():
     threshold = ThresholdFilter(Threshold(window=10.0))
     for index in range(50):
-        threshold.filter(index * INTERVAL, 1.0)
+        threshold.apply(index * INTERVAL, 1.0)
     threshold.clear()
-    assert threshold.filter(0.6, 0.001) == 0.0
+    assert threshold.apply(0.6, 0.001) == 0.0
 
 
 S, B = 0.02, 0.002
@@ -142,14 +147,14 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
     """60 s of driving with white noise, and s and b drawn from their covariance."""
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
     time, generator, ends = np.arange(6001) * INTERVAL, np.random.default_rng(0), []
-    true = ROBOT.rate_at(time)
+    true = ROBOT_MOTION.rate_at(time)
     for _ in range(400):
         s, b = np.array([S, B]) + generator.multivariate_normal([0.0, 0.0], UNCERTAIN)
         output = (1 + s) * true + b + simulate_noise(XV3500, len(time), INTERVAL, generator)
         ends.append(integrate(time, compensate(model, output).rate)[[1500, 6000]]
-                    - ROBOT.heading_at(time)[[1500, 6000]])
+                    - ROBOT_MOTION.heading_at(time)[[1500, 6000]])
     sensitivity = rate_sensitivity(model, true, true, np.full(len(time), 25.0))
-    deviation = BlockIntegrator(Threshold(0.0), XV3500, covariance(model)).add(
+    deviation = BlockIntegrator(Threshold(0.0), XV3500, uncertainty_covariance(model)).add(
         time, true, sensitivity)[2]
     ratios = np.mean(np.square(ends), axis=0) / deviation[[1500, 6000]] ** 2
     # To first order in s, 2 % here.
@@ -162,17 +167,18 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
     time, rate = (values[:3000] for values in noisy_robot())
     sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
-    tracker = HeadingTracker(XV3500, covariance(model),
+    tracker = HeadingTracker(XV3500, uncertainty_covariance(model),
                              Settings(false_alarms=0.0, threshold=settings))
     headings = []
     for index in range(len(time)):
         assert not tracker.add(float(time[index]) + offset, float(rate[index]),
                                sensitivity[:, index])
         headings.append(tracker.heading)
-    _, heading, deviation = BlockIntegrator(settings, XV3500, covariance(model)).add(
+    _, heading, deviation = BlockIntegrator(settings, XV3500, uncertainty_covariance(model)).add(
         time, rate, sensitivity)
     # Stamps near 1e9 s have steps of 0.1 us.
     assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
     tracker.finish()
     assert math.sqrt(tracker.variance) == pytest.approx(deviation[-1], rel=1e-3)
-    assert tracker.deleted == pytest.approx(integrate(time, rate)[-1] - heading[-1], abs=1e-5)
+    assert (tracker.deleted_heading == pytest.approx(
+        integrate(time, rate)[-1] - heading[-1], abs=1e-5))

@@ -15,12 +15,12 @@ from dataclasses import replace
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation, rows_of
 from gyro_calibration.logs.log import Log, read_log, write_log
-from gyro_calibration.model.channels import channels_of
-from gyro_calibration.model.compensation import covariance, quadratic_form
+from gyro_calibration.model.channels import channels_from_log
+from gyro_calibration.model.compensation import quadratic_form, uncertainty_covariance
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import respond
+from gyro_calibration.model.motion import simulate_gyro_output
 import numpy as np
 from operations import operations
 import pytest
@@ -49,7 +49,9 @@ def drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
               supply=5.0 + 0.2 * np.sin(TIME / 40.0),
               specific_force=(np.where(TIME > 400.0, 2.0, 0.1)
                               * np.random.default_rng(1).standard_normal(len(TIME))))
-    return replace(log, output=respond(model, TIME, channels_of(log).moving(rate, rate)))
+    return replace(
+        log, output=simulate_gyro_output(model, TIME,
+                                         channels_from_log(log).with_rate(rate, rate)))
 
 
 @pytest.mark.parametrize('size', [1, 700, 5000])
@@ -86,8 +88,9 @@ def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_block
     model = model_of(HEADING | {'scale_factor_error': (0.01,)})
     log = drive(model)
     turned = replace(log, reference_heading=1.5 + log.reference_heading)
-    output = respond(model, TIME,
-                     channels_of(turned).moving(log.reference_rate, log.reference_rate))
+    output = simulate_gyro_output(
+        model, TIME,
+        channels_from_log(turned).with_rate(log.reference_rate, log.reference_rate))
     lost = (TIME > 0.1) & (TIME < 0.2) | (TIME > 100.0) & (TIME < 400.1) | (TIME > 800.0)
     log = replace(turned, output=output,
                   reference_heading=np.where(lost, np.nan, turned.reference_heading))
@@ -101,8 +104,10 @@ def test_before_its_first_value_a_reference_heading_is_that_value():
     model = model_of(HEADING)
     log = drive(model, lambda time: 0.0 * time)
     heading = np.full(len(TIME), 1.5)
-    output = respond(model, TIME, channels_of(replace(log, reference_heading=heading)).moving(
-        log.reference_rate, log.reference_rate))
+    output = simulate_gyro_output(
+        model, TIME,
+        channels_from_log(replace(log, reference_heading=heading)).with_rate(
+            log.reference_rate, log.reference_rate))
     late = replace(log, output=output, reference_heading=np.where(TIME < 5.0, np.nan, heading))
     assert compensate_log(model, late) == pytest.approx(log.reference_rate, abs=1e-10)
 
@@ -128,7 +133,7 @@ def test_the_uncertainty_of_a_time_constant_goes_into_the_rate():
     log = drive(model)
     result, sensitivity = LogCompensation(model).add(log)
     other = compensate_log(model_of({'thermal_lag': (122.0, -2e-3)}), log)
-    deviation = np.sqrt(quadratic_form(covariance(model), sensitivity))
+    deviation = np.sqrt(quadratic_form(uncertainty_covariance(model), sensitivity))
     assert deviation == pytest.approx(np.abs(other - result.rate), rel=0.03, abs=2e-6)
     assert deviation.max() > 1e-4
 
@@ -170,7 +175,9 @@ def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_t
     rate = np.sin(1.3 * time)
     log = Log(output=rate, time=time + 50.0, reference_rate=rate,
               reference_heading=(1.0 - np.cos(1.3 * time)) / 1.3)
-    log = replace(log, output=respond(model, time, channels_of(log).moving(rate, rate)))
+    log = replace(
+        log, output=simulate_gyro_output(model, time,
+                                         channels_from_log(log).with_rate(rate, rate)))
     write_model(tmp_path / 'model.yaml', model)
     write_log(tmp_path / 'log.csv', log)
     code, *_ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',

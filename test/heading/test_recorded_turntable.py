@@ -44,8 +44,8 @@ def test_calibrated_on_20_s_the_heading_follows_the_encoder_for_five_minutes(tmp
     for stamp, rate, turned in zip(time.tolist(), output.tolist(), heading.tolist()):
         nanoseconds = round(1e9 * stamp)
         rig.clock.now = 1000.0 + stamp
-        rig.pipeline.odometry(nanoseconds, math.remainder(turned, math.tau), Velocity())
-        found.append(rig.pipeline.sample(nanoseconds, rate).heading)
+        rig.pipeline.add_odometry(nanoseconds, math.remainder(turned, math.tau), Velocity())
+        found.append(rig.pipeline.add_sample(nanoseconds, rate).heading)
         if rig.session.run and rig.ended:
             answers.append(rig.session.conclude())
     assert answers and answers[0][0], answers

@@ -14,12 +14,17 @@ import math
 
 from chance import RARE, rms_bounds
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.heading.kalman import begin, HEADING, RateIntegral, smoothed
+from gyro_calibration.heading.kalman import (
+    HEADING_INDEX,
+    initial_state,
+    RateIntegral,
+    smooth_states,
+)
 from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
-from gyro_calibration.model.motion import from_rates, turns
+from gyro_calibration.model.motion import constant_rate_motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
@@ -28,7 +33,7 @@ from scipy.stats import poisson
 XV3500 = presets.XV3500.noise
 #: Standard deviations of scale factor error and bias after 20 s of it.
 SCALE, BIAS = 3e-4, 2.5 * DEGREE / 60.0 / math.sqrt(20.0)
-KNOWN = np.diag([SCALE ** 2, BIAS ** 2 + XV3500.floor ** 2])
+KNOWN = np.diag([SCALE ** 2, BIAS ** 2 + XV3500.allan_floor ** 2])
 INTERVAL = 0.05
 
 
@@ -61,10 +66,10 @@ def random_parts(generator, noise, count=14):
                           np.array([-0.3 * generator.standard_normal(), -duration]))
              for duration in durations]
     resting = list(generator.random(count) < 0.5)
-    parts.append(RateIntegral(5.0, 0.0, np.zeros(2), lost=1e-4, unseen=True))
+    parts.append(RateIntegral(5.0, 0.0, np.zeros(2), lost_variance=1e-4, is_unobserved=True))
     half = count // 2
     return (parts[half:] + parts[:half], resting[half:] + [False] + resting[:half],
-            begin(noise, np.diag([1e-4, 1e-5]), age=0.0))
+            initial_state(noise, np.diag([1e-4, 1e-5]), age=0.0))
 
 
 def by_least_squares(start, parts, resting):
@@ -72,16 +77,17 @@ def by_least_squares(start, parts, resting):
     size, count = len(start.mean), len(parts)
     transitions, grown, pushed, measured = [], [], [], []
     for part, rest in zip(parts, resting):
-        step = start.step(part)
-        transition, new = np.diag(step.kept), step.grown.copy()
+        step = start.transition(part)
+        transition, new = np.diag(step.retention), step.process_noise.copy()
         push = np.zeros(size)
         if rest:
-            measured.append((step.seen, part.turned, step.grown[HEADING, HEADING]))
-            new[HEADING] = new[:, HEADING] = 0.0
+            measured.append((step.observation, part.angle, step.process_noise[HEADING_INDEX,
+                                                                              HEADING_INDEX]))
+            new[HEADING_INDEX] = new[:, HEADING_INDEX] = 0.0
         else:
             measured.append(None)
-            transition[HEADING] -= step.seen
-            push[HEADING] = part.turned
+            transition[HEADING_INDEX] -= step.observation
+            push[HEADING_INDEX] = part.angle
         transitions.append(transition)
         grown.append(new)
         pushed.append(push)
@@ -100,8 +106,8 @@ def by_least_squares(start, parts, resting):
     left = np.array([turned for _, (_, turned, _) in known]) - rows @ mean.ravel()
     gain = whole @ rows.T @ np.linalg.inv(
         rows @ whole @ rows.T + np.diag([variance for _, (_, _, variance) in known]))
-    return ((mean.ravel() + gain @ left)[HEADING::size],
-            np.diagonal(whole - gain @ rows @ whole)[HEADING::size])
+    return ((mean.ravel() + gain @ left)[HEADING_INDEX::size],
+            np.diagonal(whole - gain @ rows @ whole)[HEADING_INDEX::size])
 
 
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5), Noise(1e-3)],
@@ -110,32 +116,34 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
     parts, resting, start = random_parts(np.random.default_rng(1), noise)
     states = [start]
     for part, rest in zip(parts, resting):
-        states.append(states[-1].rested(part) if rest else states[-1].moved(part))
+        states.append(states[-1].advance_at_rest(part) if rest else states[-1].propagate(part))
     mean, variance = by_least_squares(start, parts, resting)
-    later = smoothed(states, parts, resting)
-    assert states[-1].mean[HEADING] == pytest.approx(mean[-1], abs=1e-9)
-    assert states[-1].covariance[HEADING, HEADING] == pytest.approx(variance[-1], rel=1e-6)
-    assert [state.mean[HEADING] for state in later] == pytest.approx(mean, abs=1e-8)
-    assert [state.covariance[HEADING, HEADING] for state in later] == pytest.approx(
+    later = smooth_states(states, parts, resting)
+    assert states[-1].mean[HEADING_INDEX] == pytest.approx(mean[-1], abs=1e-9)
+    assert (states[-1].covariance[HEADING_INDEX,
+                                  HEADING_INDEX] == pytest.approx(variance[-1], rel=1e-6))
+    assert [state.mean[HEADING_INDEX] for state in later] == pytest.approx(mean, abs=1e-8)
+    assert [state.covariance[HEADING_INDEX, HEADING_INDEX] for state in later] == pytest.approx(
         variance, rel=1e-4, abs=1e-12)
 
 
 def test_one_long_turn_is_as_many_short_ones():
-    start, part = (begin(XV3500, np.diag([1e-6, 1e-8]), age=100.0),
+    start, part = (initial_state(XV3500, np.diag([1e-6, 1e-8]), age=100.0),
                    RateIntegral(0.7, 0.1, np.array([-0.1, -0.7])))
     by_parts, whole = start, RateIntegral(0.0, 0.0, np.zeros(2))
     for _ in range(30):
-        by_parts, whole = by_parts.moved(part), whole + part
-    assert by_parts.mean == pytest.approx(start.moved(whole).mean, abs=1e-12)
-    assert by_parts.covariance == pytest.approx(start.moved(whole).covariance, rel=1e-6, abs=1e-18)
+        by_parts, whole = by_parts.propagate(part), whole + part
+    assert by_parts.mean == pytest.approx(start.propagate(whole).mean, abs=1e-12)
+    assert (by_parts.covariance == pytest.approx(
+        start.propagate(whole).covariance, rel=1e-6, abs=1e-18))
 
 
 def test_the_variance_after_a_calibration_is_that_of_the_noise():
     """What a log's integration is told by a formula and the filter by its steps is one thing."""
-    state = begin(XV3500, np.diag([0.0, 0.0]), age=0.0)
+    state = initial_state(XV3500, np.diag([0.0, 0.0]), age=0.0)
     for duration in (1.0, 10.0, 100.0, 1000.0):
-        after = state.moved(RateIntegral(duration, 0.0, np.array([0.0, -duration])))
-        assert after.covariance[HEADING, HEADING] == pytest.approx(
+        after = state.propagate(RateIntegral(duration, 0.0, np.array([0.0, -duration])))
+        assert after.covariance[HEADING_INDEX, HEADING_INDEX] == pytest.approx(
             XV3500.heading_variance(duration), rel=1e-6)
 
 
@@ -146,7 +154,7 @@ def test_what_was_no_rest_is_not_deleted():
     tracker = HeadingTracker(XV3500, KNOWN, Settings())
     for index, rate in enumerate([0.0] * 200 + [100.0 * DEGREE] * 20):
         tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]))
-    assert not tracker.resting and abs(tracker.deleted) < 0.01 * DEGREE
+    assert not tracker.is_resting and abs(tracker.deleted_heading) < 0.01 * DEGREE
 
 
 def test_a_rest_determines_the_bias_as_well_as_stated():
@@ -154,7 +162,7 @@ def test_a_rest_determines_the_bias_as_well_as_stated():
     for seed in range(40):
         generator = np.random.default_rng(seed)
         bias = BIAS * generator.standard_normal()
-        time, _, _, rate = gyro(from_rates(np.array([0.0, 40.0]), np.zeros(2)), generator,
+        time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 40.0]), np.zeros(2)), generator,
                                 Noise(XV3500.angle_random_walk), bias=-bias)
         tracker = HeadingTracker(Noise(XV3500.angle_random_walk), KNOWN, Settings())
         for at, value in zip(time, rate):
@@ -171,12 +179,12 @@ def test_rests_of_less_than_two_seconds_between_turns_show_the_bias():
     for seed in range(10):
         generator = np.random.default_rng([6, seed])
         bias = 0.2 * DEGREE * generator.standard_normal()
-        time, _, _, rate = gyro(turns([(1.6, 0), (2, 45)] * 10), generator,
+        time, _, _, rate = gyro(constant_rate_motion([(1.6, 0), (2, 45)] * 10), generator,
                                 Noise(XV3500.angle_random_walk), bias=-bias)
         tracker = HeadingTracker(Noise(XV3500.angle_random_walk), wide, Settings())
         for at, value in zip(time, rate):
             tracker.add(at, value, np.array([-value, -1.0]))
-        found, deviation = tracker.bias_by(np.array([0.0, -1.0]))
+        found, deviation = tracker.bias_for(np.array([0.0, -1.0]))
         deviations.append(deviation)
         errors.append((found - bias) / deviation)
     assert np.median(deviations) < 0.2 * DEGREE / 3.0
@@ -185,7 +193,7 @@ def test_rests_of_less_than_two_seconds_between_turns_show_the_bias():
 
 
 def test_a_rest_that_was_too_short_to_learn_from_still_ends_in_time():
-    motion = turns([(3, 0), (2, 30), (0.9, 0), (2, -30), (0.4, 0), (2, 30), (3, 0)])
+    motion = constant_rate_motion([(3, 0), (2, 30), (0.9, 0), (2, -30), (0.4, 0), (2, 30), (3, 0)])
     time, _, heading, rate = gyro(motion, np.random.default_rng(3))
     found = follow(time, rate)
     assert np.abs(found.heading - heading).max() < 1.0 * DEGREE
@@ -195,8 +203,8 @@ def test_a_rest_that_was_too_short_to_learn_from_still_ends_in_time():
                          ids=['no wheels', 'wheels', 'wheels and slower'])
 def test_a_slow_turn_that_lasts_is_followed(slow, wheels):
     """10 min; without wheels it is detected late, and the bias estimate is corrected then."""
-    motion = from_rates(np.array([0.0, 30.0, 30.1, 630.0]),
-                        np.array([0.0, 0.0, slow, slow]) * DEGREE)
+    motion = motion_from_rates(np.array([0.0, 30.0, 30.1, 630.0]),
+                               np.array([0.0, 0.0, slow, slow]) * DEGREE)
     errors = []
     for seed in range(2):
         time, true, heading, rate = gyro(motion, np.random.default_rng(seed))
@@ -209,7 +217,7 @@ def test_a_slow_turn_that_lasts_is_followed(slow, wheels):
 
 def test_a_bias_that_jumps_by_more_than_the_model_says_does_not_make_the_heading_drift_for_ever():
     """A jump of 0.04 deg/s passes for a turn, after 2 min for bias; the next turn corrects it."""
-    motion = turns([(600, 0), (4, 45), (10, 0)])
+    motion = constant_rate_motion([(600, 0), (4, 45), (10, 0)])
     time, _, heading, rate = gyro(motion, np.random.default_rng(4))
     found = follow(time, rate + 0.04 * DEGREE * (time > 100.0))
     noticed = ~found.resting & (time > 110.0) & (time < 600.0)
@@ -227,22 +235,22 @@ def test_a_slow_turn_until_the_wheels_stop_is_no_bias(after):
         rate = 0.2 * DEGREE if index < turning else 0.0
         tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]),
                     True if index < turning else after)
-    assert tracker.resting and abs(tracker.bias[0]) < 1e-4 * DEGREE
-    assert tracker.finish().mean[HEADING] == pytest.approx(4.0 * DEGREE, abs=0.01 * DEGREE)
+    assert tracker.is_resting and abs(tracker.bias[0]) < 1e-4 * DEGREE
+    assert tracker.finish().mean[HEADING_INDEX] == pytest.approx(4.0 * DEGREE, abs=0.01 * DEGREE)
 
 
 def test_the_slowest_turn_that_is_noticed_is_noticed():
     tracker = HeadingTracker(XV3500, KNOWN, Settings())
-    time, _, _, rate = gyro(from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+    time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 60.0]), np.zeros(2)),
                             np.random.default_rng(6))
     for at, value in zip(time, rate):
         tracker.add(at, value, np.array([-value, -1.0]))
-    slowest = tracker.slowest_noticed
+    slowest = tracker.slowest_detectable_rate
     assert 0.02 * DEGREE < slowest < 0.1 * DEGREE
     generator, noticed = np.random.default_rng(7), 0
     for _ in range(12):
-        motion = from_rates(np.array([0.0, 60.0, 60.1, 200.0]),
-                            np.array([0.0, 0.0, slowest, slowest]))
+        motion = motion_from_rates(np.array([0.0, 60.0, 60.1, 200.0]),
+                                   np.array([0.0, 0.0, slowest, slowest]))
         time, _, _, rate = gyro(motion, generator)
         noticed += not follow(time, rate).resting[time > 70.0].all()
     assert noticed >= 9, noticed
@@ -252,7 +260,7 @@ def test_false_alarms_are_as_rare_as_stated():
     """At a stated rate of 20 in an hour, over an hour of three gyros: a Poisson count."""
     alarms = 0
     for seed in range(3):
-        time, _, _, rate = gyro(from_rates(np.array([0.0, 1200.0]), np.zeros(2)),
+        time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 1200.0]), np.zeros(2)),
                                 np.random.default_rng(seed))
         resting = follow(time, rate, Settings(false_alarms=20.0)).resting
         alarms += int(np.sum(np.diff(resting.astype(int)) == -1))
@@ -260,7 +268,7 @@ def test_false_alarms_are_as_rare_as_stated():
 
 
 def test_noise_that_is_twice_what_the_model_claims_is_learned():
-    motion = turns([(40, 0), (4, 45), (30, 0), (4, -45), (30, 0)])
+    motion = constant_rate_motion([(40, 0), (4, 45), (30, 0), (4, -45), (30, 0)])
     time, true, _, rate = gyro(motion, np.random.default_rng(8),
                                Noise(2.0 * XV3500.angle_random_walk))
     found = follow(time, rate)
@@ -295,8 +303,8 @@ def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(
         wheels = False if index == 2400 else None
         tracker.add(time, rate, np.array([-rate, -1.0]), wheels, still)
         if index in (2399, 2400, 4799):
-            headings.append(tracker.finish().mean[HEADING])
-            variances.append(tracker.variance - tracker._pending ** 2)
+            headings.append(tracker.finish().mean[HEADING_INDEX])
+            variances.append(tracker.variance - tracker._pending_correction ** 2)
     assert headings == pytest.approx([headings[0]] * 3, abs=0.5 * DEGREE), (
         'off by 30 degrees if what rests taught is taken for a turn')
     assert math.sqrt(variances[1] - variances[0]) == pytest.approx(0.05 * 600.0 * DEGREE, rel=0.01)
@@ -345,12 +353,12 @@ def test_a_reset_holds_also_where_a_slow_turn_turns_out_to_be_a_bias():
     tracker, doubtful = HeadingTracker(XV3500, KNOWN, Settings()), []
     for index, rate in enumerate([10.0 * DEGREE] * 200 + [0.0] * 1200 + [0.055 * DEGREE] * 8000):
         tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]))
-        if index > 1400 and not tracker.resting:
+        if index > 1400 and not tracker.is_resting:
             doubtful.append(index)
             if len(doubtful) == 200:
                 tracker.reset()
-    assert len(doubtful) > 200 and tracker.resting
-    assert tracker.finish().mean[HEADING] == pytest.approx(0.0, abs=1.0 * DEGREE)
+    assert len(doubtful) > 200 and tracker.is_resting
+    assert tracker.finish().mean[HEADING_INDEX] == pytest.approx(0.0, abs=1.0 * DEGREE)
 
 
 @pytest.mark.parametrize('false_alarms', [0.0, 0.1])
@@ -368,7 +376,7 @@ def test_another_calibration_and_a_reset_do_not_make_the_heading_jump():
     for index in range(100):
         tracker.add(0.05 * index, 0.5, np.array([-0.5, -1.0]))
     before, variance = tracker.heading, tracker.variance
-    tracker.use(XV3500, np.diag([1e-6, 1e-9]))
+    tracker.use_calibration(XV3500, np.diag([1e-6, 1e-9]))
     assert tracker.heading == before and tracker.variance == pytest.approx(variance)
     tracker.reset()
     assert tracker.heading == 0.0 and tracker.variance == 0.0
@@ -379,10 +387,10 @@ def test_another_calibration_at_rest_keeps_the_correction_that_waits_for_motion(
     tracker = HeadingTracker(XV3500, unknown, Settings())
     for index, rate in enumerate([5.0 * DEGREE] * 400 + [0.0] * 400 + [5.0 * DEGREE] * 400):
         if index == 799:
-            assert (tracker.resting
+            assert (tracker.is_resting
                     and tracker.heading == pytest.approx(106.0 * DEGREE, abs=0.5 * DEGREE))
             before, variance = tracker.heading, tracker.variance
-            tracker.use(XV3500, unknown)
+            tracker.use_calibration(XV3500, unknown)
             assert tracker.heading == before and tracker.variance == pytest.approx(variance)
             bias = 0.0
         tracker.add(INTERVAL * index, rate + bias, np.array([-rate, -1.0]))
@@ -403,7 +411,7 @@ def random_drive(generator, duration):
             else (generator.uniform(2, 8), part * generator.uniform(5, 60)))
         stretches.append((length, rate))
         time += length
-    return turns(stretches)
+    return constant_rate_motion(stretches)
 
 
 @pytest.mark.parametrize('drives', [7, pytest.param(16, marks=pytest.mark.evidence)])

@@ -13,7 +13,14 @@
 import json
 import math
 
-from gyro_calibration.logs.log import Log, log_from_table, LogError, part, read_log, unwrapped
+from gyro_calibration.logs.log import (
+    Log,
+    log_from_table,
+    LogError,
+    read_log,
+    select_rows,
+    unwrap_heading,
+)
 import numpy as np
 import pytest
 
@@ -125,7 +132,7 @@ def test_an_unwrapped_heading_is_the_true_one(run, tmp_path):
     heading = time - 4.0 * np.cos(0.5 * time)
     wrapped = np.angle(np.exp(1j * heading))
     wrapped[::7] = np.nan
-    found, _ = unwrapped(time, wrapped, time, rate)
+    found, _ = unwrap_heading(time, wrapped, time, rate)
     known = np.isfinite(wrapped)
     np.testing.assert_allclose(found[known] - found[1], heading[known] - heading[1], atol=1e-9)
     assert np.isnan(found[~known]).all()
@@ -147,9 +154,9 @@ def test_over_a_gap_the_gyro_says_by_how_many_turns_the_heading_went_on():
     heading = 3.0 * time + 4.0 * np.sin(time)
     wrapped = np.where((time > 5.0) & (time < 8.0), np.nan, np.angle(np.exp(1j * heading)))
     rate = 3.0 + 4.0 * np.cos(time) + 0.02
-    found, by_gyro = unwrapped(time, wrapped, time, rate)
+    found, by_gyro = unwrap_heading(time, wrapped, time, rate)
     known = np.isfinite(wrapped)
-    assert by_gyro and not unwrapped(time[:500], wrapped[:500], time[:500], rate[:500])[1]
+    assert by_gyro and not unwrap_heading(time[:500], wrapped[:500], time[:500], rate[:500])[1]
     np.testing.assert_allclose(found[known] - found[0], heading[known] - heading[0], atol=1e-9)
 
 
@@ -172,7 +179,7 @@ def test_a_table_that_is_no_log_is_refused_in_a_sentence(table, wanted):
 
 def test_a_part_holds_all_columns():
     log = Log(output=np.arange(4.0), time=np.arange(4.0), others={'a': ('w', 'x', 'y', 'z')})
-    found = part(log, log.time > 1.0)
+    found = select_rows(log, log.time > 1.0)
     assert found.output.tolist() == [2.0, 3.0] and found.others == {'a': ('y', 'z')}
 
 

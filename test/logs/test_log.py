@@ -118,7 +118,7 @@ def test_what_is_no_log_is_refused_with_file_row_and_column(tmp_path, text, mess
 
 
 def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.logs.log.GROWN', 1 << 16)
+    monkeypatch.setattr('gyro_calibration.logs.log.MIN_EXPANSION_BYTES', 1 << 16)
     path = tmp_path / 'log.csv.gz'
     with gzip.open(path, 'wb') as file:
         file.write(b'gyro_dps\n')
@@ -128,7 +128,7 @@ def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeyp
 
 
 def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.logs.log._WHOLE', 100)
+    monkeypatch.setattr('gyro_calibration.logs.log._MAX_LOG_VALUES', 100)
     path = written(tmp_path,
                    'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
     with pytest.raises(LogError, match='more than 100 numbers.*; split it'):

@@ -24,7 +24,7 @@ TIMES = [10**18 + 10**7 * number for number in range(300)]
 def recording(tmp_path):
     """Write 300 samples in chunks of 100, each tenth with a temperature."""
     writer = McapWriter()
-    pieces = [writer.begin('a test', 'about', NOTES)]
+    pieces = [writer.pack_header('a test', 'about', NOTES)]
     for number, time in enumerate(TIMES):
         numbers = 37 * [0.0]
         numbers[LAYOUTS[IMU].quantities['rate']] = 0.001 * number
@@ -34,11 +34,11 @@ def recording(tmp_path):
             degc = serialize(time, 'gyro', [20.0 + number, 0.0])
             writer.add('/imu/temperature', TEMPERATURE, DEFINITIONS[TEMPERATURE], time, degc)
         if number % 100 == 99:
-            assert writer.pending > 0
-            pieces.append(writer.chunk())
-    assert writer.pending == 0 and writer.chunk() == b''
+            assert writer.pending_bytes > 0
+            pieces.append(writer.pack_chunk())
+    assert writer.pending_bytes == 0 and writer.pack_chunk() == b''
     path = tmp_path / 'recording.mcap'
-    path.write_bytes(b''.join([*pieces, writer.end()]))
+    path.write_bytes(b''.join([*pieces, writer.pack_summary()]))
     return path
 
 

@@ -20,15 +20,15 @@ import tracemalloc
 
 from gyro_calibration.logs.cdr import (
     IMU,
-    layout_of,
     LAYOUTS,
     MessageError,
     parse,
+    parse_layout,
     serialize,
     TEMPERATURE,
 )
 from gyro_calibration.logs.log import LogError, read_log, write_log
-from gyro_calibration.logs.recording import blocks_of, read_recording, Topics
+from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
 from gyro_calibration.logs.ros_bag import is_recording
 import numpy as np
 import pytest
@@ -166,7 +166,7 @@ def test_a_message_of_any_kind_is_parsed_by_its_definition(make, little):
         message = custom(make.header(12.5, frame), True, np.array(history, np.float32), 'a name',
                          [part(1, 2), part(3, 4)], np.array(history), make.vector(0.25), 31,
                          ['x'], 7.0)
-        layout = layout_of(CUSTOM)
+        layout = parse_layout(CUSTOM)
         stamp, numbers = parse(bytes(make.store.serialize_cdr(
             message, 'my_msgs/msg/Gyro', little_endian=little)), layout)
         assert (stamp, {name: numbers[place] for name, place in layout.quantities.items()}) == (
@@ -180,7 +180,7 @@ def test_a_message_of_any_kind_is_parsed_by_its_definition(make, little):
     'A a\n' + 80 * '=' + '\nMSG: p/A\nA a\n', 'Header header\nfloat64[999999999] a\n'])
 def test_a_definition_of_nothing_or_without_end_is_refused_at_once(definition):
     with pytest.raises(MessageError):
-        layout_of(definition)
+        parse_layout(definition)
 
 
 @pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
@@ -347,7 +347,7 @@ def test_a_chunk_is_never_larger_than_it_says(tmp_path, name):
 
 def test_a_compressed_file_may_not_grow_without_bound(tmp_path, monkeypatch):
     zstandard = pytest.importorskip('zstandard')
-    monkeypatch.setattr('gyro_calibration.logs.ros_bag.LARGEST', 1 << 23)
+    monkeypatch.setattr('gyro_calibration.logs.ros_bag.MAX_RECORD_BYTES', 1 << 23)
     (tmp_path / 'bomb.db3.zstd').write_bytes(zstandard.compress(bytes(1 << 26)))
     with pytest.raises(LogError, match='times its size'):
         read_recording(tmp_path / 'bomb.db3.zstd')
@@ -599,7 +599,7 @@ def test_odometry_that_never_fills_in_its_rate_gives_its_heading(make, tmp_path,
 def test_blocks_of_a_recording_are_the_whole(make, tmp_path, turning):
     time, rate, _ = turning
     log = read_recording(write(tmp_path / 'bag', {'imu': gyro(make, time, rate)}))
-    blocks = list(blocks_of(log, 300))
+    blocks = list(split_blocks(log, 300))
     assert [len(block) for block in blocks] == [300] * 6 + [200]
     np.testing.assert_array_equal(np.concatenate([block.output for block in blocks]), log.output)
 

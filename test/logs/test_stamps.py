@@ -10,9 +10,9 @@
 
 """Stamps that a host gives on arrival: delayed samples are not lost, and lost ones are counted."""
 
-from gyro_calibration.diagnosis.data_quality import inspect
+from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.logs.log import Log
-from gyro_calibration.logs.stamps import number_stamps
+from gyro_calibration.logs.stamps import fit_stamp_grid
 import numpy as np
 import pytest
 
@@ -32,18 +32,18 @@ def stalled(seconds, count=6000, begin=20.0):
 def test_what_waited_at_a_host_is_not_lost(seconds, jitter):
     time = (stalled(seconds)
             + jitter * np.random.default_rng(1).random(6000) * (np.arange(6000) < 2000))
-    stamps = number_stamps(time)
-    assert not stamps.bursts and not stamps.lost.any()
+    stamps = fit_stamp_grid(time)
+    assert not stamps.has_bursts and not stamps.lost_after.any()
     noise = 1e-3 * np.random.default_rng(2).standard_normal(6000)
-    assert not inspect(Log(output=noise, time=time)).findings
+    assert not inspect_record(Log(output=noise, time=time)).findings
 
 
 def test_what_is_lost_while_a_host_stands_is_counted():
     time = np.delete(stalled(0.3), np.arange(2015, 2027))
-    assert number_stamps(time).lost.sum() == 12
+    assert fit_stamp_grid(time).lost_after.sum() == 12
 
 
 @pytest.mark.parametrize('missing', [1, 5, 40])
 def test_samples_are_lost_before_and_after_a_stall(missing):
     places = np.concatenate([np.arange(500, 500 + missing), np.arange(4000, 4000 + missing)])
-    assert number_stamps(np.delete(stalled(0.3), places)).lost.sum() == 2 * missing
+    assert fit_stamp_grid(np.delete(stalled(0.3), places)).lost_after.sum() == 2 * missing

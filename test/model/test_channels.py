@@ -11,7 +11,7 @@
 """Channels with memory: against exact responses, and equal for a stream, a log, and its blocks."""
 
 from gyro_calibration.logs.log import Log
-from gyro_calibration.model.channels import channels_of, History
+from gyro_calibration.model.channels import ChannelHistory, channels_from_log
 import numpy as np
 from operations import operations
 import pytest
@@ -45,8 +45,9 @@ def ramp_response(time, time_constant):
 @pytest.mark.parametrize('time', [np.arange(2000) * 0.1, UNEVEN - UNEVEN[0]],
                          ids=['even', 'uneven'])
 def test_a_ramp_is_answered_exactly_whatever_the_stamps(time, time_constant):
-    lagged = channels_of(Log(output=time, time=time + 7.0, temperature=20.0 + 0.5 * time)).lagged(
-        'temperature', time_constant)
+    lagged = channels_from_log(Log(output=time, time=time + 7.0,
+                                   temperature=20.0 + 0.5 * time)).lagged(
+                                       'temperature', time_constant)
     assert lagged == pytest.approx(20.0 + 0.5 * ramp_response(time, time_constant),
                                    rel=0.0, abs=1e-10)
 
@@ -57,13 +58,14 @@ def test_a_corner_between_uneven_stamps_is_answered_exactly():
     temperature = np.minimum(time, corner)
     expected = ramp_response(time, 40.0) - np.where(
         time > corner, ramp_response(np.maximum(time - corner, 0.0), 40.0), 0.0)
-    lagged = channels_of(Log(output=time, time=time, temperature=temperature)).lagged(
+    lagged = channels_from_log(Log(output=time, time=time, temperature=temperature)).lagged(
         'temperature', 40.0)
     assert lagged == pytest.approx(expected, rel=0.0, abs=1e-10)
 
 
 def test_a_lag_starts_in_the_first_value_and_a_constant_stays():
-    channels = channels_of(Log(output=UNEVEN, time=UNEVEN, temperature=np.full(len(UNEVEN), 31.7)))
+    channels = channels_from_log(
+        Log(output=UNEVEN, time=UNEVEN, temperature=np.full(len(UNEVEN), 31.7)))
     assert (set(channels.lagged('temperature', 50.0)) == {31.7}
             and not channels.heating(10.0, 0.0).any())
 
@@ -71,8 +73,8 @@ def test_a_lag_starts_in_the_first_value_and_a_constant_stays():
 def test_vibration_is_the_mean_square_about_the_mean():
     time = np.arange(0.0, 3000.0, 0.01)
     force = 9.81 + 0.3 * np.random.default_rng(2).standard_normal(len(time))
-    vibration = channels_of(Log(output=time, time=time,
-                                specific_force=force)).lagged('vibration', 1.0)[1000:]
+    vibration = channels_from_log(Log(output=time, time=time,
+                                      specific_force=force)).lagged('vibration', 1.0)[1000:]
     kept = 1.0 - 0.01 / 2.0  # of a white deviation; the mean over 1 s takes the rest
     assert vibration.mean() == pytest.approx(0.09 * kept, rel=0.01)
 
@@ -82,64 +84,65 @@ def test_the_branch_turns_soon_after_the_temperature_does_and_not_by_noise(noise
     time = np.arange(0.0, 1800.0, 0.05)
     turned = np.abs((time / 300.0) % 2.0 - 1.0)
     temperature = 40.0 - 6.0 * turned + noise * np.random.default_rng(3).standard_normal(len(time))
-    branch = channels_of(Log(output=time, time=time, temperature=temperature)).heating(10.0, 1e-3)
+    branch = channels_from_log(Log(output=time, time=time,
+                                   temperature=temperature)).heating(10.0, 1e-3)
     settled = (time % 300.0) > 20.0
     assert branch[settled].tolist() == np.where((time // 300.0) % 2.0, -1.0, 1.0)[settled].tolist()
 
 
 def test_a_constant_temperature_has_no_branch_and_afterwards_it_keeps_the_last_one():
     time = np.arange(0.0, 600.0, 0.1)
-    branch = channels_of(Log(output=time, time=time,
-                             temperature=np.clip(time, 200.0, 300.0))).heating(10.0, 1e-3)
+    branch = channels_from_log(Log(output=time, time=time,
+                                   temperature=np.clip(time, 200.0, 300.0))).heating(10.0, 1e-3)
     assert not branch[time < 200.0].any() and branch[time > 210.0].min() == 1.0
 
 
 @pytest.mark.parametrize('cuts', [[1, 2, 500, 501, 2999], list(range(1, 3000))],
                          ids=['blocks', 'sample by sample'])
 def test_blocks_of_a_log_say_what_the_whole_says(cuts):
-    whole = everything(History().follow(UNEVEN, *surroundings(UNEVEN)))
-    history, pieces = History(), []
+    whole = everything(ChannelHistory().update(UNEVEN, *surroundings(UNEVEN)))
+    history, pieces = ChannelHistory(), []
     for block in np.split(np.arange(len(UNEVEN)), cuts):
-        pieces.append(everything(history.follow(UNEVEN[block],
+        pieces.append(everything(history.update(UNEVEN[block],
                                                 *(each[block] for each in surroundings(UNEVEN)))))
     assert np.hstack(pieces) == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
 def test_a_lag_goes_on_in_blocks_that_do_not_use_it():
-    history, (temperature, *_) = History(), surroundings(UNEVEN)
-    history.follow(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
-    history.follow(UNEVEN[10:2000], temperature[10:2000])
-    last = history.follow(UNEVEN[2000:], temperature[2000:]).lagged('temperature', 20.0)
+    history, (temperature, *_) = ChannelHistory(), surroundings(UNEVEN)
+    history.update(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
+    history.update(UNEVEN[10:2000], temperature[10:2000])
+    last = history.update(UNEVEN[2000:], temperature[2000:]).lagged('temperature', 20.0)
     assert last == pytest.approx(
-        History().follow(UNEVEN, temperature).lagged('temperature', 20.0)[2000:], rel=1e-12)
+        ChannelHistory().update(UNEVEN, temperature).lagged('temperature', 20.0)[2000:], rel=1e-12)
 
 
 def test_while_no_temperature_is_known_one_stands_in_and_nothing_is_lagging():
-    history = History(stand_in=33.0)
-    early = history.follow(0.0)
+    history = ChannelHistory(default_temperature=33.0)
+    early = history.update(0.0)
     assert early.temperature == early.lagged('temperature', 100.0) == 33.0
-    first = history.follow(1.0, 10.0)
+    first = history.update(1.0, 10.0)
     assert first.temperature == first.lagged('temperature', 100.0) == 10.0, (
         'a temperature that comes is no change of temperature')
-    ahead = history.follow(2.0, 12.0).lagged('temperature', 100.0) - 12.0
-    lost = history.follow(102.0)
+    ahead = history.update(2.0, 12.0).lagged('temperature', 100.0) - 12.0
+    lost = history.update(102.0)
     assert (lost.temperature == 33.0
             and lost.lagged('temperature', 100.0) - 33.0 == pytest.approx(ahead / np.e, rel=1e-12))
 
 
 def test_beyond_its_bounds_the_nearest_temperature_is_followed():
-    history = History(low=20.0, high=30.0)
-    assert history.follow(0.0, 5.0).lagged('temperature', 10.0) == 20.0
-    assert history.follow(1.0, 10.0).lagged('temperature', 10.0) == 20.0
+    history = ChannelHistory(min_temperature=20.0, max_temperature=30.0)
+    assert history.update(0.0, 5.0).lagged('temperature', 10.0) == 20.0
+    assert history.update(1.0, 10.0).lagged('temperature', 10.0) == 20.0
 
 
 def test_what_is_not_known_says_so():
-    channels = channels_of(Log(output=UNEVEN))
+    channels = channels_from_log(Log(output=UNEVEN))
     assert (channels.supply is None and not channels.time.any()
             and channels.lagged('temperature', 10.0).tolist() == [25.0] * len(UNEVEN))
 
 
 def test_a_lag_of_a_log_loops_over_no_samples():
     time = np.cumsum(np.random.default_rng(4).uniform(0.005, 0.015, 10 ** 5))
-    channels = channels_of(Log(output=time, time=time, temperature=time))
+    channels = channels_from_log(Log(output=time, time=time, temperature=time))
     assert operations(lambda: channels.lagged('temperature', 120.0)) < 0.1 * len(time)

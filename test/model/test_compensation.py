@@ -14,12 +14,12 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
-from gyro_calibration.logs.log import CACHED, DEGREE
+from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, DEGREE
 from gyro_calibration.model.compensation import (
     compensate,
-    covariance,
     quadratic_form,
     rate_sensitivity,
+    uncertainty_covariance,
 )
 from gyro_calibration.model.effects import (
     BIAS,
@@ -43,8 +43,8 @@ MODEL = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (0.001,))), np.
 def test_the_self_calibration_comes_after_the_model():
     """Eq. 13 of Ojeda et al., then eq. 3 of Hong and Park."""
     done = compensate(replace(MODEL, self_calibration=CALIBRATION), 0.5)
-    assert done.modelled == pytest.approx((0.5 - 0.01) / 1.001, abs=1e-12)
-    assert done.rate == pytest.approx((done.modelled - 0.002) / 1.04, abs=1e-12)
+    assert done.model_rate == pytest.approx((0.5 - 0.01) / 1.001, abs=1e-12)
+    assert done.rate == pytest.approx((done.model_rate - 0.002) / 1.04, abs=1e-12)
 
 
 def test_beyond_the_calibrated_temperatures_the_correction_is_extrapolated_and_then_held():
@@ -77,16 +77,16 @@ def test_outputs_beyond_the_calibrated_rates_are_marked():
 def test_a_log_longer_than_the_cache_is_compensated_as_its_pieces(calibration, given):
     model = GyroModel((WARM, *MODEL.terms), None, (-0.5, 0.5), (10.0, 40.0),
                       self_calibration=calibration)
-    count, generator = 2 * CACHED + 77, np.random.default_rng(0)
+    count, generator = 2 * CACHE_BLOCK_SAMPLES + 77, np.random.default_rng(0)
     output = generator.normal(size=count)
     temperature = {'all': generator.uniform(20.0, 30.0, count),
                    'clipped': generator.uniform(0.0, 50.0, count)}.get(given, given)
     whole = compensate(model, output, temperature)
-    cuts = [0, 1, 500, CACHED + 3, count]
+    cuts = [0, 1, 500, CACHE_BLOCK_SAMPLES + 3, count]
     for first, end in zip(cuts, cuts[1:]):
         here = temperature[first:end] if isinstance(temperature, np.ndarray) else temperature
         piece = compensate(model, output[first:end], here)
-        for name in ('modelled', 'rate', 'temperature', 'temperature_clipped', 'beyond_range'):
+        for name in ('model_rate', 'rate', 'temperature', 'temperature_clipped', 'beyond_range'):
             of_whole = np.broadcast_to(getattr(whole, name), count)[first:end]
             assert np.array_equal(of_whole,
                                   np.broadcast_to(getattr(piece, name), end - first)), name
@@ -98,7 +98,7 @@ def test_the_shorter_way_to_a_polynomial_is_the_sum_of_its_columns(orders):
     shapes, coefficients = (0.1, 1.7, 35.0, 10.0), generator.normal(size=len(effect.coefficients))
     channels = Channels(np.zeros(50), generator.uniform(-2.0, 2.0, 50),
                         generator.uniform(10.0, 50.0, 50))
-    error = effect.adding((*shapes, *coefficients.tolist()))(channels)
+    error = effect.error_function((*shapes, *coefficients.tolist()))(channels)
     assert error == pytest.approx(coefficients @ np.array(effect.columns(channels, *shapes)),
                                   rel=1e-12, abs=1e-13)
 
@@ -121,7 +121,7 @@ def with_values(model, change):
     change, terms = list(change), []
     for term in model.terms:
         values = list(term.values)
-        for place in term.fitted:
+        for place in term.fitted_indices:
             values[place] += change.pop(0)
         terms.append(Term(term.effect, tuple(values)))
     if model.self_calibration is None:
@@ -142,7 +142,7 @@ def test_the_sensitivity_is_the_derivative_of_the_rate(name, calibration):
     output = model.output(rate, temperature)
     base = compensate(model, output, temperature).rate
     differences = [(compensate(with_values(model, row), output, temperature).rate - base) / step
-                   for row in step * np.eye(len(covariance(model)))]
+                   for row in step * np.eye(len(uncertainty_covariance(model)))]
     assert rate_sensitivity(model, output, base, temperature) == pytest.approx(
         np.array(differences), rel=1e-4, abs=1e-6)
 
@@ -159,7 +159,7 @@ def test_the_standard_deviations_are_those_of_models_drawn_from_the_covariance(
     time = np.arange(101) * 0.1
     rate, temperature = 1.5 * np.sin(time), 25.0 + time
     output = model.output(rate, temperature)
-    whole = covariance(model)
+    whole = uncertainty_covariance(model)
     rates = np.array(
         [compensate(with_values(model, drawn), output, temperature).rate
          for drawn in generator.multivariate_normal(np.zeros(len(whole)), whole, runs)])
@@ -179,7 +179,8 @@ def test_what_a_sine_cannot_answer_has_a_large_but_finite_deviation():
     model = UNCERTAIN['sine response']
     output, degc = np.linspace(-3.0, 3.0, 101), np.full(101, 25.0)
     rate = compensate(model, output).rate
-    variance = quadratic_form(covariance(model), rate_sensitivity(model, output, rate, degc))
+    variance = quadratic_form(uncertainty_covariance(model),
+                              rate_sensitivity(model, output, rate, degc))
     assert np.isfinite(variance).all() and variance[0] > 25.0 * variance[50]
 
 
@@ -189,7 +190,7 @@ TOLERANT = replace(MODEL, tolerance=Tolerance(0.001, 0.0002, 1e-4, 2e-5, 0.003))
 def test_the_standard_deviation_grows_outside_of_what_was_calibrated():
     def deviation(model, rate, degc):
         done = compensate(model, rate, degc)
-        return math.sqrt(quadratic_form(covariance(model), rate_sensitivity(
+        return math.sqrt(quadratic_form(uncertainty_covariance(model), rate_sensitivity(
             model, rate, done.rate, done.temperature)))
 
     inside = deviation(TOLERANT, 0.0, 25.0)
@@ -209,8 +210,8 @@ def test_the_standard_deviation_grows_outside_of_what_was_calibrated():
 
 
 def test_the_covariance_has_the_order_of_the_sensitivity():
-    whole = covariance(replace(MODEL, self_calibration=CALIBRATION))
+    whole = uncertainty_covariance(replace(MODEL, self_calibration=CALIBRATION))
     assert whole.shape == (4, 4) and np.diag(whole).tolist() == [1e-6, 4e-6, 1e-6, 1e-6]
     assert whole[2, 3] == 1e-8 and not whole[:2, 2:].any()
-    assert covariance(GyroModel()).shape == (0, 0)
+    assert uncertainty_covariance(GyroModel()).shape == (0, 0)
     assert rate_sensitivity(GyroModel(), np.zeros(3), np.zeros(3), np.zeros(3)).shape == (0, 3)

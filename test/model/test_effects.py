@@ -15,7 +15,7 @@ import itertools
 import math
 
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.channels import History
+from gyro_calibration.model.channels import ChannelHistory
 from gyro_calibration.model.compensation import compensate, rate_sensitivity
 from gyro_calibration.model.effects import (
     CATALOGUE,
@@ -25,7 +25,7 @@ from gyro_calibration.model.effects import (
     rate_temperature_polynomial,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import respond
+from gyro_calibration.model.motion import simulate_gyro_output
 from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
@@ -86,7 +86,7 @@ def around(time):
 
 def test_every_effect_is_recovered_or_declared_lost():
     recovered = {name.partition(',')[0] for name in GYROS}
-    assert (recovered | {effect.name for effect in CATALOGUE.values() if effect.undone}
+    assert (recovered | {effect.name for effect in CATALOGUE.values() if effect.not_compensated}
             >= set(CATALOGUE) | {'rate_temperature_polynomial'})
 
 
@@ -95,14 +95,14 @@ def test_a_simulated_gyro_is_compensated_to_the_true_rate_as_a_log_and_sample_by
     model, time = gyro(name), np.linspace(0.0, 40.0, 401)
     rate = np.linspace(-2.0, 2.0, 401)  # the sine response goes up to k w = 1
     columns = {'time': time, **around(time)}
-    surroundings = model.history().follow(**columns)
-    output = respond(model, time, surroundings.moving(rate, rate))
+    surroundings = model.start_history().update(**columns)
+    output = simulate_gyro_output(model, time, surroundings.with_rate(rate, rate))
     assert np.abs(output - rate).max() > 1e-4, 'this gyro has no error, so nothing is shown'
     at_once = compensate(model, output, surroundings.temperature, surroundings).rate
     assert np.abs(at_once - rate).max() < 1e-9
-    history, singly = model.history(), []
+    history, singly = model.start_history(), []
     for each, *sample in zip(output.tolist(), *(values.tolist() for values in columns.values())):
-        now = history.follow(**dict(zip(columns, sample)))
+        now = history.update(**dict(zip(columns, sample)))
         singly.append(compensate(model, each, now.temperature, now).rate)
     assert singly == pytest.approx(at_once, rel=0.0, abs=1e-13)
 
@@ -112,8 +112,9 @@ def distorted(name, *values, rate_of=lambda time: np.sin(1.7 * time), generator=
     model, time = (GyroModel((Term(CATALOGUE[name], values),), noise=Noise(1e-4)),
                    np.arange(0.0, 10.0, 1e-3))
     rate = rate_of(time)
-    return model, time, rate, respond(model, time, History().follow(time).moving(rate, rate),
-                                      generator)
+    return model, time, rate, simulate_gyro_output(
+        model, time,
+        ChannelHistory().update(time).with_rate(rate, rate), generator)
 
 
 @pytest.mark.parametrize('values', [
@@ -122,7 +123,7 @@ def distorted(name, *values, rate_of=lambda time: np.sin(1.7 * time), generator=
 def test_moving_the_stamps_undoes_a_delay_and_a_wrong_clock_in_the_order_of_the_model(values):
     model, time = (GyroModel(tuple(Term(CATALOGUE[name], (value,))
                                    for name, value in values.items())), np.arange(0.0, 10.0, 1e-3))
-    output = model.distorted('rate', np.sin(1.7 * time), time)
+    output = model.distort('rate', np.sin(1.7 * time), time)
     assert np.abs(output - np.sin(1.7 * time)).max() > 0.01
     inside = (time > 1.0) & (time < 8.0)
     assert output[inside] == pytest.approx(np.sin(1.7 * model.true_time(time[inside])), abs=1e-6)
@@ -150,7 +151,7 @@ def test_saturation_and_quantization_come_after_the_noise():
 
 def test_what_cannot_be_undone_is_passed_over():
     for name, effect in CATALOGUE.items():
-        if effect.undone:
+        if effect.not_compensated:
             model, _, _, output = distorted(name, *(
                 0.01 if each.default is None else each.default for each in effect.parameters))
             assert model.rate(output, 25.0).tolist() == output.tolist(), name
@@ -161,7 +162,7 @@ def test_what_cannot_be_undone_is_passed_over():
 def test_columns_have_the_shape_of_the_rates():
     rate = np.linspace(-1.0, 1.0, 5)
     for effect in CATALOGUE.values():
-        shapes = [0.5] * len(effect.shapes)
+        shapes = [0.5] * len(effect.nonlinear_parameters)
         columns = effect.columns(Channels(rate, rate, 25.0), *shapes)
         assert [np.shape(each) for each in columns] == [(5,)] * len(effect.coefficients), effect
         for index, w in enumerate(rate.tolist()):
@@ -177,12 +178,15 @@ def test_an_effect_depends_on_no_other_channels_than_it_names():
     other = dict.fromkeys(base, 1.7) | {'lagged': lambda channel, time_constant: 3.0,
                                         'heating': lambda filter_time, threshold: -1.0}
     for effect in effects:
-        shapes = [shape.default if shape.default is not None else 0.5 for shape in effect.shapes]
+        shapes = [
+            shape.default if shape.default is not None else 0.5
+            for shape in effect.nonlinear_parameters
+        ]
         for channel in base:
             here, there = (
                 np.array(effect.columns(Channels(**(base | {channel: of[channel]})), *shapes))
                 for of in (base, other))
-            assert (channel in effect.looks_at) or np.array_equal(here, there), (
+            assert (channel in effect.inputs) or np.array_equal(here, there), (
                 effect.name, channel)
 
 

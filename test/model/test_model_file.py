@@ -150,7 +150,7 @@ def test_effects_with_a_past_are_written_by_hand(tmp_path):
     model = read(tmp_path, 'effects: {thermal_lag: {thermal_lag: 1e-4, time_constant: 120}, '
                            'thermal_hysteresis: {thermal_hysteresis: -2E-5}}')
     assert [term.values for term in model.terms] == [(120.0, 1e-4), (10.0, 1e-3, -2e-5)]
-    assert model.looks_around and not read(tmp_path, 'effects: {bias: {bias: 1.0}}').looks_around
+    assert model.needs_history and not read(tmp_path, 'effects: {bias: {bias: 1.0}}').needs_history
 
 
 def test_every_effect_survives_its_file(tmp_path):

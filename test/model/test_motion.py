@@ -13,22 +13,22 @@
 
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.motion import (
-    CALIBRATION,
-    from_headings,
+    CALIBRATION_MOTION,
+    constant_rate_motion,
+    motion_from_headings,
     MotionError,
-    NAMED,
+    NAMED_MOTIONS,
     read_motion,
-    ROBOT,
-    turns,
+    ROBOT_MOTION,
 )
 import numpy as np
 import pytest
 
 
-@pytest.mark.parametrize('name', NAMED)
+@pytest.mark.parametrize('name', NAMED_MOTIONS)
 def test_the_heading_is_the_integral_of_the_rate(name):
     """Simpson's rule is exact for a piecewise linear rate with corners at multiples of 0.1 s."""
-    motion = NAMED[name]
+    motion = NAMED_MOTIONS[name]
     time = np.arange(round(motion.duration * 20) + 1) / 20.0
     middle = motion.rate_at((time[1:] + time[:-1]) / 2)
     rate = motion.rate_at(time)
@@ -37,31 +37,33 @@ def test_the_heading_is_the_integral_of_the_rate(name):
 
 
 def test_before_and_after_a_motion_stands():
-    assert CALIBRATION.rate_at(np.array([-1.0, CALIBRATION.duration + 1.0])).tolist() == [0.0, 0.0]
-    assert (ROBOT.heading_at(np.array([-5.0, ROBOT.duration + 5.0])).tolist()
-            == [0.0, ROBOT.heading[-1]])
+    assert (CALIBRATION_MOTION.rate_at(np.array(
+        [-1.0, CALIBRATION_MOTION.duration + 1.0])).tolist() == [0.0, 0.0])
+    assert (ROBOT_MOTION.heading_at(np.array([-5.0, ROBOT_MOTION.duration + 5.0])).tolist()
+            == [0.0, ROBOT_MOTION.heading[-1]])
 
 
 def test_the_calibration_takes_20_s_turns_both_ways_at_two_speeds_and_comes_back():
-    rate = CALIBRATION.rate_at(np.arange(2001) / 100.0) / DEGREE
-    assert (CALIBRATION.duration == 20.0
-            and CALIBRATION.heading[-1] == pytest.approx(0.0, abs=1e-12))
+    rate = CALIBRATION_MOTION.rate_at(np.arange(2001) / 100.0) / DEGREE
+    assert (CALIBRATION_MOTION.duration == 20.0
+            and CALIBRATION_MOTION.heading[-1] == pytest.approx(0.0, abs=1e-12))
     assert all((np.abs(rate - speed) < 1e-9).mean() > 0.1 for speed in (-45, -30, 0, 30, 45))
 
 
 def test_the_robot_drives_160_s_and_stands_for_half_of_them():
     """Hong and Park, section 4.1: a trajectory of 160 s."""
-    rate = ROBOT.rate_at(np.arange(16001) / 100.0)
-    assert (ROBOT.duration == pytest.approx(160.0)
+    rate = ROBOT_MOTION.rate_at(np.arange(16001) / 100.0)
+    assert (ROBOT_MOTION.duration == pytest.approx(160.0)
             and (rate == 0.0).mean() == pytest.approx(0.5, abs=0.05))
 
 
 def test_a_stretch_turns_rate_times_duration():
-    assert turns([(1, 0), (4, 45), (1, 0)]).heading[-1] == pytest.approx(4 * 45 * DEGREE)
+    assert (constant_rate_motion([(1, 0), (4, 45),
+                                  (1, 0)]).heading[-1] == pytest.approx(4 * 45 * DEGREE))
 
 
 def test_known_headings_are_met_and_joined_by_lines():
-    motion = from_headings(np.array([10.0, 11.0, 13.0]), np.array([5.0, 6.0, 6.5]))
+    motion = motion_from_headings(np.array([10.0, 11.0, 13.0]), np.array([5.0, 6.0, 6.5]))
     assert (motion.heading_at(np.array([0.0, 0.5, 1.0, 2.0, 3.0])).tolist()
             == [0.0, 0.5, 1.0, 1.25, 1.5])
 

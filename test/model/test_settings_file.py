@@ -14,7 +14,7 @@ import math
 import time
 
 from gyro_calibration.files import read_bytes
-from gyro_calibration.model.settings_file import read_settings, settings_text
+from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
 import pytest
 
@@ -86,15 +86,15 @@ def test_texts_are_read_back_whatever_they_look_like(tmp_path):
                          '2026-11-21', "it's", '9' * 500], '010': 1e-7,
                'yes': [[], {}, None, True, -1, 1e22]}
     content['again'] = content['texts']
-    assert read_settings(written(tmp_path, settings_text(content))) == content
+    assert read_settings(written(tmp_path, format_settings(content))) == content
 
 
 def test_numbers_of_numpy_are_written_as_those_of_python(tmp_path):
     content = {'a': [np.float64(1e-7), np.float32(0.5), np.longdouble(2.0), np.int64(3), np.True_]}
-    assert read_settings(written(tmp_path, settings_text(content))) == {
+    assert read_settings(written(tmp_path, format_settings(content))) == {
         'a': [1e-7, 0.5, 2.0, 3, True]}
     with pytest.raises(ArithmeticError):
-        settings_text({'a': np.float64(math.nan)})
+        format_settings({'a': np.float64(math.nan)})
 
 
 def test_a_file_of_the_largest_size_is_read(tmp_path):

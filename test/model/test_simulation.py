@@ -11,10 +11,15 @@
 """A simulated log is what the model says of the motion, and says so itself."""
 
 from gyro_calibration.logs.log import read_log
-from gyro_calibration.model.channels import channels_of
+from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import CALIBRATION, respond, ROBOT, simulate
+from gyro_calibration.model.motion import (
+    CALIBRATION_MOTION,
+    ROBOT_MOTION,
+    simulate,
+    simulate_gyro_output,
+)
 from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
@@ -24,25 +29,25 @@ GYRO = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise
 
 
 def test_the_output_is_equation_1_of_hong_and_park():
-    log = simulate(GYRO, CALIBRATION, 100.0)
+    log = simulate(GYRO, CALIBRATION_MOTION, 100.0)
     assert len(log) == 2001 and log.time[-1] == 20.0
     assert log.output == pytest.approx(0.9 * log.reference_rate + 0.01, abs=1e-12)
 
 
 def test_the_reference_is_the_motion():
-    log = simulate(GYRO, ROBOT, 7.0)
-    assert np.array_equal(log.reference_rate, ROBOT.rate_at(log.time))
-    assert np.array_equal(log.reference_heading, ROBOT.heading_at(log.time))
+    log = simulate(GYRO, ROBOT_MOTION, 7.0)
+    assert np.array_equal(log.reference_rate, ROBOT_MOTION.rate_at(log.time))
+    assert np.array_equal(log.reference_heading, ROBOT_MOTION.heading_at(log.time))
 
 
 def test_the_temperature_is_the_one_given_or_the_models():
-    assert set(simulate(GYRO, CALIBRATION, 10.0).temperature) == {33.0}
-    assert set(simulate(GYRO, CALIBRATION, 10.0, temperature=5.0).temperature) == {5.0}
+    assert set(simulate(GYRO, CALIBRATION_MOTION, 10.0).temperature) == {33.0}
+    assert set(simulate(GYRO, CALIBRATION_MOTION, 10.0, temperature=5.0).temperature) == {5.0}
 
 
 def test_the_noise_is_that_of_the_model():
-    quiet, noisy = (simulate(GYRO, ROBOT, 100.0),
-                    simulate(GYRO, ROBOT, 100.0, np.random.default_rng(0)))
+    quiet, noisy = (simulate(GYRO, ROBOT_MOTION, 100.0),
+                    simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0)))
     noise = noisy.output - quiet.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
 
@@ -53,13 +58,13 @@ def test_a_log_is_replayed_with_its_motion_and_surroundings():
                        Term(CATALOGUE['warm_up'], (10.0, 0.01)),
                        Term(CATALOGUE['heading_sensitivity'], (1e-3, 0.0)),
                        Term(CATALOGUE['time_offset'], (0.02,))))
-    log = simulate(model, CALIBRATION, 50.0,
+    log = simulate(model, CALIBRATION_MOTION, 50.0,
                    temperature=25.0 + 10.0 * np.sin(np.arange(1001) / 200.0))
-    channels = channels_of(log)
-    assert np.array_equal(respond(
-        model, log.time, channels.moving(log.reference_rate, log.reference_rate)), log.output)
-    error = log.output - simulate(GYRO, CALIBRATION, 50.0).output
-    late = 0.9 * (CALIBRATION.rate_at(log.time - 0.02) - log.reference_rate)
+    channels = channels_from_log(log)
+    assert np.array_equal(simulate_gyro_output(
+        model, log.time, channels.with_rate(log.reference_rate, log.reference_rate)), log.output)
+    error = log.output - simulate(GYRO, CALIBRATION_MOTION, 50.0).output
+    late = 0.9 * (CALIBRATION_MOTION.rate_at(log.time - 0.02) - log.reference_rate)
     lagging = 1e-3 * (channels.lagged('temperature', 5.0) - log.temperature)
     assert error - late - lagging == pytest.approx(
         0.01 * np.exp(-log.time / 10.0) + 1e-3 * np.sin(log.reference_heading), abs=1e-12)

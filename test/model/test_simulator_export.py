@@ -19,9 +19,9 @@ from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.simulator_export import (
-    exported,
-    figures,
-    gauss_markov,
+    export_model,
+    fit_gauss_markov,
+    simulator_parameters,
     SIMULATORS,
 )
 import numpy as np
@@ -57,8 +57,8 @@ def as_gazebo_makes_it(element, count, interval, generator):
 
 
 def test_the_noise_of_gazebo_has_the_allan_deviation_of_the_model():
-    held, error = figures(GyroModel(noise=NOISE), 10.0, 25.0, 3600.0)
-    noise = ElementTree.fromstring(exported(held, GyroModel(), 'sdf')[0]).find('.//noise')
+    held, error = simulator_parameters(GyroModel(noise=NOISE), 10.0, 25.0, 3600.0)
+    noise = ElementTree.fromstring(export_model(held, GyroModel(), 'sdf')[0]).find('.//noise')
     made = as_gazebo_makes_it(noise, 400_000, 0.1, np.random.default_rng(1))
     chart = allan_deviation(made, 0.1, [0.1, 1.0, 10.0, 100.0, 1000.0])
     wanted = np.sqrt(NOISE.allan_variance(np.array(chart.time)))
@@ -69,13 +69,13 @@ def test_the_noise_of_gazebo_has_the_allan_deviation_of_the_model():
 
 @pytest.mark.parametrize('span', [100.0, 3600.0, 1e5])
 def test_a_random_walk_stays_one_and_no_wander_stays_none(span):
-    process, error = gauss_markov(Noise(7e-4, 0.0, 1e-5), 0.01, span)
+    process, error = fit_gauss_markov(Noise(7e-4, 0.0, 1e-5), 0.01, span)
     assert process.density == pytest.approx(1e-5, rel=0.02) and error < 0.01
-    assert gauss_markov(Noise(7e-4), 0.01, span)[0].density == 0.0
+    assert fit_gauss_markov(Noise(7e-4), 0.01, span)[0].density == 0.0
 
 
 def test_the_error_of_the_allan_deviation_is_the_largest_one():
-    process, error = gauss_markov(NOISE, 0.01, 3600.0)
+    process, error = fit_gauss_markov(NOISE, 0.01, 3600.0)
     times = 0.01 * 2.0 ** np.arange(19)
     made = NOISE.angle_random_walk ** 2 / times + process.allan_variance(times)
     ratio = np.sqrt(made / NOISE.allan_variance(times))
@@ -86,7 +86,7 @@ def test_the_bias_is_the_output_at_rest_at_the_temperature():
     model = GyroModel((term('bias', 1e-3), term('scale_factor_error', 0.05),
                        term('bias_temperature', 25.0, 1e-5), term('warm_up', 60.0, 0.2)),
                       self_calibration=SelfCalibration(0.01, 2e-3, ((1e-6, 0.0), (0.0, 4e-8))))
-    held, _ = figures(model, 100.0, 35.0, 3600.0)
+    held, _ = simulator_parameters(model, 100.0, 35.0, 3600.0)
     assert held.bias == pytest.approx(1e-3 + 1e-4 + 1.05 * 2e-3, rel=1e-9)
     assert held.bias_deviation == pytest.approx(2e-4)
 
@@ -96,7 +96,8 @@ def test_each_effect_is_held_or_listed(simulator):
     for name, effect in CATALOGUE.items():
         model = GyroModel((Term(effect, tuple(0.011 if each.default is None else each.default
                                               for each in effect.parameters)),))
-        text, left_out = exported(figures(model, 100.0, 25.0, 3600.0)[0], model, simulator)
+        text, left_out = export_model(
+            simulator_parameters(model, 100.0, 25.0, 3600.0)[0], model, simulator)
         listed = any(each.startswith(f'{name}:') for each in left_out)
         assert listed or f'{0.011:.9g}' in text.rpartition('-->')[2], name
         assert all(each in text for each in left_out), name
@@ -104,7 +105,8 @@ def test_each_effect_is_held_or_listed(simulator):
 
 def test_isaac_is_given_python():
     model = GyroModel((term('bias', 1e-3), ), noise=NOISE)
-    text, left_out = exported(figures(model, 100.0, 25.0, 3600.0)[0], model, 'isaac')
+    text, left_out = export_model(
+        simulator_parameters(model, 100.0, 25.0, 3600.0)[0], model, 'isaac')
     compile(text, 'isaac', 'exec')
     assert 'mean=0.001' in text and 'std=0.007' in text
     assert any(each.startswith('bias_instability: 0.0002 rad/s') for each in left_out)
@@ -113,7 +115,8 @@ def test_isaac_is_given_python():
 def test_mujoco_limits_and_delays_as_the_model():
     mujoco = pytest.importorskip('mujoco')
     model = GyroModel((term('saturation', 1.5), term('time_offset', 0.013)), noise=NOISE)
-    text, left_out = exported(figures(model, 100.0, 25.0, 3600.0)[0], model, 'mujoco')
+    text, left_out = export_model(
+        simulator_parameters(model, 100.0, 25.0, 3600.0)[0], model, 'mujoco')
     world = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body>'
         '<joint type="hinge" axis="0 0 1"/><geom size="0.1" mass="1"/><site name="imu"/>'

@@ -14,13 +14,13 @@ import math
 
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import CALIBRATION, from_rates
+from gyro_calibration.model.motion import CALIBRATION_MOTION, motion_from_rates
 from gyro_calibration.ros.calibration_session import (
-    DISCOVERY,
+    DISCOVERY_TIMEOUT,
     Drive,
     ODOMETRY,
     REST,
-    SILENCE,
+    SAMPLE_TIMEOUT,
     TURNS,
 )
 from gyro_calibration.ros.wheels import Velocity
@@ -59,7 +59,8 @@ def test_the_commands_are_the_profile_and_end_with_one_zero(tmp_path):
     rates = np.array([rate for _, rate in rig.commands])
     times = np.array([when for when, _ in rig.commands]) - begin
     assert (rates.max(), rates.min()) == pytest.approx((FULL, -FULL), abs=1e-6)
-    np.testing.assert_allclose(rates[:-1], CALIBRATION.rate_at(times[:-1] - 0.01), atol=0.06)
+    np.testing.assert_allclose(rates[:-1], CALIBRATION_MOTION.rate_at(times[:-1] - 0.01),
+                               atol=0.06)
     assert np.diff(times).max() < 1.5 * Drive.INTERVAL and rates[-1] == 0.0
 
 
@@ -121,7 +122,7 @@ def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault
     assert not success and reason in message, message
     assert rig.stopped_after(begin) < 0.5
     rig.go(2.0)
-    assert rig.commands[-1][1] == 0.0 and not rig.session.drives
+    assert rig.commands[-1][1] == 0.0 and not rig.session.is_driving
     if fault not in ('teleop', 'no receiver'):
         assert rig.robot.rate == pytest.approx(0.0, abs=1e-4)
         assert abs(rig.robot.heading - heading) < FULL * 0.5 + STOPPING
@@ -143,19 +144,19 @@ def test_commands_go_on_where_ros_time_jumps_back_and_the_stamps_do_not(tmp_path
 def test_a_robot_at_rest_is_driven_however_large_a_bias_its_rest_has_shown(tmp_path):
     rig = rested(tmp_path, calibration_drive=True, stationary_threshold=0.0)
     rig.go(20.0)
-    assert rig.pipeline.obstacle() == ''
+    assert rig.pipeline.find_obstacle() == ''
 
 
 def late_commands(rig):
     """Let own commands come back as over best effort: some never, the others 0.4 s later."""
-    late, taken, generator = [], rig.pipeline.command, np.random.default_rng(1)
+    late, taken, generator = [], rig.pipeline.add_command, np.random.default_rng(1)
 
     def delayed(velocity):
         if generator.random() > 0.3:
             late.append((rig.clock.now + 0.4, velocity))
         while late and late[0][0] <= rig.clock.now:
             taken(late.pop(0)[1])
-    rig.pipeline.command = delayed
+    rig.pipeline.add_command = delayed
 
 
 def paced(rig, pace):
@@ -199,7 +200,7 @@ def test_one_command_of_another_node_is_enough(tmp_path, linear, rate):
     rig = rested(tmp_path, calibration_drive=True)
     rig.drive_to()
     rate = rig.commands[-1][1] if rate is None else rate
-    rig.pipeline.command(Velocity(linear=(linear, 0.0, 0.0), angular=(0.0, 0.0, rate)))
+    rig.pipeline.add_command(Velocity(linear=(linear, 0.0, 0.0), angular=(0.0, 0.0, rate)))
     assert rig.ended and rig.commands[-1] == (rig.clock.now, 0.0)
 
 
@@ -214,7 +215,7 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
     def wait(seconds):
         for _ in range(round(seconds / Drive.INTERVAL)):
             rig.clock.now += Drive.INTERVAL
-            rig.pipeline.watch(1)
+            rig.pipeline.poll(1)
 
     for _ in range(round(3.0 / interval / burst)):
         wait(interval * burst)
@@ -224,7 +225,7 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
     assert min(rate for _, rate in rig.commands[-20:]) > 0.5
     begin = rig.clock.now
     wait(1.5)
-    assert rig.ended and 'while the robot was driven' in rig.session.run.reason
+    assert rig.ended and 'while the robot was driven' in rig.session.run.end_reason
     assert rig.stopped_after(begin) <= max(0.25, 4.0 * interval) + 2.1 * Drive.INTERVAL
 
 
@@ -233,11 +234,11 @@ def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers
         tmp_path, simulated):
     rig = rested(tmp_path, calibration_drive=True, **simulated)
     rig.drive_to()
-    rig.pipeline.watch(1)
+    rig.pipeline.poll(1)
     rig.clock.now += 0.4
-    rig.pipeline.watch(1)
+    rig.pipeline.poll(1)
     rig.step()
-    rig.pipeline.watch(1)
+    rig.pipeline.poll(1)
     assert not rig.ended
 
 
@@ -272,7 +273,7 @@ def test_a_node_that_was_stopped_in_a_drive_does_not_go_on_with_it(tmp_path, tim
         waiting.append((rig.stamp(reading), reading.output, reading.heading))
     sent = len(rig.commands)
     if timer_first:
-        rig.pipeline.watch(1)
+        rig.pipeline.poll(1)
     for each in waiting:
         rig.sample(*each)
     rig.go(2 * Drive.INTERVAL)
@@ -338,9 +339,9 @@ def test_a_drive_does_not_begin_while_ros_time_stands(tmp_path, ros):
 
 def test_a_drive_begins_after_a_pause_of_the_node_though_the_clock_waits_behind_it(tmp_path):
     rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
-    rig.pipeline.watch(1)
+    rig.pipeline.poll(1)
     rig.clock.now += 0.4
-    rig.pipeline.watch(1)
+    rig.pipeline.poll(1)
     assert not rig.begin()
 
 
@@ -364,7 +365,7 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
     rig = rested(tmp_path, calibration_drive=True)
     rig.receivers, begin = 0, rig.clock.now
     assert not rig.begin()
-    rig.go(0.5 * DISCOVERY)
+    rig.go(0.5 * DISCOVERY_TIMEOUT)
     assert rig.session.run.elapsed == 0.0 and not rig.ended
     rig.receivers = int(comes)
     assert rig.go(40.0, lambda: rig.ended)
@@ -372,7 +373,7 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
     assert success == comes
     if not comes:
         assert 'no other node receives cmd_vel' in message
-        assert rig.clock.now - begin == pytest.approx(DISCOVERY, abs=0.1)
+        assert rig.clock.now - begin == pytest.approx(DISCOVERY_TIMEOUT, abs=0.1)
 
 
 # After a drive
@@ -408,7 +409,7 @@ def test_a_robot_that_stops_late_but_stops_is_not_reported(tmp_path):
 
 def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
-    sample, watch, waiting = rig.sample, rig.pipeline.watch, []
+    sample, watch, waiting = rig.sample, rig.pipeline.poll, []
 
     def is_busy():
         """Hold this process up for 0.3 s of each 0.8 s; what came meanwhile comes then."""
@@ -419,11 +420,11 @@ def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
         while waiting and not is_busy():
             sample(*waiting.pop(0))
 
-    rig.sample, rig.pipeline.watch = late_sample, lambda count: is_busy() or watch(count)
+    rig.sample, rig.pipeline.poll = late_sample, lambda count: is_busy() or watch(count)
     success, message = rig.calibrate()
     assert not success and 'this computer was busy: commands were up to 0.' in message
     assert '(the run shows: ' in message
-    commands, samples = rig.session.lateness
+    commands, samples = rig.session.max_lateness
     assert 0.1 < commands < 0.7 and 0.1 < samples < 0.7
 
 
@@ -443,8 +444,8 @@ def test_samples_that_are_held_up_do_not_hold_up_the_motion(tmp_path):
     success, message = rig.calibrate()
     assert success, message
     times, rates = np.array(rig.commands[:-1]).T
-    np.testing.assert_allclose(rates, CALIBRATION.rate_at(times - begin - 0.01), atol=0.06)
-    assert rig.session.lateness[1] == pytest.approx(0.2, abs=0.02)
+    np.testing.assert_allclose(rates, CALIBRATION_MOTION.rate_at(times - begin - 0.01), atol=0.06)
+    assert rig.session.max_lateness[1] == pytest.approx(0.2, abs=0.02)
 
 
 def test_a_slip_without_load_is_named_as_one(tmp_path):
@@ -503,7 +504,7 @@ def test_a_run_without_samples_ends_after_5_s(tmp_path, kind):
     begin = rig.clock.now
     success, message = rig.calibrate(kind)
     assert not success and 'no sample came for 5 s' in message
-    assert rig.clock.now - begin == pytest.approx(SILENCE, abs=0.6)
+    assert rig.clock.now - begin == pytest.approx(SAMPLE_TIMEOUT, abs=0.6)
 
 
 def test_a_jump_of_the_stamps_ends_a_run_and_the_reason_names_it(tmp_path):
@@ -520,7 +521,7 @@ def test_a_jump_of_the_stamps_ends_a_run_and_the_reason_names_it(tmp_path):
 def test_an_error_in_the_fit_changes_nothing_and_the_next_run_works(tmp_path, monkeypatch):
     rig = rested(tmp_path, calibration_drive=True)
     with monkeypatch.context() as patched:
-        patched.setattr('gyro_calibration.ros.calibration_session.calibrated',
+        patched.setattr('gyro_calibration.ros.calibration_session.fit_run',
                         lambda *_: 1 / 0)
         success, message = rig.calibrate()
     assert not success and 'nothing was changed' in message and 'ZeroDivisionError' in message
@@ -543,8 +544,8 @@ def test_without_a_readable_model_nothing_is_calibrated(tmp_path):
 
 
 def test_a_profile_of_measured_headings_serves_as_well(tmp_path):
-    motion = from_rates(np.array([0.0, 1.0, 1.5, 4.0, 4.5, 5.5, 6.0, 9.0, 9.5, 10.0]),
-                        np.array([0, 0, 0.6, 0.6, 0, 0, -0.7, -0.7, 0, 0]))
+    motion = motion_from_rates(np.array([0.0, 1.0, 1.5, 4.0, 4.5, 5.5, 6.0, 9.0, 9.5, 10.0]),
+                               np.array([0, 0, 0.6, 0.6, 0, 0, -0.7, -0.7, 0, 0]))
     times = np.arange(0.0, 10.001, 0.05)
     profile = tmp_path / 'profile.csv'
     profile.write_text('time_s,heading_deg\n' + ''.join(
@@ -624,7 +625,7 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
     rig = rested(tmp_path)
     rig.other = 0.05 if shown == 'command' else None
     rig.robot.command(0.05)
-    rig.odometry = lambda stamp, reading: rig.pipeline.odometry(
+    rig.odometry = lambda stamp, reading: rig.pipeline.add_odometry(
         stamp, reading.heading * (shown == 'heading'),
         Velocity(angular=(0.0, 0.0, reading.rate * (shown == 'rate'))))
     rig.go(3.0)

@@ -16,7 +16,7 @@ import os
 from pathlib import Path
 
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find, Sample
+from gyro_calibration.driver.protocols import find_protocol, Sample
 import numpy as np
 import pytest
 
@@ -66,7 +66,7 @@ def test_driver_and_compensation_go_on_together_where_the_clock_is_set(
     heading = ros.collect(Imu, 'imu/data')
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics', 10)
     samples = (Sample(0.31, None, 0.01 * number) for number in itertools.count())
-    with Emulator(find('kvh_dsp3000'), samples, wait_for_reader=True) as gyro:
+    with Emulator(find_protocol('kvh_dsp3000'), samples, wait_for_reader=True) as gyro:
         start_node('compensation_node', {'calibration_file': tmp_path / 'calibration.yaml',
                                          'model_file': tmp_path / 'model.yaml'})
         start_node('driver_node', {'port': gyro.path})

@@ -181,11 +181,11 @@ def test_what_is_published(hold, tmp_path):
 
 def test_an_orientation_that_is_none_has_no_yaw_and_raises_nothing(ros):
     from geometry_msgs.msg import Quaternion
-    from gyro_calibration.ros.compensation_node import heading_of
+    from gyro_calibration.ros.compensation_node import quaternion_heading
     turned = Quaternion(z=math.sin(0.3), w=math.cos(0.3))
-    assert heading_of(turned) == pytest.approx(0.6)
+    assert quaternion_heading(turned) == pytest.approx(0.6)
     for value in (1e200, -1.7e308, math.inf, math.nan):
-        heading_of(Quaternion(x=value, y=value, z=value, w=value))
+        quaternion_heading(Quaternion(x=value, y=value, z=value, w=value))
 
 
 def test_names_types_and_qualities_are_those_of_the_documents(hold):

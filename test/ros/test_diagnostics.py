@@ -33,7 +33,7 @@ def test_a_report_has_the_full_name_the_level_and_all_values_as_text(ros, heard,
     made = Diagnostics(ros.node, 'thing',
                        lambda: (OK, 'well', {'number': 1.5, 'none': ''}), 'port 1')
     wait_until(lambda: ros.node.count_publishers('/diagnostics'))
-    wait_until(lambda: made.now() or heard, what='a report')
+    wait_until(lambda: made.publish() or heard, what='a report')
     status, = heard[-1].status
     assert (status.name, status.hardware_id) == ('/test_client: thing', 'port 1')
     assert (status.level, status.message, made.level) == (OK, 'well', OK)

@@ -20,7 +20,7 @@ pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find, Sample
+from gyro_calibration.driver.protocols import find_protocol, Sample
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
@@ -80,7 +80,7 @@ def interrupt_often(node):
 
 def test_a_gyro_is_published_end_to_end(robot, ros):
     """A replay at 1 kHz waits for a driver that a busy machine holds up: no sample is lost."""
-    with Emulator(find('csv'), counting(500.0), speed=2.0, wait_for_reader=True) as gyro:
+    with Emulator(find_protocol('csv'), counting(500.0), speed=2.0, wait_for_reader=True) as gyro:
         driver = robot(gyro.path, frame_id='my_gyro')
         driver.wait(lambda: len(driver.rates) > 3000 and len(driver.temperatures) > 3000,
                     'samples')
@@ -107,7 +107,7 @@ def test_a_port_that_is_missing_comes_goes_and_comes_again(robot, tmp_path):
     driver.reports('does not exist: plug the gyro in', DiagnosticStatus.ERROR)
     for number in range(2):
         driver.rates.clear()
-        with Emulator(find('csv'), counting(), link=tmp_path / 'gyro'):
+        with Emulator(find_protocol('csv'), counting(), link=tmp_path / 'gyro'):
             driver.wait(lambda: len(driver.rates) > 20, 'samples')
             driver.diagnostics.clear()
             values = {pair.key: pair.value
@@ -138,7 +138,7 @@ sys.exit(driver_node.main())
 
 def test_a_fault_of_the_program_in_the_reader_ends_the_node_and_is_reported(ros_domain):
     """A node that lives on and publishes nothing would look well to whoever started it."""
-    with Emulator(find('csv'), counting()) as gyro:
+    with Emulator(find_protocol('csv'), counting()) as gyro:
         command = [sys.executable, '-c', BROKEN, '--ros-args', '-p', f'port:={gyro.path}',
                    '-p', 'protocol:=csv']
         ended = subprocess.run(command, capture_output=True, text=True, timeout=60.0)

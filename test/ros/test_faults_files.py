@@ -18,7 +18,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from gyro_calibration.files import remove_leftovers, replacing, write_atomically
+from gyro_calibration.files import open_replacement, remove_leftovers, write_atomically
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.ros.calibration_session import REST
 import pytest
@@ -43,7 +43,7 @@ def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_is_not(t
     (tmp_path / '.model.yaml.abcd1234').write_text('half')
     (tmp_path / '.model.yaml.swp').write_text('of an editor')
     (tmp_path / '.other.yaml.abcd1234').write_text('of another file')
-    with replacing(path) as file:
+    with open_replacement(path) as file:
         file.write(b'new')
         write_atomically(path, b'of another process, in between')
         remove_leftovers(path)
@@ -110,11 +110,12 @@ def test_on_a_full_disk_the_calibration_is_used_and_written_when_there_is_room(d
     disk.fill()
     success, message = calibrated(0.02)
     assert success and 'NOT STORED' in message and f'make room in {disk.folder}' in message
-    assert rig.pipeline.store.hint.startswith('the calibration is in use but NOT STORED')
+    assert rig.pipeline.store.calibration_hint.startswith('the calibration is in use but NOT '
+                                                          'STORED')
     for _ in range(3000):  # rests, with a temperature, teach the table of biases
-        rig.pipeline.temperature(max(rig.truth), 25.0)
+        rig.pipeline.add_temperature(max(rig.truth), 25.0)
         rig.step()
-    rig.pipeline.learn(ending=True)
+    rig.pipeline.run_periodic_tasks(is_final=True)
     assert 'cannot be written' in rig.pipeline.store.table_hint
     assert calibration.read_bytes() == old and not biases.exists()
     left = ['calibration.yaml'] + ['ballast'] * disk.is_mounted
@@ -122,5 +123,5 @@ def test_on_a_full_disk_the_calibration_is_used_and_written_when_there_is_room(d
     disk.free()
     assert calibrated(0.03)[0] and calibration.read_bytes() != old
     assert read_model(calibration).self_calibration.bias == pytest.approx(0.03, abs=1e-4)
-    rig.pipeline.learn(ending=True)
+    rig.pipeline.run_periodic_tasks(is_final=True)
     assert biases.exists(), 'what could not be written is written at the end at the latest'

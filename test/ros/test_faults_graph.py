@@ -21,7 +21,7 @@ import sys
 import time
 
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 import numpy as np
 import pytest
 
@@ -48,7 +48,7 @@ class Turning:
     def __init__(self, link, protocol='csv', **how):
         self.begin, settings = (
             math.nan, SETTINGS if protocol == 'csv' else Settings(sample_rate=RATE))
-        self.emulator = Emulator(find(protocol), self._samples(), settings, link=link,
+        self.emulator = Emulator(find_protocol(protocol), self._samples(), settings, link=link,
                                  wait_for_reader=True, **how)
 
     def _samples(self):

@@ -15,12 +15,17 @@ import math
 import re
 
 from chance import fewest, mean_bound, most
-from gyro_calibration.allan import even_record, fit_noise
+from gyro_calibration.allan import build_rest_record, fit_noise
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.gyro_model import SelfCalibration
-from gyro_calibration.model.motion import ROBOT
+from gyro_calibration.model.motion import ROBOT_MOTION
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import changed, examine, HealthMonitor, STRETCH
+from gyro_calibration.ros.health_monitor import (
+    describe_change,
+    examine_stretch,
+    HealthMonitor,
+    STRETCH_DURATION,
+)
 import numpy as np
 import pytest
 
@@ -32,7 +37,7 @@ SELDOM = 2e-5  # false alarms an hour: one in 40 000 of these tests, with an hou
 
 def stretches(noise, hours, generator, scale=1.0):
     """Return outputs at rest in stretches, (n, samples), less the mean of one 600 s before."""
-    size, before = round(STRETCH / INTERVAL), round(600.0 / INTERVAL)
+    size, before = round(STRETCH_DURATION / INTERVAL), round(600.0 / INTERVAL)
     count = round(hours * 3600.0 / INTERVAL) // size * size
     whole = simulate_noise(Noise(scale * noise.angle_random_walk, noise.bias_instability,
                                  noise.rate_random_walk), before + count, INTERVAL, generator)
@@ -41,10 +46,13 @@ def stretches(noise, hours, generator, scale=1.0):
 
 def examined(outputs, noise, false_alarms, step=0.0):
     """Examine each stretch alone, at the level of a health monitor, and return the results."""
-    time, level = np.arange(outputs.shape[1]) * INTERVAL, 0.25 * false_alarms * STRETCH / 3600.0
-    variance = noise.angle_random_walk ** 2 / STRETCH
-    return [examine(time, output, output, noise, level, step, variance, 600.0 + STRETCH * number)
-            for number, output in enumerate(outputs)]
+    time, level = (np.arange(outputs.shape[1]) * INTERVAL,
+                   0.25 * false_alarms * STRETCH_DURATION / 3600.0)
+    variance = noise.angle_random_walk ** 2 / STRETCH_DURATION
+    return [
+        examine_stretch(time, output, output, noise, level, step, variance,
+                        600.0 + STRETCH_DURATION * number) for number, output in enumerate(outputs)
+    ]
 
 
 @pytest.mark.parametrize('runs', [30, pytest.param(100, marks=pytest.mark.evidence)])
@@ -57,7 +65,7 @@ def test_single_stretches_give_false_alarms_no_more_often_than_stated(noise, run
         coarse = [(np.round(each / step + 0.3) - 0.3) * step if step else each
                   for each in records]
         rests = [examined(outputs, noise, stated, step) for outputs in coarse]
-        alarms = [sum(not rest.noise_fits or not rest.bias_fits
+        alarms = [sum(not rest.is_noise_normal or not rest.is_bias_normal
                       for rest in run if rest is not None) for run in rests]
         assert np.mean(alarms) <= stated * minutes / 60.0 + mean_bound(alarms), step
         found = [rest is not None for run in rests for rest in run]
@@ -66,12 +74,13 @@ def test_single_stretches_give_false_alarms_no_more_often_than_stated(noise, run
 
 def test_the_level_of_the_bias_is_used_up_and_not_only_kept():
     """White noise, and a bias drawn with the stated deviation, which gets half of the alarms."""
-    stated, generator, size = 40.0, np.random.default_rng(12), round(STRETCH / INTERVAL)
-    level, time, deviation = 0.25 * stated * STRETCH / 3600.0, np.arange(size) * INTERVAL, 1e-4
+    stated, generator, size = 40.0, np.random.default_rng(12), round(STRETCH_DURATION / INTERVAL)
+    level, time, deviation = (0.25 * stated * STRETCH_DURATION / 3600.0,
+                              np.arange(size) * INTERVAL, 1e-4)
     outputs = (generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), (4000, size))
                + generator.normal(0.0, deviation, (4000, 1)))
-    misfits = sum(not examine(time, output, output, Noise(1e-4), level, 0.0,
-                              deviation ** 2).bias_fits for output in outputs)
+    misfits = sum(not examine_stretch(time, output, output, Noise(1e-4), level, 0.0,
+                                      deviation ** 2).is_bias_normal for output in outputs)
     assert fewest(4000, 2.0 * level) <= misfits <= most(4000, 2.0 * level)
 
 
@@ -79,16 +88,17 @@ def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12, age=600.
     """Feed a check as the node does."""
     for number, output in enumerate(np.ravel(outputs).tolist()):
         if check.add(begin + number * INTERVAL, output, output):
-            check.examine(bias_variance, age, promised)
+            check.examine_stretch(bias_variance, age, promised)
     return check
 
 
 def test_a_check_of_a_day_at_rest_is_silent():
     check, generator = HealthMonitor(MEMS, SELDOM, 0.3 * DEGREE), np.random.default_rng(13)
     for hour in range(24):
-        fed(check, stretches(MEMS, 20.0 * STRETCH / 3600.0, generator), begin=3600.0 * hour)
+        fed(check, stretches(MEMS, 20.0 * STRETCH_DURATION / 3600.0, generator),
+            begin=3600.0 * hour)
         assert not check.noise_alarm and not check.bias_alarm, hour
-    assert check.examined >= 24 * 18
+    assert check.examined_count >= 24 * 18
 
 
 @pytest.mark.parametrize('noise', [MEMS, FOG], ids=['MEMS', 'FOG'])
@@ -105,24 +115,24 @@ def test_twice_the_noise_is_missed_in_hardly_a_stretch_and_a_tenth_more_is_no_mi
     generator = np.random.default_rng(15)
     double, more = (examined(stretches(MEMS, 1.0, generator, scale), MEMS, 0.001)
                     for scale in (2.0, 1.1))
-    assert sum(rest is None or rest.noise_fits for rest in double) < 0.02 * len(double)
-    assert all(rest is None or rest.noise_fits for rest in more)
+    assert sum(rest is None or rest.is_noise_normal for rest in double) < 0.02 * len(double)
+    assert all(rest is None or rest.is_noise_normal for rest in more)
 
 
 def test_a_bias_of_unknown_uncertainty_is_not_examined():
     outputs = 0.01 + stretches(MEMS, 0.1, np.random.default_rng(17))
     check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:5], bias_variance=math.nan)
-    assert not check.bias_alarm and math.isnan(check.last.sigmas)
+    assert not check.bias_alarm and math.isnan(check.last_rest.sigmas)
 
 
 def test_motion_is_not_taken_for_a_misfit():
     """The robot stands half of the time and turns half of it, with a wobble of 1 % of its rate."""
-    time = np.arange(0.0, ROBOT.duration, INTERVAL)
+    time = np.arange(0.0, ROBOT_MOTION.duration, INTERVAL)
     check, generator = HealthMonitor(MEMS, SELDOM, 0.3 * DEGREE), np.random.default_rng(18)
     for drive in range(20):
         wobble = (np.convolve(generator.normal(0.0, 0.01, len(time)), np.ones(25) / 5.0, 'same')
-                  * ROBOT.rate_at(time))
-        fed(check, ROBOT.rate_at(time) + wobble
+                  * ROBOT_MOTION.rate_at(time))
+        fed(check, ROBOT_MOTION.rate_at(time) + wobble
             + generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), len(time)), begin=200.0 * drive)
         assert not check.noise_alarm and not check.bias_alarm, drive
 
@@ -130,7 +140,7 @@ def test_motion_is_not_taken_for_a_misfit():
 def test_a_measured_gyro_is_silent_for_hours_and_not_by_a_model_of_half_its_noise(data):
     """10 000 s of an ADIS16405 at rest; the model has its noise and the bias of its first 15 s."""
     log = read_log(data / 'mems_static' / 'adis16405_1.csv.gz', rate=100.0)
-    record = even_record(log.time, log.output)
+    record = build_rest_record(log.time, log.output)
     noise, rate = (fit_noise(record.rate, record.interval).noise,
                    log.output - log.output[:1500].mean())
     half = replace(noise, angle_random_walk=0.5 * noise.angle_random_walk)
@@ -139,9 +149,9 @@ def test_a_measured_gyro_is_silent_for_hours_and_not_by_a_model_of_half_its_nois
         for sample in zip(log.time[:length].tolist(), log.output[:length].tolist(),
                           rate[:length].tolist()):
             if check.add(*sample):
-                check.examine(claimed.angle_random_walk ** 2 / 15.0, sample[0])
+                check.examine_stretch(claimed.angle_random_walk ** 2 / 15.0, sample[0])
                 alarmed += bool(check.noise_alarm or check.bias_alarm)
-        assert check.examined == length // 1001 and bool(alarmed) == (claimed is half)
+        assert check.examined_count == length // 1001 and bool(alarmed) == (claimed is half)
 
 
 def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_examined():
@@ -149,7 +159,7 @@ def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_examin
     assert not any(check.add(number * 0.02 + (0.0 if number < 300 else 1.0), 0.0, 0.0)
                    for number in range(600))
     fed(check, np.zeros(2000), begin=100.0)
-    assert not check.examined and not check.noise_alarm
+    assert not check.examined_count and not check.noise_alarm
 
 
 def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
@@ -162,29 +172,32 @@ def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
 @pytest.mark.filterwarnings('error')
 def test_a_stretch_whose_samples_came_nearly_all_at_once_is_not_examined():
     """As where a busy computer gave a gyro the stamps of one second."""
-    time = np.append(np.linspace(0.0, 0.9, 490), np.linspace(1.5, STRETCH, 10))
+    time = np.append(np.linspace(0.0, 0.9, 490), np.linspace(1.5, STRETCH_DURATION, 10))
     output = 7e-4 * np.random.default_rng(21).standard_normal(len(time))
-    assert examine(time, output, output, MEMS, 1e-3) is None
+    assert examine_stretch(time, output, output, MEMS, 1e-3) is None
 
 
 def test_without_noise_figures_there_is_nothing_to_check():
-    assert (not HealthMonitor(Noise(), 0.001).works and not HealthMonitor(MEMS, 0.0).works
-            and HealthMonitor(MEMS, 0.001).works)
+    assert (not HealthMonitor(Noise(), 0.001).is_enabled
+            and not HealthMonitor(MEMS, 0.0).is_enabled and HealthMonitor(MEMS, 0.001).is_enabled)
 
 
 def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():
     generator, deviations, age = np.random.default_rng(20), np.array([1e-3, 1e-4]), 600.0
     covariance, alarms, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
-    wander = math.sqrt(MEMS.wander(age, STRETCH))
+    wander = math.sqrt(MEMS.mean_change_variance(age, STRETCH_DURATION))
     for _ in range(2000):
         first, second = (SelfCalibration(*(generator.normal(size=2) * deviations).tolist(),
                                          covariance) for _ in range(2))
         second = SelfCalibration(second.scale_factor_error,
                                  second.bias + wander * generator.normal(), covariance)
-        alarms += bool(changed(first, second, MEMS, age, level))
+        alarms += bool(describe_change(first, second, MEMS, age, level))
     assert fewest(2000, level) <= alarms <= most(2000, level)
-    moved = changed(first, SelfCalibration(first.scale_factor_error + 0.02,
-                                           first.bias + 1.0 * DEGREE, covariance), MEMS, age, 1e-3)
+    moved = describe_change(
+        first,
+        SelfCalibration(first.scale_factor_error + 0.02, first.bias + 1.0 * DEGREE, covariance),
+        MEMS, age, 1e-3)
     assert 'the scale factor error changed by 2.000 % (' in moved
     assert 'the bias changed by 1.0000 deg/s (' in moved
-    assert not changed(SelfCalibration(), second, MEMS, age, level), 'nothing was known before'
+    assert not describe_change(SelfCalibration(), second, MEMS, age,
+                               level), 'nothing was known before'

@@ -19,9 +19,9 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import LogCompensation
 from gyro_calibration.logs.cdr import UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE, Log
-from gyro_calibration.model.channels import channels_of
+from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import respond
+from gyro_calibration.model.motion import simulate_gyro_output
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.wheels import Velocity
@@ -105,7 +105,7 @@ def test_an_impossible_rate_is_refused_and_leaves_a_gap(tmp_path, value):
 def test_reset_makes_the_heading_zero_here(tmp_path):
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(100, 0.5))
-    rig.pipeline.reset()
+    rig.pipeline.reset_heading()
     assert rig.feed([0.5])[0].heading == pytest.approx(0.5 * INTERVAL, abs=1e-7)
 
 
@@ -147,7 +147,7 @@ def test_a_turn_while_the_gyro_is_unplugged_is_in_the_variance(tmp_path, wheels,
     for _ in range(60):
         rig.skip(0.1)
         if odometry is not None:
-            rig.pipeline.odometry(rig.fed, 0.0, Velocity(angular=(0.0, 0.0, odometry)))
+            rig.pipeline.add_odometry(rig.fed, 0.0, Velocity(angular=(0.0, 0.0, odometry)))
     after = rig.feed(noisy(5.0), SLOW, moving=0.0)[-1]
     assert after.heading == pytest.approx(before.heading, abs=0.01)
     assert (math.sqrt(after.heading_variance) < 0.05) == known
@@ -157,7 +157,7 @@ def test_a_turn_while_the_gyro_is_unplugged_is_in_the_variance(tmp_path, wheels,
 def test_no_variance_is_zero(tmp_path):
     rig = Rig(tmp_path, model=KNOWN)
     found = rig.feed(noisy(1.0), SLOW)
-    rig.pipeline.reset()
+    rig.pipeline.reset_heading()
     found += rig.feed(noisy(1.0), SLOW)
     assert min(each.heading_variance for each in found) > 0.0
     assert min(each.rate_variance for each in found) > 0.0
@@ -224,7 +224,7 @@ def test_gyros_that_repeat_values_by_themselves_are_no_error(tmp_path, output):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(noisy(10.0), SLOW)
     rig.feed(output, SLOW)
-    assert rig.pipeline.repeats == ''
+    assert rig.pipeline.repeat_fault == ''
 
 
 @pytest.mark.parametrize('acceleration, stuck', [(5.0, False), (100.0, True)])
@@ -234,7 +234,7 @@ def test_zeros_are_those_of_a_dead_gyro_where_no_robot_stops_so_fast(
     rig.feed(noisy(10.0, 0.9), SLOW)
     stop = np.maximum(0.9 - acceleration * SLOW * np.arange(1.0, 60.0), 0.0)
     rig.feed(np.where(stop > 0.0, noisy(59 * SLOW, stop), 0.0), SLOW)
-    assert bool(rig.pipeline.repeats) == stuck
+    assert bool(rig.pipeline.repeat_fault) == stuck
 
 
 @pytest.mark.parametrize('step, stuck', [(0.002, True), (0.02, False)])
@@ -243,24 +243,24 @@ def test_a_saturated_gyro_of_coarse_steps_is_an_error_as_soon_as_chance_is_ruled
     rig = Rig(tmp_path, model=KNOWN)
     outputs = np.round(noisy(60.0, 0.5 * np.sin(np.arange(1500) / 50.0)) / step) * step
     rig.feed(outputs, SLOW)
-    assert not rig.pipeline.repeats
+    assert not rig.pipeline.repeat_fault
     rig.feed(np.full(500, 0.3), SLOW)
-    assert bool(rig.pipeline.repeats) == stuck
+    assert bool(rig.pipeline.repeat_fault) == stuck
 
 
 def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_nothing(tmp_path):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(noisy(10.0), SLOW)
     rig.feed(np.full(50, BIAS), SLOW)
-    assert 'the gyro repeats' in rig.pipeline.obstacle()
-    rig.pipeline.reset()
+    assert 'the gyro repeats' in rig.pipeline.find_obstacle()
+    rig.pipeline.reset_heading()
     assert rig.feed(noisy(1.0), SLOW)[-1].heading_variance > math.pi ** 2
 
 
 def test_a_gyro_of_zeros_beside_odometry_that_turns_is_an_error(tmp_path):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(np.zeros(50), SLOW, moving=0.3)
-    assert 'the gyro repeats the rate 0 rad/s' in rig.pipeline.repeats
+    assert 'the gyro repeats the rate 0 rad/s' in rig.pipeline.repeat_fault
 
 
 # Rest
@@ -269,7 +269,7 @@ def test_a_gyro_of_zeros_beside_odometry_that_turns_is_an_error(tmp_path):
 def test_the_threshold_filter_deletes_rates_at_rest_until_it_is_switched_off(tmp_path):
     rig = Rig(tmp_path, model='')
     assert rig.feed(np.full(50, 0.1 * DEGREE))[-1].heading == 0.0
-    assert rig.pipeline.estimator.tracker.deleted > 0.03 * DEGREE
+    assert rig.pipeline.estimator.tracker.deleted_heading > 0.03 * DEGREE
     rig.set(stationary_threshold=0.0)
     assert rig.feed([0.1 * DEGREE] * 2)[-1].rate == pytest.approx(0.1 * DEGREE)
 
@@ -296,8 +296,8 @@ def test_odometry_that_is_late_does_not_show_that_the_robot_stands(tmp_path, lat
     rig = Rig(tmp_path, model=KNOWN, wheels='odom')
     for _ in range(100):
         rig.feed([BIAS])
-        rig.pipeline.odometry(rig.fed - round(1e9 * late), 0.0, Velocity())
-    assert rig.pipeline.wheels.moving(rig.clock.now) is moving
+        rig.pipeline.add_odometry(rig.fed - round(1e9 * late), 0.0, Velocity())
+    assert rig.pipeline.wheels.is_moving(rig.clock.now) is moving
 
 
 def test_slow_turns_that_late_odometry_hides_at_first_are_no_bias(tmp_path):
@@ -306,7 +306,7 @@ def test_slow_turns_that_late_odometry_hides_at_first_are_no_bias(tmp_path):
 
     def late(stamp, reading):
         seen.append((stamp, reading.heading, Velocity(angular=(0.0, 0.0, reading.rate))))
-        rig.pipeline.odometry(*seen[max(len(seen) - 1 - round(2.0 / INTERVAL), 0)])
+        rig.pipeline.add_odometry(*seen[max(len(seen) - 1 - round(2.0 / INTERVAL), 0)])
 
     rig.odometry = late
     for _ in range(10):
@@ -321,13 +321,13 @@ def test_slow_turns_that_late_odometry_hides_at_first_are_no_bias(tmp_path):
 def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill(
         tmp_path, reported):
     rig = rested(tmp_path, seconds=60.0, wheels='odom')
-    begin, odometry = len(rig.outputs) - 1, rig.pipeline.odometry
-    rig.pipeline.odometry = lambda stamp, heading, _: odometry(stamp, heading, Velocity())
+    begin, odometry = len(rig.outputs) - 1, rig.pipeline.add_odometry
+    rig.pipeline.add_odometry = lambda stamp, heading, _: odometry(stamp, heading, Velocity())
     rig.robot.command(0.05 * DEGREE)
     rig.go(60.0)
     level, message, _ = reported(rig)
     assert level == WARN and 'odom turns by its headings' in message, message
-    assert rig.pipeline.wheels.moving(rig.clock.now) is None
+    assert rig.pipeline.wheels.is_moving(rig.clock.now) is None
     error, deviation = rig.error(begin)
     assert abs(error) < 4.0 * deviation, (error, deviation)
 
@@ -360,7 +360,7 @@ def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     rig = Rig(tmp_path, model='')
     for _ in range(100):
         rig.feed([0.5])
-        rig.pipeline.sample(rig.fed + 5 * 10 ** 6, 0.0, frame='other')
+        rig.pipeline.add_sample(rig.fed + 5 * 10 ** 6, 0.0, frame='other')
     assert 'samples of the frames  and other alternate' in rig.pipeline.conflict
     assert rig.outputs[-1].heading < 0.5 * 0.2
     rig.feed(np.full(150, 0.5))
@@ -372,7 +372,7 @@ def test_a_driver_that_comes_back_with_another_frame_is_none_of_two(tmp_path):
     rig.feed(np.full(100, 0.5))
     for _ in range(100):
         rig.skip(INTERVAL)
-        assert rig.pipeline.sample(rig.fed, 0.5, frame='other')
+        assert rig.pipeline.add_sample(rig.fed, 0.5, frame='other')
 
 
 def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_path):
@@ -382,7 +382,7 @@ def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_pa
     rig.robot.command(0.7)
     for _ in range(500):
         rig.step()
-        rig.pipeline.sample(max(rig.truth) + 4 * 10 ** 6, 0.0)
+        rig.pipeline.add_sample(max(rig.truth) + 4 * 10 ** 6, 0.0)
     assert '2 publishers send on imu/data_raw (/a/driver_node, /b/driver_node)' in \
         rig.pipeline.conflict
     refused = rig.journal.counts['refused_samples']
@@ -401,11 +401,11 @@ def test_a_turn_between_two_rests_while_two_publishers_send_is_in_the_variance(t
     rig.publishers = ['/a/driver_node', '/b/driver_node']
     for step in range(700):
         if step == 100 and reset:
-            rig.pipeline.reset()
+            rig.pipeline.reset_heading()
         if step in (100, 400):
             rig.robot.command(0.8 * (step == 100))
         rig.step()
-        rig.pipeline.sample(max(rig.truth) + 4 * 10 ** 6, 0.0)
+        rig.pipeline.add_sample(max(rig.truth) + 4 * 10 ** 6, 0.0)
     assert rig.pipeline.conflict
     rig.publishers = ['/a/driver_node']
     rig.go(5.0)
@@ -420,7 +420,7 @@ def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path, paus
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(300, 0.5))
     rig.publishers = ['/driver_node', '/driver_node']
-    rig.pipeline.publishers(rig.publishers)
+    rig.pipeline.update_publishers(rig.publishers)
     rig.skip(pause)
     rig.feed(np.full(round(4.0 / interval), 0.5), interval=interval)
     assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
@@ -430,7 +430,7 @@ def test_samples_that_a_new_driver_sends_late_at_first_are_not_those_of_a_second
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(300, 0.5))
     rig.publishers = ['/driver_node', '/driver_node']
-    rig.pipeline.publishers(rig.publishers)
+    rig.pipeline.update_publishers(rig.publishers)
     for seconds in (1.5, 0.04):
         rig.skip(seconds)
         rig.feed([0.5])
@@ -445,9 +445,9 @@ def test_two_publishers_that_both_send_are_found_by_their_stamps(tmp_path, offse
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(100, 0.5))
     rig.publishers = list(names)
-    rig.pipeline.publishers(rig.publishers)
+    rig.pipeline.update_publishers(rig.publishers)
     for _ in range(3):
-        rig.pipeline.sample(rig.fed + offset * 10 ** 6, 0.0)
+        rig.pipeline.add_sample(rig.fed + offset * 10 ** 6, 0.0)
         rig.feed([0.5])
     assert '2 publishers send' in rig.pipeline.conflict
 
@@ -457,7 +457,7 @@ def test_no_published_stamp_is_outside_of_ros_time(tmp_path):
         model = f'effects: {{time_offset: {{time_offset: {offset}}}}}\n' + KNOWN.split('\n')[1]
         rig = Rig(tmp_path, model=model)
         assert not rig.pipeline.store.problem
-        found = rig.pipeline.sample(stamp, 0.5)
+        found = rig.pipeline.add_sample(stamp, 0.5)
         assert found is None or 0 <= found.stamp < 2 ** 31 * 10 ** 9
 
 
@@ -465,7 +465,7 @@ def test_no_published_stamp_is_outside_of_ros_time(tmp_path):
 def test_a_stamp_that_is_none_of_ros_time_is_refused(tmp_path, stamp):
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(10, 0.5))
-    assert rig.pipeline.sample(stamp, 0.5) is None
+    assert rig.pipeline.add_sample(stamp, 0.5) is None
     assert 'outside the range of ROS time' in rig.journal.event
     assert rig.feed([0.5])[0].heading == pytest.approx(0.05, abs=1e-9)
 
@@ -483,7 +483,7 @@ def test_a_temperature_that_leaps_is_not_used(tmp_path, odd):
     rig = Rig(tmp_path, model=THERMAL)
     before = rig.feed(noisy(20.0), SLOW, temperature=25.0)[-1]
     for each in odd:
-        rig.pipeline.temperature(rig.fed, each)
+        rig.pipeline.add_temperature(rig.fed, each)
         after = rig.feed(noisy(1.0), SLOW)[-1]
     assert after.heading == pytest.approx(before.heading, abs=1e-3)
     assert rig.journal.counts['refused_temperatures'] == odd.count(60.0)
@@ -495,17 +495,17 @@ def test_a_temperature_that_stays_where_it_has_leapt_is_used_where_it_is_possibl
     rig = Rig(tmp_path, model=THERMAL)
     rig.feed(noisy(5.0), SLOW, temperature=25.0)
     for each in (last - 1.0, last):
-        rig.pipeline.temperature(rig.fed, each)
+        rig.pipeline.add_temperature(rig.fed, each)
     assert rig.pipeline.estimator.temperature == used
 
 
 def test_a_temperature_of_the_future_is_one_of_now(tmp_path):
     rig = Rig(tmp_path, model=TEMPERATURE_MODEL)
     rig.feed(np.full(10, 0.5))
-    rig.pipeline.temperature(2_145_916_800 * 10 ** 9, 25.0)
-    assert not rig.pipeline.estimator.temperature_is_lost
+    rig.pipeline.add_temperature(2_145_916_800 * 10 ** 9, 25.0)
+    assert not rig.pipeline.estimator.is_temperature_lost
     rig.feed(np.full(1100, 0.5))
-    assert rig.pipeline.estimator.temperature_is_lost
+    assert rig.pipeline.estimator.is_temperature_lost
 
 
 TEMPERATURE_MODEL = yaml.safe_dump({
@@ -540,7 +540,7 @@ def test_biases_of_two_temperatures_are_kept_for_the_next_start(tmp_path):
     turned = found[-1].heading
     rest = rig.feed(noisy(40.0, bias=BIAS + shift, seed=2), SLOW, temperature=35.0)
     assert rest[-1].heading == pytest.approx(turned, abs=0.05) and rest[-1].rate == 0.0
-    rig.pipeline.learn(ending=True)
+    rig.pipeline.run_periodic_tasks(is_final=True)
     kept = (tmp_path / 'calibration_biases.yaml.kept-1').read_text()
     assert kept == 'format: something else\n', 'a file of somebody else is kept'
     entries = yaml.safe_load((tmp_path / 'calibration_biases.yaml').read_text())['entries']
@@ -560,14 +560,14 @@ def test_a_gyro_that_was_silent_for_10_s_may_have_been_without_power(
     rig.feed(np.zeros(50))
     rig.skip(stamps, steady=steady)
     rig.feed([0.0])
-    assert rig.pipeline.estimator.beginnings == beginnings
+    assert rig.pipeline.estimator.restart_count == beginnings
 
 
 def test_a_simulation_that_pauses_is_no_silence(tmp_path):
     rig = rested(tmp_path, ros=1000.0)
     rig.clock.now += 60.0
     rig.go(1.0)
-    assert rig.pipeline.estimator.beginnings == 1
+    assert rig.pipeline.estimator.restart_count == 1
 
 
 @pytest.mark.parametrize('step', [3600.0, -3600.0, -0.5, 2e7])
@@ -643,7 +643,7 @@ def monitored(tmp_path, outputs, **parameters):
 def test_a_bias_that_moved_raises_an_alarm(tmp_path, moved, parameters):
     rig = monitored(tmp_path, noisy(42.0, bias=0.01 + moved), **parameters)
     monitor = rig.pipeline.monitor
-    assert monitor.last.bias == pytest.approx(moved, abs=1e-3) and not monitor.noise_alarm
+    assert monitor.last_rest.bias == pytest.approx(moved, abs=1e-3) and not monitor.noise_alarm
     assert 'sigma of the model: calibrate' in monitor.bias_alarm
 
 
@@ -686,7 +686,9 @@ def test_effects_with_a_past_gain_in_a_drive_what_they_promise(tmp_path):
     truth = integrate(seconds, rate)
     log = Log(output=rate, time=seconds, temperature=heated, reference_rate=rate,
               reference_heading=truth)
-    output = respond(full, seconds, channels_of(log).moving(rate, rate), np.random.default_rng(4))
+    output = simulate_gyro_output(full, seconds,
+                                  channels_from_log(log).with_rate(rate, rate),
+                                  np.random.default_rng(4))
     log = Log(output=output, time=seconds, temperature=heated, reference_rate=rate,
               reference_heading=truth)
     rms = {}
@@ -711,7 +713,7 @@ def test_a_time_offset_moves_the_published_stamps(tmp_path):
 def test_a_channel_that_no_message_brings_is_named(tmp_path):
     rig = Rig(tmp_path, model=model({'supply_sensitivity': {'supply_sensitivity': 0.01}}))
     assert rig.feed(np.full(3, 0.5))[-1].rate == 0.5
-    assert 'supply' in ' '.join(rig.pipeline.estimator.missing(rig.journal.channels))
+    assert 'supply' in ' '.join(rig.pipeline.estimator.missing_channels(rig.journal.channels))
 
 
 def test_over_a_jump_back_of_the_stamps_the_past_of_an_effect_goes_on(tmp_path):
@@ -876,13 +878,13 @@ def test_no_value_leaves_the_heading_anything_but_a_number(tmp_path, events, cub
     for kind, stamp, first, second in events:
         velocity = Velocity((first, 0.0, 0.0), (0.0, 0.0, second))
         if kind == 'sample':
-            published.append(pipeline.sample(stamp, first, second))
+            published.append(pipeline.add_sample(stamp, first, second))
         elif kind == 'temperature':
-            pipeline.temperature(stamp, first)
+            pipeline.add_temperature(stamp, first)
         elif kind == 'odometry':
-            pipeline.odometry(stamp, first, velocity)
+            pipeline.add_odometry(stamp, first, velocity)
         else:
-            pipeline.command(velocity)
+            pipeline.add_command(velocity)
         rig.guards()
     rig.clock.now += 2.0
     rig.guards()

@@ -12,7 +12,7 @@
 
 import threading
 
-from gyro_calibration.heading.bias_table import INTERVAL, Prior
+from gyro_calibration.heading.bias_table import MIN_WRITE_INTERVAL, Prior
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.ros.state_store import StateStore
 import pytest
@@ -40,15 +40,15 @@ def taught(memory, temperature=25.0):
 def test_nothing_stored_is_an_empty_model_and_no_trouble(remember):
     memory = remember()
     assert memory.model.self_calibration is None and not memory.table.entries
-    assert memory.problem == memory.hint == memory.table_hint == ''
+    assert memory.problem == memory.calibration_hint == memory.table_hint == ''
 
 
 def test_what_is_kept_is_there_after_a_restart(remember):
     memory = remember()
-    assert memory.keep(SelfCalibration(0.01, 0.002)) == ''
+    assert memory.store_calibration(SelfCalibration(0.01, 0.002)) == ''
     taught(memory)
-    memory.keep_table(NOW, ending=True)
-    assert memory.written == NOW
+    memory.store_table(NOW, is_final=True)
+    assert memory.table_written_time == NOW
     again = remember()
     assert (again.model.self_calibration == SelfCalibration(0.01, 0.002)
             and len(again.table.entries) == 1)
@@ -56,22 +56,22 @@ def test_what_is_kept_is_there_after_a_restart(remember):
 
 def test_the_table_is_written_seldom_and_only_if_it_learned_something(remember, tmp_path):
     memory = remember()
-    memory.keep_table(NOW, ending=True)
+    memory.store_table(NOW, is_final=True)
     assert not (tmp_path / 'biases.yaml').exists()
     taught(memory)
-    memory.keep_table(NOW)
+    memory.store_table(NOW)
     taught(memory, 35.0)
-    memory.keep_table(NOW + 0.9 * INTERVAL)
-    assert memory.written == NOW
-    memory.keep_table(NOW + 1.1 * INTERVAL)
-    assert memory.written == NOW + 1.1 * INTERVAL
+    memory.store_table(NOW + 0.9 * MIN_WRITE_INTERVAL)
+    assert memory.table_written_time == NOW
+    memory.store_table(NOW + 1.1 * MIN_WRITE_INTERVAL)
+    assert memory.table_written_time == NOW + 1.1 * MIN_WRITE_INTERVAL
 
 
 def test_a_damaged_table_is_reported_and_kept(remember, tmp_path):
     memory = remember(biases='entries: [')
     assert 'cannot be read' in memory.table_hint
     taught(memory)
-    memory.keep_table(NOW, ending=True)
+    memory.store_table(NOW, is_final=True)
     assert ((tmp_path / 'biases.yaml.kept-1').read_text() == 'entries: ['
             and 'is now in' in memory.table_hint)
 
@@ -81,16 +81,17 @@ def test_a_folder_that_cannot_be_written_to_is_reported_and_not_tried_each_secon
     memory = StateStore('', tmp_path / 'calibration.yaml',
                         tmp_path / 'file' / 'biases.yaml', Prior())
     taught(memory)
-    memory.keep_table(NOW)
-    assert 'cannot be written' in memory.table_hint and memory.written is None
-    assert not memory.table.due(NOW + 1.0) and 'NOT STORED' not in memory.hint
+    memory.store_table(NOW)
+    assert 'cannot be written' in memory.table_hint and memory.table_written_time is None
+    assert not memory.table.is_write_due(NOW + 1.0) and 'NOT STORED' not in memory.calibration_hint
 
 
 def test_a_calibration_behind_another_model_is_not_used(remember):
     memory = remember(
         'effects: {bias: {bias: 0.1}}',
         calibration='effects: {}\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}')
-    assert memory.model.self_calibration is None and 'belongs to another model' in memory.hint
+    assert (memory.model.self_calibration is None
+            and 'belongs to another model' in memory.calibration_hint)
 
 
 @pytest.mark.parametrize('of_model, of_calibration, used',
@@ -101,15 +102,16 @@ def test_a_calibration_of_another_gyro_is_not_used(remember, of_model, of_calibr
     memory = remember(
         model,
         calibration=f'{calibration}self_calibration: {{scale_factor_error: 0.2, bias: 0.3}}')
-    assert (memory.model.self_calibration is not None) == used == (memory.hint == '')
-    assert used or f'and the model to {of_model or "one without"}; calibrate again' in memory.hint
+    assert (memory.model.self_calibration is not None) == used == (memory.calibration_hint == '')
+    assert (used or f'and the model to {of_model or "one without"}; calibrate again'
+            in memory.calibration_hint)
 
 
 def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path):
     memory = remember('effects: {bias: {bias:')
     assert memory.problem.startswith('uncalibrated: ')
     taught(memory)
-    memory.keep_table(NOW, ending=True)
+    memory.store_table(NOW, is_final=True)
     assert not (tmp_path / 'biases.yaml').exists()
 
 
@@ -117,11 +119,11 @@ def test_what_another_node_writes_to_the_same_file_is_reported_until_this_one_wr
     first, second = remember(), remember()
     first.poll()
     assert not first.shared_hint
-    second.keep(SelfCalibration(0.01, 0.02))
+    second.store_calibration(SelfCalibration(0.01, 0.02))
     first.poll()
     second.poll()
     assert 'was written by another process' in first.shared_hint and not second.shared_hint
-    first.keep(SelfCalibration(0.01, 0.03))
+    first.store_calibration(SelfCalibration(0.01, 0.03))
     assert not first.shared_hint
 
 
@@ -132,7 +134,7 @@ def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_lost_repo
     def keep(memory, bias):
         for _ in range(rounds):
             step.wait()
-            memory.keep(SelfCalibration(0.01, bias))
+            memory.store_calibration(SelfCalibration(0.01, bias))
             step.wait()
     writers = [threading.Thread(target=keep, args=(memory, bias))
                for memory, bias in zip(memories, (0.1, 0.2))]

@@ -21,16 +21,18 @@ ramps), `stretches` (of a log that are dwells, without outliers and repeated sam
 
 """
 
-from gyro_calibration.calibration.dwells.samples import listed, Numbers
+from gyro_calibration.calibration.dwells.samples import format_list, Numbers
 from gyro_calibration.calibration.dwells.table import (
     Dwells,
-    dwells,
+    dwells_from_table,
+    extract_dwells,
     find_dwells,
-    from_table,
-    join,
-    Steadiness,
-    take,
+    join_dwells,
+    select_dwells,
+    SteadinessLimits,
 )
 
-__all__ = ['Dwells', 'Numbers', 'Steadiness', 'dwells', 'find_dwells', 'from_table', 'join',
-           'listed', 'take']
+__all__ = [
+    'Dwells', 'Numbers', 'SteadinessLimits', 'extract_dwells', 'find_dwells', 'dwells_from_table',
+    'join_dwells', 'format_list', 'select_dwells'
+]

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 import math
 from typing import Any
 
-from gyro_calibration.calibration.dwells.samples import duration, Numbers, Samples, slope
+from gyro_calibration.calibration.dwells.samples import duration, fit_slope, Numbers, Samples
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import quantization_step
@@ -26,10 +26,10 @@ from scipy.special import digamma, polygamma
 #: Limits of the number of batches of a dwell, whose scatter gives the deviation of the mean, and
 #: the minimum duration of each where there are more than four, s: a vibration of the table and the
 #: response of the gyro's filter average out in it.
-_FEWEST_BATCHES, _MOST_BATCHES, _BATCH = 4, 12, 0.75
+_MIN_BATCHES, _MAX_BATCHES, _MIN_BATCH_DURATION = 4, 12, 0.75
 
 
-def averaged(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array, Array]:
+def average_dwells(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array, Array]:
     """
     Return reference rate, output and its standard deviation of each dwell (Ojeda et al., eq. 6).
 
@@ -38,13 +38,14 @@ def averaged(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array,
     """
     durations = np.array([duration(samples.time, rows) for rows in dwells])
     halves = np.array([len(rows) // 2 for rows in dwells])
-    batches = np.clip(np.minimum(durations / _BATCH, halves),
-                      _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
+    batches = np.clip(np.minimum(durations / _MIN_BATCH_DURATION, halves),
+                      _MIN_BATCHES, _MAX_BATCHES).astype(int)
     average = _average_rates if samples.rate is not None else _average_slopes
-    rate, output, variance, blur = average(samples, dwells, batches)
+    rate, output, variance, encoder_deviation = average(samples, dwells, batches)
     # The variance of white noise in a mean is proportional to 1 / duration; so the product of
     # variance and duration is the same in all dwells.
-    deviation = np.sqrt(moderated(variance * durations, batches - 1) / durations + blur ** 2)
+    deviation = np.sqrt(
+        shrink_variances(variance * durations, batches - 1) / durations + encoder_deviation ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan)
 
 
@@ -54,8 +55,8 @@ def _average_rates(samples: Samples, dwells: Sequence[Numbers],
     assert samples.rate is not None
     rate, output, errors = ([values[rows] for rows in dwells]
                             for values in (samples.rate, samples.output, samples.error))
-    return (_each(np.mean, rate), _each(np.mean, output),
-            _each(_scatter_of_means, errors, batches), np.zeros(len(dwells)))
+    return (_map_to_array(np.mean, rate), _map_to_array(np.mean, output),
+            _map_to_array(_variance_from_batch_means, errors, batches), np.zeros(len(dwells)))
 
 
 def _average_slopes(samples: Samples, dwells: Sequence[Numbers],
@@ -72,35 +73,39 @@ def _average_slopes(samples: Samples, dwells: Sequence[Numbers],
     step = quantization_step(samples.heading)
     time, output, heading = ([values[rows] for rows in dwells]
                              for values in (samples.time, samples.output, samples.heading))
-    turned = list(map(integrate, time, output))
-    errors = [angle - samples.scale * reference for angle, reference in zip(turned, heading)]
+    gyro_angle = list(map(integrate, time, output))
+    errors = [angle - samples.scale * reference for angle, reference in zip(gyro_angle, heading)]
     # The scatter of the output includes the motion of the table, that of the error the steps of
     # the encoder. The smaller one is used.
-    variance = min((_each(_scatter_of_slopes, time, angles, batches)
-                    for angles in (turned, errors)), key=np.median)
-    blur = abs(samples.scale) * np.array([_blur(*each, step) for each in zip(time, heading)])
-    return _each(slope, time, heading), _each(slope, time, turned), variance, blur
+    variance = min((_map_to_array(_variance_from_batch_slopes, time, angles, batches)
+                    for angles in (gyro_angle, errors)), key=np.median)
+    encoder_deviation = (
+        abs(samples.scale)
+        * np.array([_encoder_slope_deviation(*each, step) for each in zip(time, heading)]))
+    return (_map_to_array(fit_slope, time,
+                          heading), _map_to_array(fit_slope, time,
+                                                  gyro_angle), variance, encoder_deviation)
 
 
-def _each(function: Callable[..., float], *columns: Iterable[Any]) -> Array:
+def _map_to_array(function: Callable[..., float], *columns: Iterable[Any]) -> Array:
     return np.array([function(*each) for each in zip(*columns)])
 
 
-def _scatter_of_means(error: Array, batches: int) -> float:
-    return _variance([batch.mean() for batch in np.array_split(error, batches)])
+def _variance_from_batch_means(error: Array, batches: int) -> float:
+    return _variance_of_mean([batch.mean() for batch in np.array_split(error, batches)])
 
 
-def _scatter_of_slopes(time: Array, angle: Array, batches: int) -> float:
-    return _variance([slope(*batch) for batch in zip(np.array_split(time, batches),
-                                                     np.array_split(angle, batches))])
+def _variance_from_batch_slopes(time: Array, angle: Array, batches: int) -> float:
+    return _variance_of_mean([fit_slope(*batch) for batch in zip(np.array_split(time, batches),
+                                                                 np.array_split(angle, batches))])
 
 
-def _variance(batches: Sequence[float]) -> float:
+def _variance_of_mean(batches: Sequence[float]) -> float:
     """Return the variance of the mean of all batches; noise may be correlated within a batch."""
     return float(np.var(batches, ddof=1)) / len(batches)
 
 
-def _blur(time: Array, heading: Array, step: float) -> float:
+def _encoder_slope_deviation(time: Array, heading: Array, step: float) -> float:
     """
     Return the standard deviation of a heading's slope, due to the steps of an encoder, rad/s.
 
@@ -117,7 +122,7 @@ def _blur(time: Array, heading: Array, step: float) -> float:
         0.35 / max(steps, 0.6), math.sqrt(min(steps, samples)) / samples)
 
 
-def moderated(variance: Array, freedom: Array) -> Array:
+def shrink_variances(variance: Array, dof: Array) -> Array:
     """
     Shrink variances toward their common value, by more if they are uncertain or agree.
 
@@ -129,20 +134,22 @@ def moderated(variance: Array, freedom: Array) -> Array:
     Parameters
     ----------
     variance : shape (n,)
-    freedom : degrees of freedom of each, shape (n,)
+    dof : degrees of freedom of each, shape (n,)
 
     """
     known = variance > 0.0
     if known.sum() < 3:
         return variance
-    own = freedom[known] / 2.0
-    logarithm = np.log(variance[known]) - digamma(own) + np.log(own)
-    excess = float(logarithm.var(ddof=1) - polygamma(1, own).mean())
+    half_dof = dof[known] / 2.0
+    logarithm = np.log(variance[known]) - digamma(half_dof) + np.log(half_dof)
+    excess = float(logarithm.var(ddof=1) - polygamma(1, half_dof).mean())
     if excess <= 0.0:
-        return np.full(len(variance), np.average(variance[known], weights=own))
-    prior = 2.0 * _inverse_trigamma(excess)
-    common = math.exp(logarithm.mean() + digamma(prior / 2.0) - math.log(prior / 2.0))
-    return np.where(known, (prior * common + freedom * variance) / (prior + freedom), common)
+        return np.full(len(variance), np.average(variance[known], weights=half_dof))
+    prior_dof = 2.0 * _inverse_trigamma(excess)
+    common_variance = math.exp(logarithm.mean() + digamma(prior_dof / 2.0)
+                               - math.log(prior_dof / 2.0))
+    return np.where(known, (prior_dof * common_variance + dof * variance) / (prior_dof + dof),
+                    common_variance)
 
 
 def _inverse_trigamma(value: float) -> float:

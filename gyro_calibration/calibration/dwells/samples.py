@@ -16,18 +16,18 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
-from gyro_calibration.logs.quality import runs
+from gyro_calibration.logs.quality import find_runs
+from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.logs.stamps import Integers as Numbers
-from gyro_calibration.logs.stamps import lost_samples
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 #: Minimum number of samples of a dwell.
-FEWEST = 8
+MIN_DWELL_SAMPLES = 8
 #: Longest interval between two values of a reference with none lost, in median intervals.
-_LOST = 1.5
+_MAX_INTERVAL_RATIO = 1.5
 #: Longer intervals than this are not used for the sample rate, s.
-_PAUSE = 1.0
+_MAX_SAMPLE_INTERVAL = 1.0
 
 
 class Samples(NamedTuple):
@@ -46,51 +46,52 @@ class Samples(NamedTuple):
         return self.output if self.rate is None else self.output - self.scale * self.rate
 
 
-def usable(log: Log) -> tuple[Samples, list[str]]:
+def select_usable_samples(log: Log) -> tuple[Samples, list[str]]:
     """Return the samples with output and reference, none near a lost reference, and remarks."""
-    output, time = output_of(log), log.time
+    output, time = require_output(log), log.time
     reference = log.reference_heading if log.reference_rate is None else log.reference_rate
     if time is None or reference is None:
         raise DataRefused('the log has no time or no reference; to find dwells it needs time_s '
                           'and one of reference_rate_dps and reference_heading_deg')
     known = np.isfinite(reference)
-    lost = where_lost(known)
+    lost = find_lost_reference(known)
     # A reference has errors up to 0.05 s before and after a loss: motion capture loses its markers
     # one by one.
-    good = np.flatnonzero(~maximum_filter1d(lost, 2 * count(time, 0.05) + 1)
+    good = np.flatnonzero(~maximum_filter1d(lost, 2 * count_samples(time, 0.05) + 1)
                           & known & np.isfinite(output))
-    if len(good) < FEWEST:
+    if len(good) < MIN_DWELL_SAMPLES:
         raise DataRefused(f'{len(good)} of {len(time)} samples hold both a gyro output and '
                           'a reference; check the columns')
     rate, heading, temperature = (
         None if values is None else values[good]
         for values in (log.reference_rate, log.reference_heading, log.temperature))
-    places = [f'{time[run.start]:.2f} s' for run in runs(lost)]
-    remark = (f'the reference was lost {times(len(places))}, for {lost.sum()} samples, '
-              f'at {listed(places)}; they are left out')
+    places = [f'{time[run.start]:.2f} s' for run in find_runs(lost)]
+    remark = (f'the reference was lost {format_occurrences(len(places))}, for {lost.sum()} '
+              'samples, '
+              f'at {format_list(places)}; they are left out')
     return (Samples(time[good], output[good], rate, heading, temperature),
             [remark] if places else [])
 
 
-def where_lost(known: Mask) -> Mask:
+def find_lost_reference(known: Mask) -> Mask:
     """Mark samples without a reference, where its values are above 1.5 median intervals apart."""
     apart = np.diff(np.flatnonzero(known), prepend=-1, append=len(known))
     usual = float(np.median(apart[1:-1])) if len(apart) > 2 else 1.0
     lost = ~known
-    lost[~known] = np.repeat(apart > _LOST * usual, apart - 1)
+    lost[~known] = np.repeat(apart > _MAX_INTERVAL_RATIO * usual, apart - 1)
     return lost
 
 
-def between_values(time: Array, values: Array) -> Array:
+def interpolate_reference(time: Array, values: Array) -> Array:
     """Return a slow reference at each sample, linear between its values; nan where it is lost."""
     known = np.isfinite(values)
     if known.all() or not known.any():
         return values
-    return np.where(where_lost(known), np.nan,
+    return np.where(find_lost_reference(known), np.nan,
                     np.interp(time, time[known], values[known], np.nan, np.nan))
 
 
-def output_of(log: Log) -> Array:
+def require_output(log: Log) -> Array:
     """Return the output of a log, or refuse it."""
     if log.output is None:
         raise DataRefused('the log holds no gyro output in rad/s; with gyro_counts alone, say how '
@@ -98,28 +99,29 @@ def output_of(log: Log) -> Array:
     return log.output
 
 
-def missing(log: Log, samples: Samples, dwells: Sequence[Numbers]) -> Iterator[str]:
+def describe_missing_samples(log: Log, samples: Samples,
+                             dwells: Sequence[Numbers]) -> Iterator[str]:
     """Yield a remark on lost gyro samples within the dwells, or on stamps too irregular."""
     assert log.time is not None and log.output is not None
     time = log.time[np.isfinite(log.output)]
-    lost = lost_samples(time)
+    lost = count_lost_samples(time)
     if lost is None:
         yield 'the stamps are too irregular to count lost samples'
         return
     gaps = np.flatnonzero((lost > 0) & (
-        np.interp(time[1:], samples.time, inside(samples, dwells)) > 0.5))
+        np.interp(time[1:], samples.time, mark_dwells(samples, dwells)) > 0.5))
     if len(gaps):
         yield (f'samples missing within the dwells: {lost[gaps].sum()}, '
-               f'after {listed([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
+               f'after {format_list([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
                'constant rate the means are not affected')
 
 
-def inside(samples: Samples, dwells: Sequence[Numbers]) -> Mask:
+def mark_dwells(samples: Samples, dwells: Sequence[Numbers]) -> Mask:
     """Mark the samples within dwells, including those that were left out of them."""
-    mask = np.zeros(len(samples.time), dtype=bool)
+    in_dwells = np.zeros(len(samples.time), dtype=bool)
     for rows in dwells:
-        mask[rows[0]:rows[-1] + 1] = True
-    return mask
+        in_dwells[rows[0]:rows[-1] + 1] = True
+    return in_dwells
 
 
 def duration(time: Array, part: slice | Numbers) -> float:
@@ -128,24 +130,25 @@ def duration(time: Array, part: slice | Numbers) -> float:
     return float(within[-1] - within[0])
 
 
-def count(time: Array, span: float) -> int:
+def count_samples(time: Array, span: float) -> int:
     """Return the number of samples in a span by the mean interval; stamps may come in bursts."""
     steps = np.diff(time)
-    return round(span / float(steps[steps < _PAUSE].mean())) if (steps < _PAUSE).any() else 0
+    return (round(span / float(steps[steps < _MAX_SAMPLE_INTERVAL].mean())) if
+            (steps < _MAX_SAMPLE_INTERVAL).any() else 0)
 
 
-def slope(place: Array, values: Array) -> float:
+def fit_slope(x: Array, values: Array) -> float:
     """Return the slope of the straight line through some values."""
-    centred = place - place.mean()
+    centred = x - x.mean()
     return float(centred @ values / (centred @ centred))
 
 
-def times(number: int) -> str:
+def format_occurrences(number: int) -> str:
     """Return 'once', or the number and 'times'."""
     return 'once' if number == 1 else f'{number} times'
 
 
-def listed(words: Sequence[str], most: int = 5) -> str:
+def format_list(items: Sequence[str], limit: int = 5) -> str:
     """Return the first words, separated by commas, and the number of further ones."""
-    return ', '.join(words[:most]) + (
-        f' and {len(words) - most} more' if len(words) > most else '')
+    return ', '.join(items[:limit]) + (
+        f' and {len(items) - limit} more' if len(items) > limit else '')

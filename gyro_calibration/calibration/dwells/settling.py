@@ -15,57 +15,60 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gyro_calibration.calibration.dwells.samples import duration, Numbers, Samples
-from gyro_calibration.calibration.dwells.steadiness import Steadiness
+from gyro_calibration.calibration.dwells.steadiness import SteadinessLimits
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 #: Longest ramp between two dwells, s.
-_APART = 5.0
+_MAX_RAMP_DURATION = 5.0
 
 
-def settled(samples: Samples, dwells: Sequence[Numbers],
-            limits: Steadiness) -> tuple[list[Numbers], str]:
+def trim_settling(samples: Samples, dwells: Sequence[Numbers],
+                  limits: SteadinessLimits) -> tuple[list[Numbers], str]:
     """Cut margin or settling time, if longer, off both ends of dwells; return a remark."""
     time, error = samples.time, samples.error
-    change = np.diff([np.median(samples.output[rows]) for rows in dwells])
-    apart = np.array([time[later[0]] - time[rows[-1]] for rows, later in zip(dwells, dwells[1:])])
-    change = np.where(apart < _APART, change, 0.0)
+    rate_change = np.diff([np.median(samples.output[rows]) for rows in dwells])
+    spacing = np.array(
+        [time[later[0]] - time[rows[-1]] for rows, later in zip(dwells, dwells[1:])])
+    rate_change = np.where(spacing < _MAX_RAMP_DURATION, rate_change, 0.0)
     mirrored = [(len(time) - 1 - rows)[::-1] for rows in dwells[:-1]]
-    after = max(limits.margin, _settling(time, error, dwells[1:], change, limits.settling))
-    before = max(limits.margin,
-                 _settling(-time[::-1], error[::-1], mirrored, -change, limits.settling))
+    after = max(limits.margin,
+                _settling_time(time, error, dwells[1:], rate_change, limits.max_settling_time))
+    before = max(
+        limits.margin,
+        _settling_time(-time[::-1], error[::-1], mirrored, -rate_change, limits.max_settling_time))
     kept = [rows[(time[rows] >= time[rows[0]] + after) & (time[rows] <= time[rows[-1]] - before)]
             for rows in dwells]
     return kept, f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut away'
 
 
-def _settling(time: Array, error: Array, dwells: Sequence[Numbers], change: Array,
-              longest: float) -> float:
+def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers], rate_change: Array,
+                   max_settling: float) -> float:
     """Return the settling time of the output after a ramp, s."""
     durations = np.array([duration(time, rows) for rows in dwells])
     if not len(durations):
         return 0.0
     interval = max(0.05, float(np.median(np.diff(time))))
-    bins = int(min(np.quantile(durations, 0.25), 3.0 * longest) / interval)
+    bins = int(min(np.quantile(durations, 0.25), 3.0 * max_settling) / interval)
     edges = np.arange(bins + 1) * interval
     used = durations >= edges[-1]
-    if not change[used].any():
+    if not rate_change[used].any():
         return 0.0
-    means = np.array([_binned(time[rows] - time[rows[0]], error[rows], edges)
+    means = np.array([_average_in_bins(time[rows] - time[rows[0]], error[rows], edges)
                       for rows, wanted in zip(dwells, used) if wanted])
-    answer = _answer(means, change[used])
+    response = _unit_step_response(means, rate_change[used])
     # single bins, and means of four
-    return max(_last_seen(answer, width) for width in (1, 4)) * interval
+    return max(_count_unsettled_bins(response, width) for width in (1, 4)) * interval
 
 
-def _binned(time: Array, values: Array, edges: Array) -> Array:
+def _average_in_bins(time: Array, values: Array, edges: Array) -> Array:
     """Return the mean of the values in each bin, with gaps bridged by lines."""
     return np.diff(np.interp(edges, time, integrate(time, values))) / np.diff(edges)
 
 
-def _answer(means: Array, change: Array) -> Array:
+def _unit_step_response(means: Array, rate_change: Array) -> Array:
     """
     Return the response to a unit of change in each bin, from means of shape (dwells, bins).
 
@@ -74,10 +77,10 @@ def _answer(means: Array, change: Array) -> Array:
 
     """
     late = means[:, means.shape[1] // 2:].mean(axis=1, keepdims=True)
-    return change @ (means - late) / (change @ change)
+    return rate_change @ (means - late) / (rate_change @ rate_change)
 
 
-def _last_seen(answer: Array, width: int) -> int:
+def _count_unsettled_bins(response: Array, width: int) -> int:
     """
     Return the number of bins until the response stays within four standard deviations of noise.
 
@@ -85,13 +88,13 @@ def _last_seen(answer: Array, width: int) -> int:
     standard deviation of the response in the last half.
 
     """
-    if len(answer) < 8 * width:
+    if len(response) < 8 * width:
         return 0
-    smooth = uniform_filter1d(answer, width, mode='nearest')
+    smooth = uniform_filter1d(response, width, mode='nearest')
     # A response below 20 ppm of the change of rate is not cut, even without noise.
     spread = max(float(smooth[len(smooth) // 2:].std()), 2e-5)
-    last = -1
+    last_unsettled = -1
     for place in np.flatnonzero(np.abs(smooth[:len(smooth) // 3]) > 4.0 * spread):
         # After ten bins within the limit the response has ended; later ones exceed it by chance.
-        last = int(place) if place - last <= 10 else last
-    return last + 1 + width // 2 if last >= 0 else 0
+        last_unsettled = int(place) if place - last_unsettled <= 10 else last_unsettled
+    return last_unsettled + 1 + width // 2 if last_unsettled >= 0 else 0

@@ -15,87 +15,93 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 import math
 
-from gyro_calibration.calibration.dwells.samples import duration, Numbers, slope
-from gyro_calibration.calibration.dwells.steadiness import Steadiness
+from gyro_calibration.calibration.dwells.samples import duration, fit_slope, Numbers
+from gyro_calibration.calibration.dwells.steadiness import SteadinessLimits
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.logs.quality import quantization_step
 import numpy as np
 
 #: Duration of the blocks in which the heading is averaged, s.
-_BLOCK = 0.1
+_BLOCK_DURATION = 0.1
 
 
 def _length(part: slice) -> int:
     return int(part.stop - part.start)
 
 
-def straight(time: Array, heading: Array, limits: Steadiness) -> list[slice]:
+def find_straight_heading(time: Array, heading: Array, limits: SteadinessLimits) -> list[slice]:
     """Return the stretches whose reference heading is straight."""
     step = quantization_step(heading)
-    edges, times, headings = _blocks(time, heading)
-    tolerance = step + _crookedness(headings, limits.heading)
-    cones = [cone for cone in _cones(times, headings, 2.0 * tolerance, limits.gap)
-             if duration(times, cone) >= 0.5 * limits.duration]
-    parts = _apart(_walked(times, headings, cone, tolerance, step) for cone in cones)
+    edges, times, headings = _average_blocks(time, heading)
+    tolerance = step + _straightness_tolerance(headings, limits.max_heading_deviation)
+    stretches = [
+        cone for cone in _split_into_lines(times, headings, 2.0 * tolerance, limits.max_gap)
+        if duration(times, cone) >= 0.5 * limits.min_duration
+    ]
+    parts = _drop_overlaps(
+        _extend_line(times, headings, cone, tolerance, step) for cone in stretches)
     whole = [slice(int(edges[part.start]), int(edges[part.stop]))
              for part in parts if _length(part) > 4]
-    return [part for part in whole if _holds_its_slope(time[part], heading[part], step, limits)]
+    return [part for part in whole if _has_constant_slope(time[part], heading[part], step, limits)]
 
 
-def _blocks(time: Array, heading: Array) -> tuple[Numbers, Array, Array]:
+def _average_blocks(time: Array, heading: Array) -> tuple[Numbers, Array, Array]:
     """Return where blocks begin and the last one ends, and their mean times and headings."""
-    first = np.unique(np.floor((time - time[0]) / _BLOCK), return_index=True)[1]
+    first = np.unique(np.floor((time - time[0]) / _BLOCK_DURATION), return_index=True)[1]
     edges = np.append(first, len(time))
     times, headings = (np.add.reduceat(values, first) / np.diff(edges)
                        for values in (time, heading))
     return edges, times, headings
 
 
-def _crookedness(heading: Array, most: float) -> float:
+def _straightness_tolerance(heading: Array, upper_limit: float) -> float:
     """Return three times the median deviation from a straight line within 1 s, rad, clipped."""
     # A vibration of the table cancels over a whole number of its periods, so several lengths are
     # used.
-    reaches = [reach for reach in (2, 3, 5) if len(heading) > 2 * reach]
+    lengths = [reach for reach in (2, 3, 5) if len(heading) > 2 * reach]
     deviations = [
         np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach]))
-        for reach in reaches]
+        for reach in lengths]
     deviation = max((float(np.median(each)) for each in deviations), default=math.inf)
-    return float(np.clip(3.0 * deviation, 0.02 * DEGREE, most))
+    return float(np.clip(3.0 * deviation, 0.02 * DEGREE, upper_limit))
 
 
-def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterator[slice]:
+def _split_into_lines(time: Array, heading: Array, tolerance: float,
+                      gap: float) -> Iterator[slice]:
     """Divide a heading into the longest stretches that a line through their first point fits."""
     start, low, high = 0, -math.inf, math.inf
     times, headings = time.tolist(), heading.tolist()
     for place in range(1, len(times)):
-        since = times[place] - times[start]
+        elapsed = times[place] - times[start]
         rise = headings[place] - headings[start]
-        low, high = max(low, (rise - tolerance) / since), min(high, (rise + tolerance) / since)
+        low, high = max(low, (rise - tolerance) / elapsed), min(high, (rise + tolerance) / elapsed)
         if low > high or times[place] - times[place - 1] > gap:
             yield slice(start, place)
             start, low, high = place, -math.inf, math.inf
     yield slice(start, len(times))
 
 
-def _walked(time: Array, heading: Array, cone: slice, tolerance: float, step: float) -> slice:
+def _extend_line(time: Array, heading: Array, stretch: slice, tolerance: float,
+                 step: float) -> slice:
     """Fit a line to the middle of a stretch, extend it within the tolerance, exclude the ramps."""
-    fifth = _length(cone) // 5
-    middle = slice(cone.start + fifth, cone.stop - fifth)
+    fifth = _length(stretch) // 5
+    middle = slice(stretch.start + fifth, stretch.stop - fifth)
     # By at most its own length at both ends, so that the time is linear in the length of the log.
-    first, last = max(0, cone.start - _length(cone)), min(len(time), cone.stop + _length(cone))
-    line = heading[middle].mean() + slope(time[middle], heading[middle]) * (
+    first, last = (max(0, stretch.start - _length(stretch)),
+                   min(len(time), stretch.stop + _length(stretch)))
+    line = heading[middle].mean() + fit_slope(time[middle], heading[middle]) * (
         time[first:last] - time[middle].mean())
     deviation = np.abs(heading[first:last] - line)
     beyond = np.flatnonzero(deviation > tolerance)
     before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
     begin = (0 if not len(before) else
-             int(before[-1]) + 1 + _step_back(deviation[before[-1]::-1], tolerance, step))
+             int(before[-1]) + 1 + _count_ramp_blocks(deviation[before[-1]::-1], tolerance, step))
     end = (len(deviation) if not len(after) else
-           int(after[0]) - _step_back(deviation[after[0]:], tolerance, step))
+           int(after[0]) - _count_ramp_blocks(deviation[after[0]:], tolerance, step))
     return slice(first + begin, first + max(begin, end))
 
 
-def _step_back(deviation: Array, tolerance: float, step: float) -> int:
+def _count_ramp_blocks(deviation: Array, tolerance: float, step: float) -> int:
     """
     Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
 
@@ -103,14 +109,15 @@ def _step_back(deviation: Array, tolerance: float, step: float) -> int:
     two deviations gives its beginning; a short ramp began later.
 
     """
-    reach = round(0.5 / _BLOCK)
-    if len(deviation) <= reach:
+    reference_block = round(0.5 / _BLOCK_DURATION)
+    if len(deviation) <= reference_block:
         return 0
-    ratio = math.sqrt(max(1.0, deviation[reach] / (tolerance + 0.5 * step)))
-    return math.ceil(min(3.0 / _BLOCK, reach / (ratio - 1.0) if ratio > 1.0 else math.inf))
+    ratio = math.sqrt(max(1.0, deviation[reference_block] / (tolerance + 0.5 * step)))
+    return math.ceil(
+        min(3.0 / _BLOCK_DURATION, reference_block / (ratio - 1.0) if ratio > 1.0 else math.inf))
 
 
-def _apart(parts: Iterable[slice]) -> list[slice]:
+def _drop_overlaps(parts: Iterable[slice]) -> list[slice]:
     """Keep the longer of two stretches that overlap: its line is more accurate."""
     kept: list[slice] = []
     for part in parts:
@@ -121,12 +128,15 @@ def _apart(parts: Iterable[slice]) -> list[slice]:
     return kept
 
 
-def _holds_its_slope(time: Array, heading: Array, step: float, limits: Steadiness) -> bool:
+def _has_constant_slope(time: Array, heading: Array, step: float,
+                        limits: SteadinessLimits) -> bool:
     """Return whether the quarters of a stretch have one slope, unlike those of a slow swing."""
     quarters = [quarter for quarter in np.array_split(np.arange(len(time)), 4) if len(quarter) > 2]
     if not quarters:
         return True
-    slopes = np.array([slope(time[quarter], heading[quarter]) for quarter in quarters])
+    slopes = np.array([fit_slope(time[quarter], heading[quarter]) for quarter in quarters])
     blur = 8.0 * step / (time[-1] - time[0])
-    return bool(np.ptp(slopes)
-                <= 2.0 * (limits.rate + limits.relative * np.abs(slopes).max()) + blur)
+    return bool(
+        np.ptp(slopes) <= 2.0
+        * (limits.max_rate_deviation + limits.relative_rate_deviation * np.abs(slopes).max())
+        + blur)

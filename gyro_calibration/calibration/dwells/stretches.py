@@ -24,29 +24,29 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells.samples import (
+    describe_missing_samples,
     duration,
-    FEWEST,
-    inside,
-    listed,
-    missing,
+    fit_slope,
+    format_list,
+    format_occurrences,
+    mark_dwells,
+    MIN_DWELL_SAMPLES,
     Numbers,
     Samples,
-    slope,
-    times,
-    usable,
+    select_usable_samples,
 )
-from gyro_calibration.calibration.dwells.settling import settled
-from gyro_calibration.calibration.dwells.steadiness import Steadiness, steady
-from gyro_calibration.calibration.dwells.straightness import straight
+from gyro_calibration.calibration.dwells.settling import trim_settling
+from gyro_calibration.calibration.dwells.steadiness import find_steady_rate, SteadinessLimits
+from gyro_calibration.calibration.dwells.straightness import find_straight_heading
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
-from gyro_calibration.logs.quality import outliers, repeated_samples, runs
+from gyro_calibration.logs.quality import find_runs, mask_outliers, mask_repeated_samples
 import numpy as np
 
 #: Number of parts of a dwell whose mean temperatures are compared.
-_PARTS = 12
+_TEMPERATURE_PARTS = 12
 
 
-class Stretches(NamedTuple):
+class DwellRows(NamedTuple):
     """The rows of each dwell, and remarks on samples that were left out."""
 
     samples: Samples
@@ -54,17 +54,17 @@ class Stretches(NamedTuple):
     remarks: tuple[str, ...]
 
     @property
-    def duration(self) -> float:
+    def dwell_duration(self) -> float:
         """Return the time in dwells, s."""
         return float(sum(duration(self.samples.time, rows) for rows in self.rows))
 
     @property
-    def share(self) -> float:
+    def dwell_share(self) -> float:
         """Return the part of the log that is in dwells."""
-        return self.duration / float(self.samples.time[-1] - self.samples.time[0])
+        return self.dwell_duration / float(self.samples.time[-1] - self.samples.time[0])
 
 
-def find_stretches(log: Log, limits: Steadiness) -> Stretches:
+def find_dwell_rows(log: Log, limits: SteadinessLimits) -> DwellRows:
     """
     Find the dwells by the reference rate, or by the reference heading where more of it is steady.
 
@@ -74,114 +74,124 @@ def find_stretches(log: Log, limits: Steadiness) -> Stretches:
 
     """
     by_rate, by_heading = replace(log, reference_heading=None), replace(log, reference_rate=None)
-    if not _known(log.reference_rate):
-        found = _found(by_heading, limits)
-    elif not _known(log.reference_heading):
-        found = _found(by_rate, limits)
+    if not _has_values(log.reference_rate):
+        found = _find_by_reference(by_heading, limits)
+    elif not _has_values(log.reference_heading):
+        found = _find_by_reference(by_rate, limits)
     else:
         # A rate derived from the steps of a coarse encoder is hardly ever steady; the heading may
         # be straight.
-        found, other = _found(by_rate, limits), _found(by_heading, limits)
-        found = found if found.duration > 0.9 * other.duration else other
-    if found.share < limits.share:
-        raise DataRefused(_not_steady(found, limits))
-    if found.share > 0.25:
+        found, other = _find_by_reference(by_rate, limits), _find_by_reference(by_heading, limits)
+        found = found if found.dwell_duration > 0.9 * other.dwell_duration else other
+    if found.dwell_share < limits.min_dwell_share:
+        raise DataRefused(_format_unsteady(found, limits))
+    if found.dwell_share > 0.25:
         return found
     return found._replace(remarks=(
-        *found.remarks, f'only {100.0 * found.share:.0f} % of the time is in dwells; --method '
+        *found.remarks, f'only {100.0 * found.dwell_share:.0f} % of the time is in dwells; '
+                        '--method '
         'likelihood uses all of it, where there is a heading'))
 
 
-def _known(reference: Array | None) -> bool:
+def _has_values(reference: Array | None) -> bool:
     return reference is not None and bool(np.isfinite(reference).any())
 
 
-def _not_steady(found: Stretches, limits: Steadiness) -> str:
+def _format_unsteady(found: DwellRows, limits: SteadinessLimits) -> str:
     line = ('' if found.samples.heading is None
-            else f' and straight to {limits.heading / DEGREE:g} deg')
-    return (f'the reference is steady to {limits.rate / DEGREE:g} deg/s{line}, for '
-            f'{limits.duration:g} s at a time without the settling, in '
-            f'{100.0 * found.share:.0f} % of the log; hold each rate for longer, or use the '
+            else f' and straight to {limits.max_heading_deviation / DEGREE:g} deg')
+    return (f'the reference is steady to {limits.max_rate_deviation / DEGREE:g} deg/s{line}, for '
+            f'{limits.min_duration:g} s at a time without the settling, in '
+            f'{100.0 * found.dwell_share:.0f} % of the log; hold each rate for longer, or use the '
             'heading itself with --method likelihood')
 
 
-def _found(log: Log, limits: Steadiness) -> Stretches:
+def _find_by_reference(log: Log, limits: SteadinessLimits) -> DwellRows:
     """Find the dwells in a log with one reference."""
-    samples, lost = usable(log)
-    parts = [part for part in _calm(samples, limits)
-             if duration(samples.time, part) > limits.duration]
-    samples = samples._replace(scale=_scale(samples, parts))
-    outlying, repeated = np.zeros((2, len(samples.time)), dtype=bool)
+    samples, lost = select_usable_samples(log)
+    parts = [part for part in _find_steady_parts(samples, limits)
+             if duration(samples.time, part) > limits.min_duration]
+    samples = samples._replace(scale=_estimate_scale(samples, parts))
+    is_outlier, is_repeated = np.zeros((2, len(samples.time)), dtype=bool)
     kept = []
     for part in parts:
-        repeated[part] = repeated_samples(samples.output[part])
-        fresh = np.arange(part.start, part.stop)[~repeated[part]]
-        outlying[fresh] = outliers(samples.error[fresh], limits.outlier)
-        kept.append(fresh[~outlying[fresh]])
-    whole, cut = settled(samples, kept, limits)
-    whole, divided = _divided(samples, whole, limits)
-    rows = [part for part in whole
-            if len(part) >= FEWEST and duration(samples.time, part) >= limits.duration]
+        is_repeated[part] = mask_repeated_samples(samples.output[part])
+        fresh = np.arange(part.start, part.stop)[~is_repeated[part]]
+        is_outlier[fresh] = mask_outliers(samples.error[fresh], limits.outlier_threshold)
+        kept.append(fresh[~is_outlier[fresh]])
+    whole, cut = trim_settling(samples, kept, limits)
+    whole, divided = _split_by_temperature(samples, whole, limits)
+    rows = [
+        part for part in whole
+        if len(part) >= MIN_DWELL_SAMPLES and duration(samples.time, part) >= limits.min_duration
+    ]
     if short := len(whole) - len(rows):
-        lost.append(f'steady stretches shorter than {limits.duration:g} s without the settling, '
+        lost.append(f'steady stretches shorter than {limits.min_duration:g} s without the '
+                    'settling, '
                     f'left out: {short}')
-    return Stretches(samples, rows, (*lost, cut, *divided,
-                                     *_left_out(samples, rows, outlying, repeated),
-                                     *missing(log, samples, rows)))
+    return DwellRows(samples, rows, (*lost, cut, *divided,
+                                     *_describe_left_out(samples, rows, is_outlier, is_repeated),
+                                     *describe_missing_samples(log, samples, rows)))
 
 
-def _left_out(samples: Samples, dwells: list[Numbers], outlying: Mask,
-              repeated: Mask) -> Iterator[str]:
+def _describe_left_out(samples: Samples, dwells: list[Numbers], is_outlier: Mask,
+                       is_repeated: Mask) -> Iterator[str]:
     """Yield remarks on the outliers and repeated samples within the dwells."""
-    within = inside(samples, dwells)
-    places = [f'{time:.2f} s' for time in samples.time[outlying & within]]
+    within = mark_dwells(samples, dwells)
+    places = [f'{time:.2f} s' for time in samples.time[is_outlier & within]]
     if places:
-        yield f'outliers, left out: {len(places)}, at {listed(places)}'
+        yield f'outliers, left out: {len(places)}, at {format_list(places)}'
     places = [f'{samples.time[run.start]:.2f} s ({run.stop - run.start} samples)'
-              for run in runs(repeated & within)]
+              for run in find_runs(is_repeated & within)]
     if places:
-        yield (f'the output was repeated {times(len(places))}, at {listed(places)}; '
+        yield (f'the output was repeated {format_occurrences(len(places))}, at '
+               f'{format_list(places)}; '
                'the repeats are left out')
 
 
-def _calm(samples: Samples, limits: Steadiness) -> list[slice]:
+def _find_steady_parts(samples: Samples, limits: SteadinessLimits) -> list[slice]:
     if samples.rate is not None:
-        return steady(samples.time, samples.rate, limits)
+        return find_steady_rate(samples.time, samples.rate, limits)
     assert samples.heading is not None
-    return straight(samples.time, samples.heading, limits)
+    return find_straight_heading(samples.time, samples.heading, limits)
 
 
-def _scale(samples: Samples, parts: list[slice]) -> float:
+def _estimate_scale(samples: Samples, parts: list[slice]) -> float:
     """Return the approximate ratio of output to reference, of any sign and unit."""
-    rate = np.array([_rate(samples, part) for part in parts])
+    rate = np.array([_mean_reference_rate(samples, part) for part in parts])
     output = np.array([np.median(samples.output[part]) for part in parts])
     # Rests alone do not determine it.
-    return slope(rate, output) if len(rate) > 1 and np.ptp(rate) > 1.0 * DEGREE else 1.0
+    return fit_slope(rate, output) if len(rate) > 1 and np.ptp(rate) > 1.0 * DEGREE else 1.0
 
 
-def _rate(samples: Samples, part: slice) -> float:
+def _mean_reference_rate(samples: Samples, part: slice) -> float:
     if samples.rate is not None:
         return float(samples.rate[part].mean())
     assert samples.heading is not None
-    return slope(samples.time[part], samples.heading[part])
+    return fit_slope(samples.time[part], samples.heading[part])
 
 
-def _divided(samples: Samples, dwells: list[Numbers],
-             limits: Steadiness) -> tuple[list[Numbers], list[str]]:
+def _split_by_temperature(samples: Samples, dwells: list[Numbers],
+                          limits: SteadinessLimits) -> tuple[list[Numbers], list[str]]:
     """Divide the dwells in which the temperature changes, so that its slope can be fitted."""
     if samples.temperature is None:
         return dwells, []
-    pieces = [_pieces(samples.time[rows], samples.temperature[rows], limits) for rows in dwells]
+    pieces = [
+        _count_temperature_parts(samples.time[rows], samples.temperature[rows], limits)
+        for rows in dwells
+    ]
     parts = [part for rows, number in zip(dwells, pieces) for part in np.array_split(rows, number)]
     more = len(parts) - len(dwells)
-    remark = (f'dwells that warmed or cooled by more than {limits.temperature:g} K are divided, '
+    remark = (f'dwells that warmed or cooled by more than {limits.max_temperature_change:g} K are '
+              'divided, '
               f'which makes {more} more')
     return parts, [remark] if more else []
 
 
-def _pieces(time: Array, temperature: Array, limits: Steadiness) -> int:
-    if len(temperature) < 2 * _PARTS:
+def _count_temperature_parts(time: Array, temperature: Array, limits: SteadinessLimits) -> int:
+    if len(temperature) < 2 * _TEMPERATURE_PARTS:
         return 1
-    change = float(np.ptp([part.mean() for part in np.array_split(temperature, _PARTS)]))
-    return max(1, min(math.ceil(change / limits.temperature),
-                      int((time[-1] - time[0]) / limits.duration)))
+    change = float(
+        np.ptp([part.mean() for part in np.array_split(temperature, _TEMPERATURE_PARTS)]))
+    return max(1, min(math.ceil(change / limits.max_temperature_change),
+                      int((time[-1] - time[0]) / limits.min_duration)))

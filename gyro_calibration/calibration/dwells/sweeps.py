@@ -19,18 +19,18 @@ from gyro_calibration.logs.log import Array, DEGREE
 import numpy as np
 
 #: If the median sweep has fewer dwells than this, the order of the rates is taken as random.
-_SHORTEST = 4
+_MIN_SWEEP_DWELLS = 4
 #: Blocks of consecutive dwells, where the order shows no sweeps.
-_BLOCKS = 9
+_BLOCK_COUNT = 9
 
 
-def numbered(names: Sequence[str]) -> Numbers:
+def number_named_sweeps(names: Sequence[str]) -> Numbers:
     """Give sweeps that have names their numbers, in the order in which they come."""
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
     return np.array([numbers[name] for name in names])
 
 
-def sweeps(rate: Array) -> Numbers:
+def number_sweeps(rate: Array) -> Numbers:
     """
     Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
 
@@ -43,16 +43,16 @@ def sweeps(rate: Array) -> Numbers:
     for used in (np.full(len(rate), True), turning) if turning.any() else ():
         for value in (rate, np.abs(rate)):
             sweep = np.zeros(len(rate), dtype=int)
-            sweep[used] = _passes(value[used])
+            sweep[used] = _number_passes(value[used])
             # A rest belongs to the dwell before it.
             sweep = np.maximum.accumulate(np.where(used, sweep, 0))
             lengths = np.bincount(sweep[used])
-            if len(lengths) > 1 and np.median(lengths) >= _SHORTEST:
+            if len(lengths) > 1 and np.median(lengths) >= _MIN_SWEEP_DWELLS:
                 return sweep
-    return np.arange(len(rate)) * min(_BLOCKS, len(rate)) // len(rate)
+    return np.arange(len(rate)) * min(_BLOCK_COUNT, len(rate)) // len(rate)
 
 
-def _passes(value: Array) -> Numbers:
+def _number_passes(value: Array) -> Numbers:
     """Assign numbers to passes through values; a pass begins where the direction reverses."""
     change = np.diff(value)
     # Mean rates of opposite sign differ slightly in absolute value.
@@ -60,8 +60,8 @@ def _passes(value: Array) -> Numbers:
     numbers = np.zeros(len(value), dtype=int)
     direction = 0.0
     for place, step in enumerate(steps, 1):
-        turned = step * direction < 0.0
-        numbers[place] = numbers[place - 1] + turned
+        is_reversed = step * direction < 0.0
+        numbers[place] = numbers[place - 1] + is_reversed
         # The jump back to the start of the next pass does not show its direction.
-        direction = 0.0 if turned else direction or step
+        direction = 0.0 if is_reversed else direction or step
     return numbers

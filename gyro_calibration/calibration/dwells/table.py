@@ -15,11 +15,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gyro_calibration.calibration.dwells.averaging import averaged
-from gyro_calibration.calibration.dwells.samples import listed, Numbers, output_of
-from gyro_calibration.calibration.dwells.steadiness import Steadiness
-from gyro_calibration.calibration.dwells.stretches import find_stretches
-from gyro_calibration.calibration.dwells.sweeps import numbered, sweeps
+from gyro_calibration.calibration.dwells.averaging import average_dwells
+from gyro_calibration.calibration.dwells.samples import format_list, Numbers, require_output
+from gyro_calibration.calibration.dwells.steadiness import SteadinessLimits
+from gyro_calibration.calibration.dwells.stretches import find_dwell_rows
+from gyro_calibration.calibration.dwells.sweeps import number_named_sweeps, number_sweeps
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 import numpy as np
 
@@ -38,7 +38,7 @@ class Dwells:
         it is not known
     sweep : number of the sweep, or block of time, of each dwell; cross-validation leaves a sweep
         out as a whole
-    place : of each dwell in its file, for messages
+    location : of each dwell in its file, for messages
     remarks : on what was found and left out, one sentence each
     rows : of the log, whose mean each dwell is
 
@@ -49,7 +49,7 @@ class Dwells:
     temperature: Array | None
     deviation: Array
     sweep: Numbers
-    place: tuple[str, ...]
+    location: tuple[str, ...]
     remarks: tuple[str, ...] = ()
     rows: tuple[Numbers, ...] = ()
 
@@ -57,7 +57,7 @@ class Dwells:
         return len(self.rate)
 
 
-def dwells(log: Log, name: str = '') -> Dwells:
+def extract_dwells(log: Log, name: str = '') -> Dwells:
     """
     Return the dwells of a log: the rows of a rate table, or stretches of a log in time.
 
@@ -71,24 +71,24 @@ def dwells(log: Log, name: str = '') -> Dwells:
     DataRefused : output or reference are missing, or nothing is steady
 
     """
-    found = from_table(log) if log.time is None else find_dwells(log)
+    found = dwells_from_table(log) if log.time is None else find_dwells(log)
     if not name:
         return found
-    return replace(found, place=tuple(f'{name}: {place}' for place in found.place),
+    return replace(found, location=tuple(f'{name}: {place}' for place in found.location),
                    remarks=tuple(f'{name}: {remark}' for remark in found.remarks))
 
 
-def take(dwells: Dwells, which: Mask) -> Dwells:
+def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
     """Return some of the dwells, by a mask of shape (n,)."""
-    temperature = None if dwells.temperature is None else dwells.temperature[which]
-    places = tuple(place for place, wanted in zip(dwells.place, which) if wanted)
-    rows = tuple(rows for rows, wanted in zip(dwells.rows, which) if wanted)
-    return replace(dwells, rate=dwells.rate[which], output=dwells.output[which],
-                   temperature=temperature, deviation=dwells.deviation[which],
-                   sweep=dwells.sweep[which], place=places, rows=rows)
+    temperature = None if dwells.temperature is None else dwells.temperature[mask]
+    places = tuple(place for place, wanted in zip(dwells.location, mask) if wanted)
+    rows = tuple(rows for rows, wanted in zip(dwells.rows, mask) if wanted)
+    return replace(dwells, rate=dwells.rate[mask], output=dwells.output[mask],
+                   temperature=temperature, deviation=dwells.deviation[mask],
+                   sweep=dwells.sweep[mask], location=places, rows=rows)
 
 
-def join(parts: Sequence[Dwells]) -> Dwells:
+def join_dwells(parts: Sequence[Dwells]) -> Dwells:
     """
     Return the dwells of several logs as one, with separate sweeps.
 
@@ -97,23 +97,24 @@ def join(parts: Sequence[Dwells]) -> Dwells:
     """
     if not parts:
         raise DataRefused('no dwells were given; give at least one log')
-    first = np.cumsum([0] + [int(part.sweep.max()) + 1 for part in parts])
+    first_sweep = np.cumsum([0] + [int(part.sweep.max()) + 1 for part in parts])
     temperatures = [part.temperature for part in parts if part.temperature is not None]
-    whole = len(temperatures) == len(parts)
+    has_temperature = len(temperatures) == len(parts)
     remarks = sum((part.remarks for part in parts), ())
-    if temperatures and not whole:
+    if temperatures and not has_temperature:
         remarks += (f'{len(parts) - len(temperatures)} of {len(parts)} logs hold no temperature, '
                     'so that of the others is not used',)
-    return Dwells(np.concatenate([part.rate for part in parts]),
-                  np.concatenate([part.output for part in parts]),
-                  np.concatenate(temperatures) if whole else None,
-                  np.concatenate([part.deviation for part in parts]),
-                  np.concatenate([part.sweep + number for part, number in zip(parts, first)]),
-                  sum((part.place for part in parts), ()), remarks,
-                  sum((part.rows for part in parts), ()))
+    return Dwells(
+        np.concatenate([part.rate for part in parts]),
+        np.concatenate([part.output for part in parts]),
+        np.concatenate(temperatures) if has_temperature else None,
+        np.concatenate([part.deviation for part in parts]),
+        np.concatenate([part.sweep + number for part, number in zip(parts, first_sweep)]),
+        sum((part.location for part in parts), ()), remarks, sum((part.rows for part in parts),
+                                                                 ()))
 
 
-def from_table(log: Log) -> Dwells:
+def dwells_from_table(log: Log) -> Dwells:
     """
     Return the rows of a rate table.
 
@@ -124,7 +125,7 @@ def from_table(log: Log) -> Dwells:
     DataRefused : output or reference rate are missing, or no row holds both
 
     """
-    output = output_of(log)
+    output = require_output(log)
     if log.reference_rate is None:
         raise DataRefused('the rows have no time and no reference rate; a rate table needs the '
                           'column reference_rate_dps')
@@ -134,15 +135,17 @@ def from_table(log: Log) -> Dwells:
                           'a reference rate; check the columns')
     rows, lost = np.flatnonzero(good), np.flatnonzero(~good) + 1
     remark = (f'{len(lost)} rows without output or reference are left out: '
-              f'{listed([str(row) for row in lost])}')
+              f'{format_list([str(row) for row in lost])}')
     rate, names = log.reference_rate[rows], log.others.get('sweep')
-    sweep = sweeps(rate) if names is None else numbered([names[row] for row in rows])
+    sweep = (number_sweeps(rate)
+             if names is None else number_named_sweeps([names[row] for row in rows]))
     return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows],
-                  _told_deviation(log)[rows], sweep, tuple(f'row {row + 1}' for row in rows),
-                  (remark,) if len(lost) else (), tuple(np.split(rows, len(rows))))
+                  _read_deviation_column(log)[rows], sweep,
+                  tuple(f'row {row + 1}' for row in rows), (remark, ) if len(lost) else (),
+                  tuple(np.split(rows, len(rows))))
 
 
-def _told_deviation(log: Log) -> Array:
+def _read_deviation_column(log: Log) -> Array:
     texts = log.others.get('deviation_dps')
     if texts is None:
         return np.full(len(log), np.nan)
@@ -154,7 +157,7 @@ def _told_deviation(log: Log) -> Array:
     return np.where(values > 0.0, values, np.nan)
 
 
-def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
+def find_dwells(log: Log, limits: SteadinessLimits | None = None) -> Dwells:
     """
     Find the dwells in a log in time.
 
@@ -163,13 +166,13 @@ def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
     DataRefused : output or reference are missing, or the reference is never steady for long enough
 
     """
-    samples, dwells, remarks = find_stretches(log, limits or Steadiness())
-    rate, output, deviation = averaged(samples, dwells)
+    samples, dwells, remarks = find_dwell_rows(log, limits or SteadinessLimits())
+    rate, output, deviation = average_dwells(samples, dwells)
     time, temperature = samples.time, samples.temperature
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output,
                   None if temperature is None
                   else np.array([temperature[rows].mean() for rows in dwells]),
-                  deviation, sweeps(rate),
+                  deviation, number_sweeps(rate),
                   tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells),
                   remarks, tuple(row[rows] for rows in dwells))

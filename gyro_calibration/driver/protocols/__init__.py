@@ -34,10 +34,10 @@ from gyro_calibration.driver.protocols.witmotion import WITMOTION
 PROTOCOLS = {protocol.name: protocol for protocol in (
     KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA, MINIMU9, WITMOTION, RAZOR, CSV)}
 
-__all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find']
+__all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find_protocol']
 
 
-def find(name: str) -> Protocol:
+def find_protocol(name: str) -> Protocol:
     """Return a protocol by its name; ValueError names the known ones where there is none."""
     if name in PROTOCOLS:
         return PROTOCOLS[name]

@@ -25,25 +25,25 @@ import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
-    check_rates,
     GYRO_COLUMNS,
-    KNOWN_COLUMNS,
     LineSplitter,
     NUMBER,
+    OPTIONAL_COLUMNS,
     Protocol,
     Reading,
+    refuse_increments,
     Settings,
     stateless,
-    Written,
+    WrittenReading,
 )
 
 _NUMBER = re.compile(NUMBER)
 _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)
-_UNKNOWN = (b'', b'nan')
+_MISSING_VALUES = (b'', b'nan')
 
 
-def _check(settings: Settings) -> None:
-    check_rates(settings)
+def _check_settings(settings: Settings) -> None:
+    refuse_increments(settings)
     counts = 'gyro_counts' in settings.columns
     if counts and settings.sensitivity is None:
         raise ValueError('columns hold gyro_counts, but sensitivity is not set: set it to the '
@@ -63,9 +63,9 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
     if not (_NUMBER.fullmatch(output) or _NOT_FINITE.fullmatch(output)):
         return None
     known: list[float | None] = []
-    for column in KNOWN_COLUMNS:
+    for column in OPTIONAL_COLUMNS:
         text = fields.get(column, b'')
-        if text.lower() in _UNKNOWN:
+        if text.lower() in _MISSING_VALUES:
             known.append(None)
         elif _NUMBER.fullmatch(text) and math.isfinite(value := float(text)):
             known.append(value)
@@ -76,9 +76,9 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
                    {} if supply is None else {'supply_v': supply})
 
 
-def _write(reading: Written, settings: Settings) -> bytes:
-    known = dict(zip(KNOWN_COLUMNS, (reading.temperature, reading.time, reading.specific_force,
-                                     reading.health.get('supply_v'))))
+def _write(reading: WrittenReading, settings: Settings) -> bytes:
+    known = dict(zip(OPTIONAL_COLUMNS, (reading.temperature, reading.time, reading.specific_force,
+                                        reading.health.get('supply_v'))))
     fields = {name: b'nan' if value is None else b'%.6f' % value for name, value in known.items()}
     fields |= {name: b'%.9g' % (reading.value / unit) for name, unit in GYRO_COLUMNS.items()}
     fields['gyro_counts'] = b'%d' % round(reading.value)
@@ -96,5 +96,5 @@ CSV = Protocol(
     writer=stateless(_write),
     full_scale=math.radians(2000.0),
     preamble=b'\r\n',
-    check=_check,
+    check_settings=_check_settings,
 )

@@ -28,18 +28,18 @@ from __future__ import annotations
 from functools import partial
 
 from gyro_calibration.driver.protocols.protocol import (
-    check_counts,
-    count,
     FrameSplitter,
     Protocol,
     Reading,
+    require_sensitivity,
     Settings,
-    Written,
+    to_signed_count,
+    WrittenReading,
 )
 
 _HEADER = 0xDD
 # number of the high byte: name, unit of one count, offset, default of an emulated unit
-_VALUES = {
+_STATUS_VALUES = {
     0: ('temperature', 250.0 / 0x8000, -50.0, 25.0),
     2: ('supply_v', 10.0 / 0x8000, 0.0, 5.0),
     4: ('source_current_a', 0.25 / 0x8000, 0.0, 0.1),
@@ -55,15 +55,16 @@ class _Parser:
     """Joins the halves of values that span two frames."""
 
     def __init__(self, settings: Settings):
-        self._number, self._high = -1, 0
+        self._last_id, self._last_byte = -1, 0
 
     def __call__(self, frame: bytes) -> Reading:
         _, low, high, middle, number, byte, *_ = frame
-        (before, first), (self._number, self._high) = (self._number, self._high), (number, byte)
+        (before, first), (self._last_id, self._last_byte) = (
+            (self._last_id, self._last_byte), (number, byte))
         rate = int.from_bytes((high, middle, low), 'big', signed=True)
-        if before not in _VALUES or number != before + 1:
+        if before not in _STATUS_VALUES or number != before + 1:
             return Reading(rate)
-        name, unit, offset, _ = _VALUES[before]
+        name, unit, offset, _ = _STATUS_VALUES[before]
         value = int.from_bytes((first, byte), 'big', signed=True) * unit + offset
         if name == 'temperature':
             return Reading(rate, temperature=value)
@@ -76,15 +77,15 @@ class _Writer:
     def __init__(self, settings: Settings):
         self._latched: dict[int, bytes] = {}
 
-    def __call__(self, reading: Written) -> bytes:
+    def __call__(self, reading: WrittenReading) -> bytes:
         number = reading.sequence % 8
         even = number & ~1
         if number == even or even not in self._latched:
-            name, unit, offset, usual = _VALUES[even]
+            name, unit, offset, usual = _STATUS_VALUES[even]
             value = reading.temperature if name == 'temperature' else reading.health.get(name)
-            half = count(((usual if value is None else value) - offset) / unit)
+            half = to_signed_count(((usual if value is None else value) - offset) / unit)
             self._latched = {even: half.to_bytes(2, 'big', signed=True)}
-        high, middle, low = count(reading.value, 24).to_bytes(3, 'big', signed=True)
+        high, middle, low = to_signed_count(reading.value, 24).to_bytes(3, 'big', signed=True)
         frame = bytes([_HEADER, low, high, middle, number, self._latched[even][number - even]])
         return frame + _checksum(frame)
 
@@ -100,7 +101,7 @@ FIZOPTIKA = Protocol(
     parser=_Parser,
     writer=_Writer,
     largest_count=0x800000,
-    good={'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15),
-          'diagnostic_v': (0.95, 1.05)},
-    check=check_counts,
+    normal_ranges={'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15),
+                   'diagnostic_v': (0.95, 1.05)},
+    check_settings=require_sensitivity,
 )

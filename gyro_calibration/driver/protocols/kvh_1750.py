@@ -36,7 +36,6 @@ import struct
 import zlib
 
 from gyro_calibration.driver.protocols.protocol import (
-    count,
     FrameSplitter,
     Protocol,
     Reading,
@@ -44,20 +43,21 @@ from gyro_calibration.driver.protocols.protocol import (
     Settings,
     STANDARD_GRAVITY,
     stateless,
-    Written,
+    to_signed_count,
+    WrittenReading,
 )
 
 _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')
 _MODULUS = 128
 _ALL_VALID = 0x77
-_MIRRORED = bytes(int(f'{byte:08b}'[::-1], 2) for byte in range(256))
+_REVERSED_BITS = bytes(int(f'{byte:08b}'[::-1], 2) for byte in range(256))
 
 
 def _checksum(data: bytes) -> bytes:
     """Return the CRC-32 of zlib with the bits in reverse order and not inverted at the end."""
-    mirrored = zlib.crc32(data.translate(_MIRRORED)) ^ 0xFFFFFFFF
-    return mirrored.to_bytes(4, 'little').translate(_MIRRORED)
+    mirrored = zlib.crc32(data.translate(_REVERSED_BITS)) ^ 0xFFFFFFFF
+    return mirrored.to_bytes(4, 'little').translate(_REVERSED_BITS)
 
 
 def _parse(frame: bytes, settings: Settings) -> Reading:
@@ -73,7 +73,7 @@ def _parse(frame: bytes, settings: Settings) -> Reading:
     )
 
 
-def _write(reading: Written, settings: Settings) -> bytes:
+def _write(reading: WrittenReading, settings: Settings) -> bytes:
     axis = 'xyz'.index(settings.axis)
     rotation, acceleration, status = [0.0] * 3, [0.0] * 3, _ALL_VALID
     rotation[axis] = reading.value
@@ -85,7 +85,7 @@ def _write(reading: Written, settings: Settings) -> bytes:
         status &= ~(1 << axis)
     temperature = ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
     frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, reading.sequence % _MODULUS,
-                        count(temperature))
+                        to_signed_count(temperature))
     return frame + _checksum(frame)
 
 
@@ -103,5 +103,5 @@ KVH_1750 = Protocol(
     noise_density=math.radians(1.0 / 3600.0),  # 1 deg/h/√Hz for the 1725, others less
     increments=True,
     modulus=_MODULUS,
-    check=lambda settings: None,
+    check_settings=lambda settings: None,
 )

@@ -25,27 +25,27 @@ from functools import partial
 import math
 
 from gyro_calibration.driver.protocols.protocol import (
-    count,
     FrameSplitter,
     Protocol,
     Reading,
     Settings,
     stateless,
-    Written,
+    to_signed_count,
+    WrittenReading,
 )
 
-_COUNT = math.radians(0.00183)
+_RATE_PER_COUNT = math.radians(0.00183)
 
 
-def _content(frame: bytes) -> bytes:
+def _unpack_content(frame: bytes) -> bytes:
     bits = 0
     for byte in frame:
         bits = bits << 7 | byte & 0x7F
     return bits.to_bytes(7, 'big')
 
 
-def _write(reading: Written, settings: Settings) -> bytes:
-    rate = count(reading.value).to_bytes(2, 'big', signed=True)
+def _write(reading: WrittenReading, settings: Settings) -> bytes:
+    rate = to_signed_count(reading.value).to_bytes(2, 'big', signed=True)
     bits = int.from_bytes(bytes([-sum(rate) % 256, 0, 0, 0, 0]) + rate, 'big')
     frame = bytes(bits >> shift & 0x7F for shift in range(49, -1, -7))
     return bytes([frame[0] | 0x80]) + frame[1:]
@@ -56,11 +56,11 @@ KVH_ECORE = Protocol(
     description='KVH E-Core 2000 fibre-optic gyro (also RD2100, not verified), binary',
     baud=9600,
     rate=10.0,
-    sensitivity=_COUNT,
+    sensitivity=_RATE_PER_COUNT,
     splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8,
-                     lambda frame: sum(_content(frame)) % 256 == 0),
+                     lambda frame: sum(_unpack_content(frame)) % 256 == 0),
     parser=lambda settings: lambda frame: Reading(
-        int.from_bytes(_content(frame)[5:], 'big', signed=True)),
+        int.from_bytes(_unpack_content(frame)[5:], 'big', signed=True)),
     writer=stateless(_write),
     largest_count=0x8000,
 )

@@ -11,8 +11,8 @@
 """
 Recognition of the wire format of received bytes.
 
-A line is read at each of `BAUDS` in turn, until `recognize` names a protocol. At a wrong baud the
-bytes fit no format.
+A line is read at each of `BAUDS` in turn, until `recognize_protocol` names a protocol. At a wrong
+baud the bytes fit no format.
 
 """
 
@@ -28,12 +28,13 @@ from gyro_calibration.driver.protocols.protocol import LineSplitter, NUMBER
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 """Bits per second, in order of the attempts: first the defaults of gyros, then others."""
 
-_LONGEST = 8192  # number of last bytes that are used, which limits the cost
-_FRAMES = 3  # least number of frames; fewer may be chance
-_ENOUGH = 0.5  # least share of the bytes in frames; a line may lose or damage the rest
-_ALL = 0.95  # least share where all frames are equal: zeros may pass a weak check
-_NEARLY = 0.8  # the result is ambiguous if another format has this times the best share
-_NUMBERS = re.compile(NUMBER + rb'(?: *, *' + NUMBER + rb')* *')
+_MAX_BYTES = 8192  # number of last bytes that are used, which limits the cost
+_MIN_FRAMES = 3  # least number of frames; fewer may be chance
+# least share of the bytes in frames; a line may lose or damage the rest
+_MIN_EXPLAINED_SHARE = 0.5
+_MIN_IDENTICAL_SHARE = 0.95  # least share where all frames are equal: zeros may pass a weak check
+_AMBIGUITY_RATIO = 0.8  # the result is ambiguous if another format has this times the best share
+_NUMBERS_PATTERN = re.compile(NUMBER + rb'(?: *, *' + NUMBER + rb')* *')
 
 
 @dataclass(frozen=True)
@@ -48,21 +49,21 @@ class Recognition:
     """
 
     protocol: Protocol | None  # None if ambiguous, or too few bytes
-    explained: float
+    explained_share: float
     frames: int
     runner_up: Protocol | None  # the next best format, if it explains any byte
-    words: str  # the result as a sentence
+    summary: str  # the result as a sentence
 
 
 @dataclass(frozen=True)
 class _Score:
     protocol: Protocol
-    explained: float
+    explained_share: float
     frames: int
-    distinct: int
+    distinct_frames: int
 
 
-def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
+def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recognition:
     """
     Return the format that explains the last 8192 bytes.
 
@@ -74,23 +75,24 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
     settings : the format ``csv`` is recognized by the number of `columns`
 
     """
-    settings, data = settings or Settings(), data[-_LONGEST:]
-    scores = [_score(protocol, settings, data) for protocol in PROTOCOLS.values()]
-    best, second = sorted(scores, key=lambda score: -score.explained)[:2]
-    runner_up = second if second.explained else None
-    ambiguous = runner_up is not None and second.explained >= _NEARLY * best.explained
-    enough = _ENOUGH if best.distinct >= _FRAMES else _ALL
-    protocol, explained = None, best.explained
-    if best.frames >= _FRAMES and best.explained >= enough and not ambiguous:
+    settings, data = settings or Settings(), data[-_MAX_BYTES:]
+    scores = [_score_protocol(protocol, settings, data) for protocol in PROTOCOLS.values()]
+    best, second = sorted(scores, key=lambda score: -score.explained_share)[:2]
+    runner_up = second if second.explained_share else None
+    ambiguous = (runner_up is not None
+                 and second.explained_share >= _AMBIGUITY_RATIO * best.explained_share)
+    enough = _MIN_EXPLAINED_SHARE if best.distinct_frames >= _MIN_FRAMES else _MIN_IDENTICAL_SHARE
+    protocol, explained = None, best.explained_share
+    if best.frames >= _MIN_FRAMES and best.explained_share >= enough and not ambiguous:
         protocol = best.protocol
         words = (f'{protocol.name} explains {explained:.0%} of {len(data)} bytes, in '
                  f'{best.frames} frames')
         if runner_up:
-            words += f'; next is {runner_up.protocol.name} with {runner_up.explained:.0%}'
+            words += f'; next is {runner_up.protocol.name} with {runner_up.explained_share:.0%}'
     elif ambiguous:
         words = (f'the bytes may be {best.protocol.name} or {second.protocol.name}: set protocol')
     else:
-        count, share = _numbers_of_a_line(data)
+        count, share = _count_numbers_per_line(data)
         if count not in (0, named := len(settings.columns)):
             explained, words = share, (f'lines of {count} numbers came, but columns names '
                                        f'{named}: name all columns in their order')
@@ -106,7 +108,7 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
                        None if runner_up is None else runner_up.protocol, words)
 
 
-def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
+def _score_protocol(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
     splitter, parse = protocol.splitter(), protocol.parser(settings)
     frames = splitter.feed(data)
     good = [frame for frame in frames if parse(frame.data) is not None]
@@ -114,17 +116,17 @@ def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
         return _Score(protocol, 0.0, 0, 0)
     known = sum(len(frame.data) for frame in good)
     unknown = splitter.discarded_bytes + sum(len(frame.data) for frame in frames) - known
-    begun = min(frames[0].garbage, max(len(frame.data) for frame in good))
+    begun = min(frames[0].skipped_bytes, max(len(frame.data) for frame in good))
     distinct = len({frame.data for frame in good})
     return _Score(protocol, known / (known + unknown - begun), len(good), distinct)
 
 
-def _numbers_of_a_line(data: bytes) -> tuple[int, float]:
+def _count_numbers_per_line(data: bytes) -> tuple[int, float]:
     """Return the most frequent number of numbers in a line, 0 for none, and its share."""
     lines = [frame.data for frame in LineSplitter(1024).feed(data)]
-    counts = Counter(line.count(b',') + 1 if _NUMBERS.fullmatch(line.strip()) else 0
+    counts = Counter(line.count(b',') + 1 if _NUMBERS_PATTERN.fullmatch(line.strip()) else 0
                      for line in lines)
-    if len(lines) < _FRAMES:
+    if len(lines) < _MIN_FRAMES:
         return 0, 0.0
     count, times = counts.most_common(1)[0]
     return count, times / len(lines)

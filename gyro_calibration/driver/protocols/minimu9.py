@@ -24,16 +24,16 @@ import math
 import re
 
 from gyro_calibration.driver.protocols.protocol import (
-    count,
     LineSplitter,
     Protocol,
     Reading,
     Settings,
     stateless,
-    Written,
+    to_signed_count,
+    WrittenReading,
 )
 
-_COUNT = math.radians(0.07)
+_RATE_PER_COUNT = math.radians(0.07)
 _LINE = re.compile(rb'!ANG:[-+.0-9]+,[-+.0-9]+,[-+.0-9]+,AN:(-?[0-9]{1,5}(?:,-?[0-9]{1,5}){8}) *')
 
 
@@ -42,8 +42,8 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
     return match and Reading(int(match[1].split(b',')['xyz'.index(settings.axis)]))
 
 
-def _write(reading: Written, settings: Settings) -> bytes:
-    counts = [count(reading.value) if axis == settings.axis else 0 for axis in 'xyz']
+def _write(reading: WrittenReading, settings: Settings) -> bytes:
+    counts = [to_signed_count(reading.value) if axis == settings.axis else 0 for axis in 'xyz']
     return b'!ANG:0.00,0.00,0.00,AN:%d,%d,%d,0,0,0,0,0,0\r\n' % tuple(counts)
 
 
@@ -52,7 +52,7 @@ MINIMU9 = Protocol(
     description='Pololu MinIMU-9 with AHRS firmware, text with raw counts',
     baud=115200,
     rate=50.0,
-    sensitivity=_COUNT,
+    sensitivity=_RATE_PER_COUNT,
     splitter=partial(LineSplitter, 256, (b'!',)),
     parser=stateless(_parse),
     writer=stateless(_write),

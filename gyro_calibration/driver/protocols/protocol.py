@@ -35,7 +35,7 @@ ROOM_TEMPERATURE = 25.0
 GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts': 1.0}
 """Columns of the log format that hold the output, with their unit in rad/s, or in counts."""
 
-KNOWN_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
+OPTIONAL_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
 """Further columns of the log format."""
 
 ASSUMED_NOISE = math.radians(0.5)
@@ -44,9 +44,9 @@ ASSUMED_NOISE = math.radians(0.5)
 ASSUMED_FORCE_NOISE = 0.1
 """m/s², standard deviation of a specific force: 0.01 g, beyond the noise of any such unit."""
 
-_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
-_MOST_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
-_LEARNING = 0.05  # weight of a frame in the average length
+_PLAUSIBLE_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
+_MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
+_LENGTH_SMOOTHING = 0.05  # weight of a frame in the average length
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Settings:
         named = f'columns are {", ".join(columns)}, but'
         if sum(columns.count(name) for name in GYRO_COLUMNS) != 1:
             raise ValueError(f'{named} exactly one must be {", ".join(GYRO_COLUMNS)}')
-        for name in KNOWN_COLUMNS:
+        for name in OPTIONAL_COLUMNS:
             if columns.count(name) > 1:
                 raise ValueError(f'{named} {name} may occur only once')
 
@@ -147,46 +147,46 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Written(Reading):
+class WrittenReading(Reading):
     """A reading that an emulated device writes: with a value, and a sequence without wraps."""
 
     value: float
     sequence: int = 0
 
 
-def count(value: float, bits: int = 16) -> int:
+def to_signed_count(value: float, bits: int = 16) -> int:
     """Return the nearest signed integer of a number of bits, with saturation."""
     return min(max(round(value), -1 << bits - 1), (1 << bits - 1) - 1)
 
 
-Parse = Callable[[bytes], 'Reading | None']
+ParseFrame = Callable[[bytes], 'Reading | None']
 """Parses a frame to a reading, or None if it is not valid; may use earlier frames."""
 
-Write = Callable[[Written], bytes]
+WriteFrame = Callable[[WrittenReading], bytes]
 """Makes the bytes of a reading; may use earlier readings."""
 
-Given = TypeVar('Given')
-Made = TypeVar('Made')
+InputT = TypeVar('InputT')
+OutputT = TypeVar('OutputT')
 
 
-def stateless(make: Callable[[Given, Settings], Made]
-              ) -> Callable[[Settings], Callable[[Given], Made]]:
+def stateless(convert: Callable[[InputT, Settings], OutputT]
+              ) -> Callable[[Settings], Callable[[InputT], OutputT]]:
     """Return the `Protocol.parser` or `writer` of a format with independent frames."""
-    return lambda settings: lambda given: make(given, settings)
+    return lambda settings: lambda given: convert(given, settings)
 
 
 class Frame(NamedTuple):
     """A frame, and the number of bytes before it outside of frames."""
 
     data: bytes
-    garbage: int
+    skipped_bytes: int
 
 
 class Splitter:
     """Finds frames in bytes that come in any pieces; buffers at most one frame."""
 
     def __init__(self) -> None:
-        self._tail, self._garbage, self.discarded_bytes = b'', 0, 0
+        self._tail, self._skipped_bytes, self.discarded_bytes = b'', 0, 0
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete."""
@@ -195,27 +195,27 @@ class Splitter:
     def reset(self) -> None:
         """Discard an incomplete frame: the next bytes do not continue it."""
         self._discard(len(self._tail))
-        self._tail, self._garbage = b'', 0
+        self._tail, self._skipped_bytes = b'', 0
 
     def _discard(self, count: int) -> None:
         self.discarded_bytes += count
-        self._garbage += count
+        self._skipped_bytes += count
 
-    def _frame(self, data: bytes) -> Frame:
-        garbage, self._garbage = self._garbage, 0
+    def _make_frame(self, data: bytes) -> Frame:
+        garbage, self._skipped_bytes = self._skipped_bytes, 0
         return Frame(data, garbage)
 
 
-def check_rates(settings: Settings) -> None:
+def refuse_increments(settings: Settings) -> None:
     """Raise ValueError if increments are set for a device that sends rates only."""
     if settings.increments:
         raise ValueError('increments is set, but this gyro sends rates, not angles: leave '
                          'increments out')
 
 
-def check_counts(settings: Settings) -> None:
+def require_sensitivity(settings: Settings) -> None:
     """Raise ValueError if a device that sends counts has no sensitivity."""
-    check_rates(settings)
+    refuse_increments(settings)
     if settings.sensitivity is None:
         raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the rad/s '
                          'of one count, which its data sheet gives')
@@ -233,8 +233,10 @@ class Protocol:
     rate : nominal samples per second; see `nominal_rate`
     sensitivity : rad/s per unit of the device, or rad where it sends increments
     splitter : returns a new `Splitter`
-    parser : ``parser(settings)`` returns the parser of one connection, see `Parse` and `stateless`
-    writer : ``writer(settings)`` returns the writer of one device, see `Write` and `stateless`
+    parser : ``parser(settings)`` returns the parser of one connection, see `ParseFrame` and
+        `stateless`
+    writer : ``writer(settings)`` returns the writer of one device, see `WriteFrame` and
+        `stateless`
     invert : whether the device counts clockwise turns positive
     full_scale : rad/s
     largest_count : of a device that sends counts; the full scale is this times the sensitivity
@@ -245,8 +247,8 @@ class Protocol:
     preamble : first bytes of the emulated device, so that its first sample is not taken for the
         rest of a line
     modulus : of the sequence of the device; 0 where it has none
-    good : normal ranges of the values of `Sample.health`
-    check : ``check(settings)`` raises ValueError if settings are missing or wrong
+    normal_ranges : normal ranges of the values of `Sample.health`
+    check_settings : ``check(settings)`` raises ValueError if settings are missing or wrong
 
     """
 
@@ -256,8 +258,8 @@ class Protocol:
     rate: float
     sensitivity: float
     splitter: Callable[[], Splitter]
-    parser: Callable[[Settings], Parse]
-    writer: Callable[[Settings], Write]
+    parser: Callable[[Settings], ParseFrame]
+    writer: Callable[[Settings], WriteFrame]
     invert: bool = False
     full_scale: float = math.radians(2000.0)
     largest_count: int | None = None
@@ -266,31 +268,33 @@ class Protocol:
     startup: bytes = b''
     preamble: bytes = b''
     modulus: int = 0
-    good: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    check: Callable[[Settings], None] = check_rates
+    normal_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    check_settings: Callable[[Settings], None] = refuse_increments
 
     def decoder(self, settings: Settings | None = None) -> Decoder:
-        """Return a decoder for one connection, or raise as `check` does."""
+        """Return a decoder for one connection, or raise as `check_settings` does."""
         return Decoder(self, settings or Settings())
 
     def encoder(self, settings: Settings | None = None) -> Callable[..., bytes]:
         """
         Return ``encode(sample, valid=True)`` of one device, which gives the bytes that it sends.
 
-        Beyond full scale it saturates. It raises as `check` does.
+        Beyond full scale it saturates. It raises as `check_settings` does.
 
         """
         settings = settings or Settings()
-        self.check(settings)
-        limit, factor, write = self.limit(settings), self.factor(settings), self.writer(settings)
+        self.check_settings(settings)
+        limit, factor, write = (self.effective_full_scale(settings), self.unit_scale(settings),
+                                self.writer(settings))
 
         def encode(sample: Sample, valid: bool = True) -> bytes:
             value = min(max(sample.output, -limit), limit) / factor
             # a log has nan where a sensor failed
             temperature, force = (each if each is not None and math.isfinite(each) else None
                                   for each in (sample.temperature, sample.specific_force))
-            return write(Written(value, valid, temperature, sample.time, sample.sequence or 0,
-                                 force, sample.health))
+            return write(
+                WrittenReading(value, valid, temperature, sample.time, sample.sequence or 0, force,
+                               sample.health))
 
         return encode
 
@@ -307,15 +311,15 @@ class Protocol:
         """Return whether the device sends angles since its last sample, as set or by default."""
         return self.increments if settings.increments is None else settings.increments
 
-    def wrong_rate(self, settings: Settings, period: float) -> str:
+    def sample_rate_warning(self, settings: Settings, period: float) -> str:
         """Return a warning if angles come at another period, s, than that of the sample rate."""
         rate = self.nominal_rate(settings)
-        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MOST_DEVIATION:
+        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MAX_RATE_DEVIATION:
             return ''
         return (f'the gyro sends {1.0 / period:.0f} samples per second, but angles are converted '
                 f'to rates by {rate:g}: set sample_rate')
 
-    def factor(self, settings: Settings) -> float:
+    def unit_scale(self, settings: Settings) -> float:
         """Return the rad/s, counter-clockwise positive, of one unit of the device."""
         invert = self.invert if settings.invert is None else settings.invert
         factor = settings.sensitivity or self.sensitivity
@@ -323,7 +327,7 @@ class Protocol:
             factor *= self.nominal_rate(settings)
         return -factor if invert else factor
 
-    def limit(self, settings: Settings) -> float:
+    def effective_full_scale(self, settings: Settings) -> float:
         """Return the full scale in rad/s, as set or of the device."""
         if settings.full_scale is not None:
             return settings.full_scale
@@ -331,7 +335,7 @@ class Protocol:
             return self.largest_count * (settings.sensitivity or self.sensitivity)
         return self.full_scale
 
-    def variance(self, settings: Settings) -> float:
+    def sample_variance(self, settings: Settings) -> float:
         """Return the assumed variance of one sample, (rad/s)²."""
         if self.noise_density is None:
             return ASSUMED_NOISE ** 2
@@ -347,21 +351,22 @@ class Decoder:
 
     Attributes
     ----------
-    faults : frames whose value the device marks as invalid
+    device_faults : frames whose value the device marks as invalid
     refused_samples : frames whose value is not finite, or beyond full scale
     refused_temperatures : not finite, or beyond -100 to 300 degC
 
     """
 
     def __init__(self, protocol: Protocol, settings: Settings):
-        protocol.check(settings)
+        protocol.check_settings(settings)
         self._splitter = protocol.splitter()
         self._parser = partial(protocol.parser, settings)
         self._parse = self._parser()
-        self._factor, self._limit = protocol.factor(settings), protocol.limit(settings)
-        self._refused_bytes, self._begun = 0, False
-        self._garbage, self._skipped, self._length = 0, 0, 0.0
-        self.faults = self.refused_samples = self.refused_temperatures = 0
+        self._factor, self._limit = (protocol.unit_scale(settings),
+                                     protocol.effective_full_scale(settings))
+        self._refused_bytes, self._has_sample = 0, False
+        self._skipped_bytes, self._refused_frames, self._mean_frame_length = 0, 0, 0.0
+        self.device_faults = self.refused_samples = self.refused_temperatures = 0
 
     @property
     def discarded_bytes(self) -> int:
@@ -370,39 +375,42 @@ class Decoder:
 
     def feed(self, data: bytes) -> list[Sample]:
         """Return the samples that these bytes complete, the oldest first."""
-        samples = (self._sample(frame) for frame in self._splitter.feed(data))
+        samples = (self._to_sample(frame) for frame in self._splitter.feed(data))
         return [sample for sample in samples if sample is not None]
 
     def reset(self) -> None:
         """Discard an incomplete frame, as after a loss of the port; the counts are kept."""
         self._splitter.reset()
         self._parse = self._parser()
-        self._garbage, self._skipped, self._begun = 0, 0, False
+        self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, False
 
-    def _sample(self, frame: Frame) -> Sample | None:
-        if frame.garbage:
+    def _to_sample(self, frame: Frame) -> Sample | None:
+        if frame.skipped_bytes:
             self._parse = self._parser()  # the previous frame is not adjacent
-            self._garbage += frame.garbage
+            self._skipped_bytes += frame.skipped_bytes
         reading = self._parse(frame.data)
         if reading is None:
             self._refused_bytes += len(frame.data)
-            self._garbage += len(frame.data)
+            self._skipped_bytes += len(frame.data)
             return None
         if reading.value is None:
             return None
         output = reading.value * self._factor
         if not (reading.valid and math.isfinite(output) and abs(output) <= self._limit):
-            self.faults += not reading.valid
+            self.device_faults += not reading.valid
             self.refused_samples += reading.valid
-            self._skipped += 1
+            self._refused_frames += 1
             return None
         # number of frames that were discarded or skipped before this one; 0 for the first
         length = len(frame.data)
-        self._length += (_LEARNING if self._length else 1.0) * (length - self._length)
-        missing = self._skipped + round(self._garbage / self._length) if self._begun else 0
-        self._garbage, self._skipped, self._begun = 0, 0, True
+        self._mean_frame_length += ((_LENGTH_SMOOTHING if self._mean_frame_length else 1.0) *
+                                    (length - self._mean_frame_length))
+        missing = (self._refused_frames + round(self._skipped_bytes / self._mean_frame_length)
+                   if self._has_sample else 0)
+        self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, True
         temperature = reading.temperature
-        if temperature is not None and not _TEMPERATURES[0] <= temperature <= _TEMPERATURES[1]:
+        if (temperature is not None
+                and not _PLAUSIBLE_TEMPERATURES[0] <= temperature <= _PLAUSIBLE_TEMPERATURES[1]):
             self.refused_temperatures += 1
             temperature = None
         return Sample(output, temperature, reading.time, reading.sequence, missing,
@@ -424,15 +432,15 @@ class LineSplitter(Splitter):
 
     Parameters
     ----------
-    longest : bytes; a longer line is discarded, so that an endless one does not fill the memory
-    beginnings : first bytes that occur only at the beginning of a line
+    max_length : bytes; a longer line is discarded, so that an endless one does not fill the memory
+    line_starts : first bytes that occur only at the beginning of a line
 
     """
 
-    def __init__(self, longest: int, beginnings: tuple[bytes, ...] = ()):
+    def __init__(self, max_length: int, line_starts: tuple[bytes, ...] = ()):
         super().__init__()
-        self._longest, self._beginnings = longest, beginnings
-        self._begun = self._too_long = False
+        self._max_length, self._line_starts = max_length, line_starts
+        self._has_line_start = self._is_too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the lines that these bytes complete."""
@@ -440,23 +448,23 @@ class LineSplitter(Splitter):
         *lines, tail = self._tail + first, *rest
         whole = []
         for line in lines:
-            good = not self._too_long and len(line) <= self._longest
-            good = good and (self._begun or line.startswith(self._beginnings))
-            self._begun, self._too_long = True, False
+            good = not self._is_too_long and len(line) <= self._max_length
+            good = good and (self._has_line_start or line.startswith(self._line_starts))
+            self._has_line_start, self._is_too_long = True, False
             if not good:
                 self._discard(len(line))
             elif line:
-                whole.append(self._frame(line))
+                whole.append(self._make_frame(line))
         self._tail = tail
-        if self._too_long or len(tail) > self._longest:
+        if self._is_too_long or len(tail) > self._max_length:
             self._discard(len(tail))
-            self._tail, self._too_long = b'', True
+            self._tail, self._is_too_long = b'', True
         return whole
 
     def reset(self) -> None:
         """Discard an incomplete line."""
         super().reset()
-        self._begun = self._too_long = False
+        self._has_line_start = self._is_too_long = False
 
 
 class FrameSplitter(Splitter):
@@ -483,7 +491,7 @@ class FrameSplitter(Splitter):
             position = match.start() + 1
             if self._is_intact(match.group()):
                 self._discard(match.start() - end)
-                frames.append(self._frame(match.group()))
+                frames.append(self._make_frame(match.group()))
                 position = end = match.end()
         kept = max(position, len(data) - self._length + 1)
         self._discard(kept - end)

@@ -37,33 +37,33 @@ from gyro_calibration.driver.protocols.protocol import (
     Settings,
     STANDARD_GRAVITY,
     stateless,
-    Written,
+    WrittenReading,
 )
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
 # default output of the firmware
-_ANGLES = re.compile(rb'#YPR=' + NUMBER + rb'(?:,' + NUMBER + rb'){2} *')
-_FORCE = STANDARD_GRAVITY / 256.0
-_TURNED = {'x': 1.0, 'y': -1.0, 'z': -1.0}  # from forward, right, down to forward, left, up
+_ANGLES_LINE = re.compile(rb'#YPR=' + NUMBER + rb'(?:,' + NUMBER + rb'){2} *')
+_FORCE_PER_COUNT = STANDARD_GRAVITY / 256.0
+_AXIS_SIGNS = {'x': 1.0, 'y': -1.0, 'z': -1.0}  # from forward, right, down to forward, left, up
 
 
 def _parse(line: bytes, settings: Settings) -> Reading | None:
     match = _LINE.fullmatch(line)
     if match is None:
-        return Reading(None) if _ANGLES.fullmatch(line) else None
-    axis, turned = 'xyz'.index(settings.axis), _TURNED[settings.axis]
+        return Reading(None) if _ANGLES_LINE.fullmatch(line) else None
+    axis, turned = 'xyz'.index(settings.axis), _AXIS_SIGNS[settings.axis]
     numbers = match[1].split(b',')
-    force = -turned * float(numbers[3 + axis]) * _FORCE
+    force = -turned * float(numbers[3 + axis]) * _FORCE_PER_COUNT
     return Reading(turned * float(numbers[6 + axis]),
                    specific_force=force if math.isfinite(force) else None)
 
 
-def _write(reading: Written, settings: Settings) -> bytes:
-    turned, force = _TURNED[settings.axis], reading.specific_force
+def _write(reading: WrittenReading, settings: Settings) -> bytes:
+    turned, force = _AXIS_SIGNS[settings.axis], reading.specific_force
     force = STANDARD_GRAVITY if force is None else force
     accelerations, rates = [0.0] * 3, [0.0] * 3
     axis = 'xyz'.index(settings.axis)
-    accelerations[axis], rates[axis] = -turned * force / _FORCE, turned * reading.value
+    accelerations[axis], rates[axis] = -turned * force / _FORCE_PER_COUNT, turned * reading.value
     return b'#YPRAG=0.00,0.00,0.00,%.2f,%.2f,%.2f,%.2f,%.2f,%.2f\r\n' % (*accelerations, *rates)
 
 

@@ -29,7 +29,6 @@ import math
 import struct
 
 from gyro_calibration.driver.protocols.protocol import (
-    count,
     FrameSplitter,
     Protocol,
     Reading,
@@ -37,11 +36,12 @@ from gyro_calibration.driver.protocols.protocol import (
     Settings,
     STANDARD_GRAVITY,
     stateless,
-    Written,
+    to_signed_count,
+    WrittenReading,
 )
 
-_COUNT = math.radians(2000.0) / 0x8000
-_FORCE = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
+_RATE_PER_COUNT = math.radians(2000.0) / 0x8000
+_FORCE_PER_COUNT = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
 _ACCELERATION, _RATE = 0x51, 0x52
 _NUMBERS = struct.Struct('<2x4h')
 
@@ -56,25 +56,25 @@ class _Parser:
     def __call__(self, frame: bytes) -> Reading:
         numbers = _NUMBERS.unpack_from(frame)
         if frame[1] == _ACCELERATION:
-            self._force = numbers[self._axis] * _FORCE
+            self._force = numbers[self._axis] * _FORCE_PER_COUNT
         if frame[1] != _RATE:
             return Reading(None)
         force, self._force = self._force, None
         return Reading(numbers[self._axis], temperature=numbers[3] * 0.01, specific_force=force)
 
 
-def _write(reading: Written, settings: Settings) -> bytes:
+def _write(reading: WrittenReading, settings: Settings) -> bytes:
     degrees = ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
     rate = _frame(_RATE, reading.value, 100.0 * degrees, settings.axis)
     if reading.specific_force is None:
         return rate
-    force = reading.specific_force / _FORCE
+    force = reading.specific_force / _FORCE_PER_COUNT
     return _frame(_ACCELERATION, force, 100.0 * degrees, settings.axis) + rate
 
 
 def _frame(kind: int, value: float, temperature: float, axis: str) -> bytes:
     numbers = [value if each == axis else 0.0 for each in 'xyz'] + [temperature]
-    frame = bytes([0x55, kind]) + struct.pack('<4h', *map(count, numbers))
+    frame = bytes([0x55, kind]) + struct.pack('<4h', *map(to_signed_count, numbers))
     return frame + bytes([sum(frame) & 0xFF])
 
 
@@ -83,7 +83,7 @@ WITMOTION = Protocol(
     description='WitMotion modules, binary',
     baud=9600,
     rate=10.0,
-    sensitivity=_COUNT,
+    sensitivity=_RATE_PER_COUNT,
     splitter=partial(FrameSplitter, rb'\x55[\x50-\x5f].{9}', 11,
                      lambda frame: sum(frame[:10]) & 0xFF == frame[10]),
     parser=_Parser,

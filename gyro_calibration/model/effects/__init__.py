@@ -21,7 +21,6 @@ effects; the lag), `polynomial` (of Ojeda, Chung and Borenstein), `catalogue` (a
 
 from gyro_calibration.model.effects.catalogue import (
     add_effects,
-    ADDED,
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -34,7 +33,8 @@ from gyro_calibration.model.effects.catalogue import (
     SCALE_FACTOR_ERROR,
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
-    STEADY,
+    STATIC_EFFECTS,
+    USER_EFFECTS,
 )
 from gyro_calibration.model.effects.effect import Channels, Effect, Parameter
 from gyro_calibration.model.effects.polynomial import (
@@ -43,8 +43,8 @@ from gyro_calibration.model.effects.polynomial import (
     rate_temperature_polynomial,
 )
 
-__all__ = ['ADDED', 'BIAS', 'BIAS_TEMPERATURE', 'BIAS_TEMPERATURE_QUADRATIC', 'CATALOGUE',
+__all__ = ['USER_EFFECTS', 'BIAS', 'BIAS_TEMPERATURE', 'BIAS_TEMPERATURE_QUADRATIC', 'CATALOGUE',
            'CUBIC_NONLINEARITY', 'Channels', 'Effect', 'Parameter', 'QUADRATIC_NONLINEARITY',
            'QUANTIZATION', 'SATURATION', 'SCALE_FACTOR_ASYMMETRY', 'SCALE_FACTOR_ERROR',
-           'SCALE_FACTOR_TEMPERATURE', 'SINE_RESPONSE', 'STEADY', 'add_effects',
+           'SCALE_FACTOR_TEMPERATURE', 'SINE_RESPONSE', 'STATIC_EFFECTS', 'add_effects',
            'polynomial_from_matrix', 'polynomial_to_matrix', 'rate_temperature_polynomial']

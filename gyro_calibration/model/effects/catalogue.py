@@ -29,26 +29,26 @@ from scipy.interpolate import CubicSpline
 BIAS = Effect(
     'bias', 'The output at rest is not zero; it includes the Earth rate about the input axis.',
     frozenset(), (Parameter('bias', 'rad/s'),),
-    lambda channels: (channels.ones(),), shown_by='record at rest')
+    lambda channels: (channels.ones(),), experiment='record at rest')
 SCALE_FACTOR_ERROR = Effect(
     'scale_factor_error', 'The scale factor differs from the nominal one.',
     frozenset({'rate'}), (Parameter('scale_factor_error', '1'),),
-    lambda channels: (channels.rate,), shown_by='turn at several speeds, both ways')
+    lambda channels: (channels.rate,), experiment='turn at several speeds, both ways')
 SCALE_FACTOR_ASYMMETRY = Effect(
     'scale_factor_asymmetry', 'The scale factor differs between the two senses of rotation.',
     frozenset({'rate'}), (Parameter('scale_factor_asymmetry', '1'),),
     lambda channels: (abs(channels.rate),),
-    shown_by='turn both ways at many speeds, slow ones and rest too')
+    experiment='turn both ways at many speeds, slow ones and rest too')
 QUADRATIC_NONLINEARITY = Effect(
     'quadratic_nonlinearity', 'The output has a part in proportion to the square of the rate.',
     frozenset({'rate'}), (Parameter('quadratic_nonlinearity', 's/rad'),),
     lambda channels: (channels.rate * channels.rate,),
-    shown_by='turn both ways at many speeds up to full scale')
+    experiment='turn both ways at many speeds up to full scale')
 CUBIC_NONLINEARITY = Effect(
     'cubic_nonlinearity', 'The scale factor changes with the square of the rate.',
     frozenset({'rate'}), (Parameter('cubic_nonlinearity', 's²/rad²'),),
     lambda channels: (channels.rate * channels.rate * channels.rate,),
-    shown_by='turn at many speeds up to full scale')
+    experiment='turn at many speeds up to full scale')
 SINE_RESPONSE = Effect(
     'sine_response', 'An open-loop fibre-optic gyro responds with the sine of its Sagnac phase.',
     frozenset({'rate'}), (Parameter('amplitude', '1', default=1.0),),
@@ -74,21 +74,21 @@ SCALE_FACTOR_TEMPERATURE = Effect(
     (_REFERENCE_TEMPERATURE,), 'turn at two temperatures')
 
 
-def _temperature_ahead(channels: Channels, time_constant: float) -> Number:
+def _temperature_lag(channels: Channels, time_constant: float) -> Number:
     """Return the lagged temperature minus the temperature, K."""
     if channels.lagged is None:
         return 0.0
     return channels.lagged('temperature', time_constant) - channels.temperature
 
 
-_OF_PAST_TEMPERATURES = (
+_THERMAL_HISTORY_EFFECTS = (
     Effect(
         'bias_temperature_rate',
         'The bias changes in proportion to the rate of change of the temperature, by gradients '
         'within the instrument (in fibre gyros the Shupe effect).',
         frozenset({'temperature', 'lagged'}), (Parameter('bias_temperature_rate', 'rad/s/(K/s)'),),
         lambda channels, filter_time: (
-            -_temperature_ahead(channels, filter_time) / filter_time + 0.0 * channels.rate,),
+            -_temperature_lag(channels, filter_time) / filter_time + 0.0 * channels.rate,),
         (Parameter('filter_time', 's', 10.0, (1e-3, 1e4)),),
         'heat and cool at two speeds, with corners in the temperature'),
     Effect(
@@ -97,7 +97,7 @@ _OF_PAST_TEMPERATURES = (
         'thermometer.',
         frozenset({'temperature', 'lagged'}), (Parameter('thermal_lag', 'rad/s/K'),),
         lambda channels, time_constant: (
-            _temperature_ahead(channels, time_constant) + 0.0 * channels.rate,),
+            _temperature_lag(channels, time_constant) + 0.0 * channels.rate,),
         (Parameter('time_constant', 's', bounds=(1.0, 3000.0)),),
         'heat and cool at two speeds, with corners in the temperature'),
     Effect(
@@ -110,7 +110,7 @@ _OF_PAST_TEMPERATURES = (
          Parameter('threshold', 'K/s', 1e-3, (0.0, 10.0))),
         'go through the same cycle of temperature at two speeds'))
 
-_OF_TIME = (
+_TIME_EFFECTS = (
     Effect(
         'warm_up', 'After power-on the bias settles exponentially.',
         frozenset({'time'}), (Parameter('warm_up', 'rad/s'),),
@@ -122,27 +122,27 @@ _OF_TIME = (
         'rate_ramp', 'The bias grows steadily with time.',
         frozenset({'time'}), (Parameter('rate_ramp', 'rad/s²'),),
         lambda channels: (channels.time + 0.0 * channels.rate,),
-        shown_by='let it run several times, heating in one and cooling in another'),
+        experiment='let it run several times, heating in one and cooling in another'),
     Effect(
         'bias_step', 'The bias changes in a single step.',
         frozenset({'time'}), (Parameter('bias_step', 'rad/s'),),
         lambda channels, step_time: ((channels.time >= step_time) * channels.ones(),),
         (Parameter('step_time', 's', bounds=(0.0, 1e9)),), 'repeat the run: the step occurs once'))
 
-_OF_SURROUNDINGS = (
+_ENVIRONMENT_EFFECTS = (
     Effect(
         'heading_sensitivity',
         'The bias depends on the heading, mostly by the magnetic field of the Earth.',
         frozenset({'heading'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')),
         lambda channels: [wave(channels.heading) + 0.0 * channels.rate
                           for wave in (np.sin, np.cos)],
-        shown_by='turn at several speeds, and rest at eight headings'),
+        experiment='turn at several speeds, and rest at eight headings'),
     Effect(
         'acceleration_sensitivity',
         'The bias changes in proportion to the specific force along the input axis.',
         frozenset({'specific_force'}), (Parameter('acceleration_sensitivity', '(rad/s)/(m/s²)'),),
         lambda channels: (channels.specific_force + 0.0 * channels.rate,),
-        shown_by='rest in several poses within one power-on'),
+        experiment='rest in several poses within one power-on'),
     Effect(
         'vibration_rectification', 'Vibration shifts the bias in proportion to its mean square.',
         frozenset({'specific_force', 'lagged'}),
@@ -170,69 +170,72 @@ _OF_SURROUNDINGS = (
         'sample at another rate: an alias changes its frequency, a tone does not'))
 
 
-def _at(when: Array, time: Array, signal: Array) -> Array:
+def _interpolate(new_time: Array, time: Array, signal: Array) -> Array:
     """Return a signal at other times; beyond its ends it is constant."""
     # Linear interpolation would look like a delay in fast motion.
-    return np.asarray(CubicSpline(time, signal)(np.clip(when, time[0], time[-1])))
+    return np.asarray(CubicSpline(time, signal)(np.clip(new_time, time[0], time[-1])))
 
 
-def _lagged(signal: Array, time: Array, time_constant: float) -> Array:
+def _filter_lag(signal: Array, time: Array, time_constant: float) -> Array:
     """Return the signal through a lag, interpolated at 4 points a sample."""
     count = len(time)
     finer = np.interp(np.arange(4 * (count - 1) + 1) / 4, np.arange(count), time)
-    return lagged_signal(_at(finer, time, signal), finer, time_constant)[::4]
+    return lagged_signal(_interpolate(finer, time, signal), finer, time_constant)[::4]
 
 
 _FAST_REVERSALS = 'reverse quickly: a lag reduces the amplitude, a delay does not'
-_OF_THE_SIGNAL = (
+_SIGNAL_EFFECTS = (
     Effect(
         'bandwidth', 'The output follows the rate through a first-order lag.',
-        shapes=(Parameter('bandwidth', 's', bounds=(1e-7, 10.0)),), shown_by=_FAST_REVERSALS,
-        distortion=_lagged, stage='rate',
-        undone='The attenuation of fast motion remains: to undo it would amplify the noise.'),
+        nonlinear_parameters=(Parameter('bandwidth', 's', bounds=(1e-7, 10.0)), ),
+        experiment=_FAST_REVERSALS, distortion=_filter_lag, stage='rate',
+        not_compensated='The attenuation of fast motion remains: to undo it would amplify the '
+        'noise.'),
     Effect(
         'time_offset', 'The stamps of the samples are late by a constant time.',
-        shapes=(Parameter('time_offset', 's', bounds=(-1.0, 1.0)),), shown_by=_FAST_REVERSALS,
-        distortion=lambda signal, time, offset: _at(time - offset, time, signal), stage='rate',
-        moved=lambda time, offset: time - offset,
-        undone='It is compensated by shifting the stamps; the delay for a controller remains.'),
+        nonlinear_parameters=(Parameter('time_offset', 's',
+                                        bounds=(-1.0, 1.0)), ), experiment=_FAST_REVERSALS,
+        distortion=lambda signal, time, offset: _interpolate(time - offset, time, signal),
+        stage='rate', correct_stamps=lambda time, offset: time - offset,
+        not_compensated='It is compensated by shifting the stamps; the delay for a controller '
+        'remains.'),
     Effect(
         'clock_rate', 'The clock of the gyro runs at a different rate than that of the reference.',
-        shapes=(Parameter('clock_rate', '1', bounds=(-0.1, 0.1)),),
-        shown_by='record a long log with quick motion at both ends',
-        distortion=lambda signal, time, rate: _at((1.0 + rate) * time, time, signal), stage='rate',
-        moved=lambda time, rate: (1.0 + rate) * time,
-        undone='It is compensated by scaling the stamps of a log; a robot stamps by its own '
-               'clock, without this effect.'),
-    Effect(
-        'dead_zone', 'The output stays zero while the rate is small.',
-        frozenset({'rate'}), (Parameter('amplitude', '1', default=1.0),),
-        lambda channels, dead_zone: ((abs(channels.rate) < dead_zone) * -channels.rate,),
-        (Parameter('dead_zone', 'rad/s', bounds=(1e-7, 1.0)),), 'sweep slowly through zero',
-        undone='An output of zero does not determine the rate within the zone.'))
+        nonlinear_parameters=(Parameter('clock_rate', '1', bounds=(-0.1, 0.1)), ),
+        experiment='record a long log with quick motion at both ends',
+        distortion=lambda signal, time, rate: _interpolate((1.0 + rate) * time, time, signal),
+        stage='rate', correct_stamps=lambda time, rate: (1.0 + rate) * time,
+        not_compensated='It is compensated by scaling the stamps of a log; a robot stamps by its '
+        'own '
+        'clock, without this effect.'),
+    Effect('dead_zone', 'The output stays zero while the rate is small.', frozenset({'rate'}),
+           (Parameter('amplitude', '1', default=1.0), ), lambda channels, dead_zone: (
+               (abs(channels.rate) < dead_zone) * -channels.rate, ),
+           (Parameter('dead_zone', 'rad/s', bounds=(1e-7, 1.0)), ), 'sweep slowly through zero',
+           not_compensated='An output of zero does not determine the rate within the zone.'))
 SATURATION = Effect(
     'saturation', 'The output cannot go beyond a limit.',
-    shapes=(Parameter('saturation', 'rad/s', bounds=(1e-3, 1e3)),),
-    shown_by='turn faster than the limit',
+    nonlinear_parameters=(Parameter('saturation', 'rad/s', bounds=(1e-3, 1e3)),),
+    experiment='turn faster than the limit',
     distortion=lambda signal, _time, limit: np.clip(signal, -limit, limit), stage='output',
-    undone='An output at the limit does not determine the rate beyond it.')
+    not_compensated='An output at the limit does not determine the rate beyond it.')
 QUANTIZATION = Effect(
     'quantization', 'The output comes in steps.',
-    shapes=(Parameter('quantization', 'rad/s', bounds=(1e-12, 1.0)),),
-    shown_by='list the distinct values of the output',
+    nonlinear_parameters=(Parameter('quantization', 'rad/s', bounds=(1e-12, 1.0)),),
+    experiment='list the distinct values of the output',
     distortion=lambda signal, _time, step: np.round(signal / step) * step, stage='output',
-    undone='The rounding error remains; with noise above half a step its mean is zero.')
+    not_compensated='The rounding error remains; with noise above half a step its mean is zero.')
 
 #: Effects of rate and temperature alone, which dwells of a rate table can show.
-STEADY = {effect.name: effect for effect in (
+STATIC_EFFECTS = {effect.name: effect for effect in (
     BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY, QUADRATIC_NONLINEARITY, CUBIC_NONLINEARITY,
     SINE_RESPONSE, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
 #: All effects except the polynomial.
-CATALOGUE = STEADY | {effect.name: effect for effect in (
-    *_OF_PAST_TEMPERATURES, *_OF_TIME, *_OF_SURROUNDINGS, *_OF_THE_SIGNAL, SATURATION,
+CATALOGUE = STATIC_EFFECTS | {effect.name: effect for effect in (
+    *_THERMAL_HISTORY_EFFECTS, *_TIME_EFFECTS, *_ENVIRONMENT_EFFECTS, *_SIGNAL_EFFECTS, SATURATION,
     QUANTIZATION)}
 #: Effects of the user, which `add_effects` added to the catalogue.
-ADDED: dict[str, Effect] = {}
+USER_EFFECTS: dict[str, Effect] = {}
 
 
 def add_effects(effects: Iterable[Effect]) -> None:
@@ -251,15 +254,16 @@ def add_effects(effects: Iterable[Effect]) -> None:
     for effect in effects:
         if not isinstance(effect, Effect):
             raise ValueError(f'{effect!r} is not an Effect')
-        if effect.name in CATALOGUE and effect.name not in ADDED:
+        if effect.name in CATALOGUE and effect.name not in USER_EFFECTS:
             raise ValueError(f'the name {effect.name} is taken; give the effect another')
-        if any(shape.default is None and not shape.begin_with for shape in effect.shapes):
+        if any(shape.default is None and not shape.begin_with
+               for shape in effect.nonlinear_parameters):
             raise ValueError(f'{effect.name} has a shape without a default and without begin_with')
         shapes = [shape.default if shape.default is not None else shape.begin_with[0]
-                  for shape in effect.shapes]
+                  for shape in effect.nonlinear_parameters]
         columns = effect.columns(channels, *shapes)
         if (len(columns) != len(effect.coefficients)
                 or any(np.shape(column) != rate.shape for column in columns)):
             raise ValueError(f'{effect.name} has {len(effect.coefficients)} coefficients and '
                              f'{len(columns)} columns; give an array like channels.rate for each')
-        ADDED[effect.name] = CATALOGUE[effect.name] = effect
+        USER_EFFECTS[effect.name] = CATALOGUE[effect.name] = effect

@@ -67,7 +67,7 @@ class Channels:
     lagged: Callable[[str, float], Number] | None = None
     heating: Callable[[float, float], Number] | None = None
 
-    def moving(self, rate: Number, output: Number) -> Channels:
+    def with_rate(self, rate: Number, output: Number) -> Channels:
         """Return the same surroundings with another rate and output."""
         # The constructor would take three times as long.
         other = object.__new__(Channels)
@@ -75,7 +75,7 @@ class Channels:
         return other
 
     @staticmethod
-    def of(rate: Number, output: Number, temperature: Number) -> Channels:
+    def instantaneous(rate: Number, output: Number, temperature: Number) -> Channels:
         """Return channels without history, in a third of the time of the constructor."""
         other = object.__new__(Channels)
         other.__dict__.update(rate=rate, output=output, temperature=temperature)
@@ -113,46 +113,48 @@ class Effect:
     ----------
     name : as in the catalogue and in files
     cause : one sentence for users
-    looks_at : the channels that it uses
+    inputs : the channels that it uses
     coefficients : factors of the columns
     columns : (channels, *shapes) -> one column per coefficient
-    shapes : nonlinear parameters, on which the columns depend
-    shown_by : experiment that separates it from similar effects
-    nested : (channels, shapes, coefficients) -> the sum of the columns times the coefficients,
-        where a faster formula exists
+    nonlinear_parameters : nonlinear parameters, on which the columns depend
+    experiment : experiment that separates it from similar effects
+    sum_columns : (channels, shapes, coefficients) -> the sum of the columns times the
+        coefficients, where a faster formula exists
     distortion : (signal, time, *values) -> signal, of a whole log, for an effect that adds nothing
         but changes the signal itself
     stage : of the distortion: 'rate' before anything is added to the rate, or 'output' after the
         noise
-    moved : (time, *values) -> time, of an effect that is compensated by shifting the stamps
-    undone : the part of the effect that compensation leaves, as a sentence; '' for none
+    correct_stamps : (time, *values) -> time, of an effect that is compensated by shifting the
+        stamps
+    not_compensated : the part of the effect that compensation leaves, as a sentence; '' for none
     along : channel of the abscissa of its plot in a diagnosis
 
     """
 
     name: str
     cause: str
-    looks_at: frozenset[str] = frozenset()
+    inputs: frozenset[str] = frozenset()
     coefficients: tuple[Parameter, ...] = ()
     columns: Callable[..., Sequence[Number]] = lambda _channels, *_shapes: ()
-    shapes: tuple[Parameter, ...] = ()
-    shown_by: str = ''
-    nested: Callable[[Channels, Sequence[float], Sequence[float]], Number] | None = None
+    nonlinear_parameters: tuple[Parameter, ...] = ()
+    experiment: str = ''
+    sum_columns: Callable[[Channels, Sequence[float], Sequence[float]], Number] | None = None
     distortion: Callable[..., Array] | None = None
     stage: str = ''
-    moved: Callable[..., Number] | None = None
-    undone: str = ''
+    correct_stamps: Callable[..., Number] | None = None
+    not_compensated: str = ''
     along: str = 'time'
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Shapes, then coefficients: the order of a term's values."""
-        return self.shapes + self.coefficients
+        return self.nonlinear_parameters + self.coefficients
 
-    def adding(self, values: Sequence[float]) -> Callable[[Channels], Number]:
+    def error_function(self, values: Sequence[float]) -> Callable[[Channels], Number]:
         """Return a function of channels: what the effect adds to the output, rad/s."""
-        shapes, coefficients = values[:len(self.shapes)], values[len(self.shapes):]
-        nested, columns = self.nested, self.columns
+        shapes, coefficients = (values[:len(self.nonlinear_parameters)],
+                                values[len(self.nonlinear_parameters):])
+        nested, columns = self.sum_columns, self.columns
         if nested is not None:
             return lambda channels: nested(channels, shapes, coefficients)
         if len(coefficients) == 1:
@@ -162,8 +164,8 @@ class Effect:
             value * column for value, column in zip(coefficients, columns(channels, *shapes)))
 
 
-def lag_ahead(interval: Number, change: Number, time_constant: float,
-              ahead: float = 0.0) -> Number:
+def lag_difference(interval: Number, change: Number, time_constant: float,
+                   initial_difference: float = 0.0) -> Number:
     """
     Return the lagged signal minus the signal, at one instant or at many (shape (n,)).
 
@@ -176,25 +178,25 @@ def lag_ahead(interval: Number, change: Number, time_constant: float,
     interval : since the previous sample, s, not negative
     change : of the signal since the previous sample
     time_constant : s, above 0
-    ahead : the difference at the sample before the first one
+    initial_difference : the difference at the sample before the first one
 
     """
     if not isinstance(interval, np.ndarray):
         x = interval / time_constant
-        return math.exp(-x) * ahead + change * (math.expm1(-x) / x if x else -1.0)
+        return math.exp(-x) * initial_difference + change * (math.expm1(-x) / x if x else -1.0)
     # an interval of 0 must not give 0 / 0
     x = np.maximum(interval / time_constant, 1e-300)
     fallen = np.expm1(-x)
-    return _recurrence(fallen + 1.0, change * (fallen / x), ahead)
+    return _solve_recurrence(fallen + 1.0, change * (fallen / x), initial_difference)
 
 
 def lagged_signal(signal: Array, time: Array, time_constant: float) -> Array:
     """Return a signal, shape (n,), through a lag that starts at its first value."""
     interval, change = np.diff(time, prepend=time[:1]), np.diff(signal, prepend=signal[:1])
-    return signal + lag_ahead(interval, change, time_constant)
+    return signal + lag_difference(interval, change, time_constant)
 
 
-def _recurrence(factors: Array, added: Array, before: float) -> Array:
+def _solve_recurrence(factors: Array, added: Array, initial: float) -> Array:
     """
     Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,).
 
@@ -210,7 +212,7 @@ def _recurrence(factors: Array, added: Array, before: float) -> Array:
     for k in range(1, width):
         total[k] += product[k] * total[k - 1]
         product[k] *= product[k - 1]
-    starts = [before]
+    starts = [initial]
     for factor, sum_of_row in zip(product[-1].tolist(), total[-1].tolist()):
         starts.append(factor * starts[-1] + sum_of_row)
     product *= np.array(starts[:-1])

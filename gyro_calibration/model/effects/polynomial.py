@@ -44,8 +44,8 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     """
     names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
 
-    def scaled(channels: Channels, output_centre: float, output_scale: float,
-               temperature_centre: float, temperature_scale: float) -> tuple[Number, Number]:
+    def scale_inputs(channels: Channels, output_centre: float, output_scale: float,
+                     temperature_centre: float, temperature_scale: float) -> tuple[Number, Number]:
         output = channels.output - output_centre
         output /= output_scale
         if not temperature_order:  # the temperature may be unknown
@@ -55,19 +55,19 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
         return output, temperature
 
     def columns(channels: Channels, *shapes: float) -> Sequence[Number]:
-        output, temperature = scaled(channels, *shapes)
+        output, temperature = scale_inputs(channels, *shapes)
         outputs = _powers(output, rate_order)
         return [of_temperature * of_output
                 for of_temperature in _powers(temperature, temperature_order)
                 for of_output in outputs]
 
-    def nested(channels: Channels, shapes: Sequence[float],
-               coefficients: Sequence[float]) -> Number:
-        output, temperature = scaled(channels, *shapes)
+    def sum_columns(channels: Channels, shapes: Sequence[float],
+                    coefficients: Sequence[float]) -> Number:
+        output, temperature = scale_inputs(channels, *shapes)
         width = rate_order + 1
-        inner = [_horner(coefficients[begin:begin + width], output)
+        inner = [_evaluate_horner(coefficients[begin:begin + width], output)
                  for begin in range(0, len(coefficients), width)]
-        return _horner(inner, temperature)
+        return _evaluate_horner(inner, temperature)
 
     return Effect(
         'rate_temperature_polynomial',
@@ -78,7 +78,7 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
          Parameter('output_scale', 'rad/s', 1.0, (1e-9, np.inf)),
          Parameter('temperature_centre', 'degC', 0.0),
          Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))),
-        'turn at more rates, at more temperatures, or take lower orders', nested)
+        'turn at more rates, at more temperatures, or take lower orders', sum_columns)
 
 
 def _powers(value: Number, order: int) -> list[Number]:
@@ -88,7 +88,7 @@ def _powers(value: Number, order: int) -> list[Number]:
     return powers
 
 
-def _horner(coefficients: Sequence[Number], value: Number) -> Number:
+def _evaluate_horner(coefficients: Sequence[Number], value: Number) -> Number:
     """Return the sum of coefficients times `_powers`, by Horner's rule, with one new array."""
     if len(coefficients) == 1:
         return coefficients[0] * (value * 0.0 + 1.0)
@@ -137,12 +137,12 @@ def polynomial_to_matrix(effect: Effect, values: Sequence[float]) -> Array:
     rows = 1 + max(int(parameter.name[1:].split('w')[0]) for parameter in effect.coefficients)
     c = np.reshape(values[4:], (rows, -1))
     columns = c.shape[1]
-    of_temperature = _raw_powers(temperature_centre, temperature_scale, rows)
-    raw = of_temperature.T @ c @ _raw_powers(output_centre, output_scale, columns)
+    of_temperature = _raw_power_coefficients(temperature_centre, temperature_scale, rows)
+    raw = of_temperature.T @ c @ _raw_power_coefficients(output_centre, output_scale, columns)
     return (raw * DEGREE ** (np.arange(columns) - 1.0))[::-1, ::-1]
 
 
-def _raw_powers(centre: float, scale: float, count: int) -> Array:
+def _raw_power_coefficients(centre: float, scale: float, count: int) -> Array:
     """Return rows i of the coefficients of ``((x - centre) / scale)**i``, lowest power first."""
     rows = np.zeros((count, count))
     for power in range(count):
