@@ -446,12 +446,12 @@ class _TopicSession(_Session):
 
     def _check_publishers(self, node: Any, tick: Callable[[], None]) -> None:
         tick()
-        self._unknown_topics = node.unknown
+        self._unknown_topics = node.unknown_topics
         if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
             self._is_waiting = False
-            if missing := node.missing:
+            if missing := node.missing_topics:
                 verb.print_message(f'no publisher so far of {", ".join(missing)}; '
-                                   f'there are {", ".join(node.known()) or "none"}')
+                                   f'there are {", ".join(node.known_topics()) or "none"}')
 
     def _answer_data(self) -> dict[str, Any]:
         return {**super()._answer_data(), 'messages': self._messages}

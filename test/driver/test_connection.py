@@ -176,7 +176,7 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     world.at(30.0, world.plug)
     world.at(50.0, world.unplug)
     reading = Reading(world, 'csv')
-    waits = [state.waiting for state in reading.states if state.name == 'failed']
+    waits = [state.retry_delay for state in reading.states if state.name == 'failed']
     doubling = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
     assert waits == pytest.approx([*doubling, *5 * [5.0], *doubling, 5.0])
     assert reading.connection.waited_duration == pytest.approx(31.3 + 10.0, abs=0.2)

@@ -180,9 +180,9 @@ def test_samples_are_numbered():
 class Adapter(Emulator):
     """Sends what arrives behind an adapter, in bursts."""
 
-    _BATCH = 0.0
+    _BATCH_DURATION = 0.0
 
-    def _frames(self):
+    def _timed_frames(self):
         return bursts(super()._timed_frames())
 
 

@@ -131,7 +131,7 @@ import sys
 from gyro_calibration.ros import driver_node
 def fill(self, mean):
     raise ZeroDivisionError('as if there were a fault in the program')
-driver_node.Messages.fill = fill
+driver_node.SampleMessages.fill = fill
 sys.exit(driver_node.main())
 """
 

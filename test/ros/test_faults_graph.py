@@ -225,7 +225,7 @@ class Hanging(Node):
     def destroy_node(self):
         time.sleep(30.0)
 
-node.ENDING = 0.5
+node.SHUTDOWN_TIMEOUT = 0.5
 import rclpy
 rclpy.init()
 stop = threading.Event()
