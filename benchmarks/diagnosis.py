@@ -145,18 +145,18 @@ HEADER = ('| hidden | logs | detected | first | in set | set size | extra | beyo
 
 def line(row: str, answers: Sequence[Answer]) -> str:
     """Return a row of the table in Markdown, in percent where it is a share."""
-    sizes = [size for each in answers for size in each.judgement.set_sizes]
-    held = [value for each in answers for value in each.judgement.interval_holds.values()]
-    cells = [row, str(len(answers)), _percent([each.judgement.is_detected for each in answers])]
-    hidden = [_percent([getattr(each.judgement, name) for each in answers])
-              for name in ('first', 'in_set')]
-    cells += hidden if any(each.has_hidden for each in answers) else ['', '']
+    sizes = [size for each in answers for size in each.how.set_sizes]
+    held = [value for each in answers for value in each.how.interval_holds.values()]
+    cells = [row, str(len(answers)), _percent([each.how.is_detected for each in answers])]
+    hidden = [_percent([getattr(each.how, name) for each in answers])
+              for name in ('is_first', 'is_in_set')]
+    cells += hidden if any(each.hidden for each in answers) else ['', '']
     cells += [
         f'{np.mean(sizes):.2f}' if sizes else '',
-        f'{np.mean([len(each.judgement.false_names) for each in answers]):.3f}',
-        f'{np.mean([len(each.judgement.unexplained_variables) for each in answers]):.3f}',
+        f'{np.mean([len(each.how.false_names) for each in answers]):.3f}',
+        f'{np.mean([len(each.how.unexplained_variables) for each in answers]):.3f}',
         f'{np.mean([len(each.suspected) for each in answers]):.3f}',
-        _percent([each.is_right for each in answers]),
+        _percent([each.right for each in answers]),
         _percent(held),
         _share(answers, 'rate'),
         _share(answers, 'heading'), f'{np.mean([each.seconds for each in answers]):.1f}'
@@ -176,10 +176,10 @@ def _share(answers: Sequence[Answer], name: str) -> str:
 
 def failing(answer: Answer) -> str:
     """Return what went wrong in a case, in a line or two."""
-    hidden = ', '.join(f'{name} {_short(each)}' for name, each in answer.has_hidden.items())
+    hidden = ', '.join(f'{name} {_short(each)}' for name, each in answer.hidden.items())
     said = [f'{"|".join([each["effect"], *each["ambiguous_with"]])} p={each["p_value"]:.1e} '
             f'{_short(each["parameters"])}' for each in answer.findings]
-    said += [f'unexplained along {along}' for along in answer.judgement.unexplained_variables
+    said += [f'unexplained along {along}' for along in answer.how.unexplained_variables
              ] + [answer.problem] * bool(answer.problem)
     return (f'{answer.case}\n    hidden: {hidden or "nothing"}\n'
             f'    answer: {"; ".join(said) or "nothing"}')
@@ -220,7 +220,7 @@ def _run(chosen: Sequence[Case], given: argparse.Namespace) -> Iterator[Answer]:
     """Run cases, in some processes, and keep them in a file."""
     with get_context('fork').Pool(given.processes) as pool:
         for answer in pool.imap(partial(answered, seed=given.seed), chosen):
-            if given.verbose and not answer.is_right:
+            if given.verbose and not answer.right:
                 print(failing(answer), file=sys.stderr, flush=True)
             if given.out:
                 with open(given.out, 'a') as file:
