@@ -127,18 +127,12 @@ class _CourseAlignment:
         """Return the spans for a time offset that the samples cover."""
         half_step = 0.5
         inside = (self.time + offset - half_step - 0.5 * SPAN_DURATION >= self._time[0]) & (
-            self.time + offset + half_step + 0.5 * SPAN_DURATION <= self._time[-1]
-        )
-        middle, later, earlier = (
-            self.gyro_angle(offset + shift)[inside] for shift in (0, half_step, -half_step)
-        )
-        return _Spans(
-            self.time[inside],
-            self.course[inside],
-            middle,
-            (later - earlier) / (2.0 * half_step),
-            (later - 2.0 * middle + earlier) / half_step**2,
-        )
+            self.time + offset + half_step + 0.5 * SPAN_DURATION <= self._time[-1])
+        middle, later, earlier = (self.gyro_angle(offset + shift)[inside]
+                                  for shift in (0, half_step, -half_step))
+        return _Spans(self.time[inside], self.course[inside], middle,
+                      (later - earlier) / (2.0 * half_step),
+                      (later - 2.0 * middle + earlier) / half_step**2)
 
     def find_coarse_offset(self, largest: float) -> float:
         """Return the offset at which course less integral is straight for most of the time."""
@@ -146,18 +140,12 @@ class _CourseAlignment:
         line = np.column_stack([np.ones(len(self.time)), self.time])
         misfits = [
             float(np.mean(np.abs(robust_residual(line, self.course - self.gyro_angle(offset), 3))))
-            for offset in offsets
-        ]
+            for offset in offsets]
         return float(offsets[int(np.argmin(misfits))])
 
 
-def fit_course(
-    time: Array,
-    rate: Array,
-    motion: Motion,
-    technology: str = 'mems',
-    largest_time_offset: float = MAX_TIME_OFFSET,
-) -> ScaleBiasFit:
+def fit_course(time: Array, rate: Array, motion: Motion, technology: str = 'mems',
+               largest_time_offset: float = MAX_TIME_OFFSET) -> ScaleBiasFit:
     """
     Fit scale factor error, bias and time offset to a drive.
 
@@ -178,10 +166,9 @@ def fit_course(
     offset = alignment.find_coarse_offset(largest_time_offset)
     spans = alignment.average_spans(offset)
     if len(spans.time) < MIN_SPANS:
-        raise DataRefused(
-            f'the course is known for {len(spans.time) * SPAN_DURATION:.0f} s, wanted at least '
-            f'{MIN_SPANS * SPAN_DURATION:.0f} s: drive for longer, faster than a walk'
-        )
+        raise DataRefused(f'the course is known for {len(spans.time) * SPAN_DURATION:.0f} s, '
+                          f'wanted at least {MIN_SPANS * SPAN_DURATION:.0f} s: drive for longer, '
+                          'faster than a walk')
     _refuse_other_motion(spans)
     point_variance: Array = np.ones(len(spans.time))
     for _ in range(2):
@@ -191,16 +178,10 @@ def fit_course(
     jacobian = np.array([[-1.0 / scale**2, 0.0], [-scaled_bias / scale**2, 1.0 / scale]])
     covariance = jacobian @ _stretch_covariance(found, spans) @ jacobian.T
     influence = found.influence[:, :2] @ jacobian.T
-    return ScaleBiasFit(
-        float(1.0 / scale - 1.0),
-        float(scaled_bias / scale),
-        covariance,
-        offset + float(late),
-        found.size('angle_random_walk'),
-        found.size('reference'),
-        time_offset_deviation=float(found.deviations[2]),
-        influence=np.column_stack([influence, spans.time[1:]]),
-    )
+    return ScaleBiasFit(float(1.0 / scale - 1.0), float(scaled_bias / scale), covariance,
+                        offset + float(late), found.size('angle_random_walk'),
+                        found.size('reference'), time_offset_deviation=float(found.deviations[2]),
+                        influence=np.column_stack([influence, spans.time[1:]]))
 
 
 def is_course(time: Array, rate: Array, motion: Motion) -> bool:
@@ -233,8 +214,7 @@ def is_course(time: Array, rate: Array, motion: Motion) -> bool:
 def _regression_columns(spans: _Spans) -> Array:
     """Return the columns of p, q, d and c in the increments of the course, shape (n - 1, 4)."""
     return np.diff(
-        np.column_stack([spans.gyro_angle, -spans.time, spans.rate, spans.acceleration]), axis=0
-    )
+        np.column_stack([spans.gyro_angle, -spans.time, spans.rate, spans.acceleration]), axis=0)
 
 
 def _regress_course(spans: _Spans, point_variance: Array, technology: str) -> GridFit:
@@ -244,19 +224,11 @@ def _regress_course(spans: _Spans, point_variance: Array, technology: str) -> Gr
     noise = heading_noise(spans.time, spans.rate, point_variance,
                           angle_random_walk=WHITE_NOISE_RANGE)
     return fit_noise_grid(
-        increments,
-        columns,
-        noise,
-        cosines,
-        wanders,
-        np.array([1.0, 0.0, 0.0, 0.0]),
+        increments, columns, noise, cosines, wanders, np.array([1.0, 0.0, 0.0, 0.0]),
         np.array([largest_scale, largest_bias, DELAY_DEVIATION, SMOOTHING_DEVIATION]),
-        wandering_value=1,
-        hierarchical_priors=(
+        wandering_value=1, hierarchical_priors=(
             HierarchicalPrior('scale_factor_error', 0, (1e-2 * largest_scale, largest_scale)),
-            HierarchicalPrior('bias', 1, (1e-3 * largest_bias, largest_bias)),
-        ),
-    )
+            HierarchicalPrior('bias', 1, (1e-3 * largest_bias, largest_bias))))
 
 
 def _point_errors(spans: _Spans, point_variance: Array) -> Array:
@@ -279,17 +251,15 @@ def _burst_variance(spans: _Spans, error: Array) -> Array:
 
 def _refuse_other_motion(spans: _Spans) -> None:
     """Refuse a gyro that explains less than half of the variation of the course."""
-    residual_variation, course_variation = (_median_line_deviation(
-        spans.time, each) for each in (spans.course - spans.gyro_angle, spans.course))
+    residual_variation, course_variation = (
+        _median_line_deviation(spans.time, each)
+        for each in (spans.course - spans.gyro_angle, spans.course))
     if residual_variation > max(MAX_FOLLOWED_RESIDUAL, 0.5 * course_variation):
-        raise DataRefused(
-            f'within {STRETCH_DURATION:.0f} s the course varies by '
-            f'{course_variation / DEGREE:.1f} deg, and less the '
-            f'gyro by {residual_variation / DEGREE:.1f} deg (medians): the gyro does not follow '
-            'the '
-            'course. Check that both belong to one drive, and check axis, sign, units, and that '
-            'the gyro responds'
-        )
+        raise DataRefused(f'within {STRETCH_DURATION:.0f} s the course varies by '
+                          f'{course_variation / DEGREE:.1f} deg, and less the gyro by '
+                          f'{residual_variation / DEGREE:.1f} deg (medians): the gyro does not '
+                          'follow the course. Check that both belong to one drive, and check '
+                          'axis, sign, units, and that the gyro responds')
 
 
 def _median_line_deviation(time: Array, heading: Array) -> float:

@@ -176,14 +176,13 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     refuse_dead(output)
     fit = METHODS[method](time, output, motion, limits)
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
-    drift = _estimate_drift(motion,
-                            _corrected_residual(time, output, motion, fit).heading, fit.bias, noise
-                            or Noise(), technology)
+    drift = _estimate_drift(motion, _corrected_residual(time, output, motion, fit).heading,
+                            fit.bias, noise or Noise(), technology)
     _refuse_uncertain_bias(drift.bias, drift.deviation, limits.max_heading_error)
     fit = _apply_drift(fit, drift)
     _refuse_uncertain_scale(fit, limits)
-    before, after = (_heading_residual(time - np.nan_to_num(fit.time_offset), output, motion),
-                     _corrected_residual(time, output, motion, fit))
+    before = _heading_residual(time - np.nan_to_num(fit.time_offset), output, motion)
+    after = _corrected_residual(time, output, motion, fit)
     # what repeats within a piece, as a wobble of the shaft does, is no random walk
     repeats = fit.angle_random_walk > drift.largest_walk
     fit = replace(fit, angle_random_walk=drift.largest_walk) if repeats else fit
@@ -204,8 +203,8 @@ def _calibrate_by_course(log: Log, time: Array, output: Array, motion: Motion, n
     _refuse_length(motion)
     refuse_dead(output)
     fit = fit_course(time, output, motion, technology)
-    before, after = (_heading_residual(time - fit.time_offset, output, motion),
-                     _corrected_residual(time, output, motion, fit))
+    before = _heading_residual(time - fit.time_offset, output, motion)
+    after = _corrected_residual(time, output, motion, fit)
     drift = _estimate_drift(motion, after.heading, fit.bias, noise or Noise(), technology)
     model = _build_model(output, log.temperature, fit, noise or Noise(fit.angle_random_walk))
     remark = ('what the drive leaves open of scale factor error and bias is drawn towards zero, '
@@ -306,8 +305,8 @@ def _fit_by_rate(time: Array, output: Array, motion: Motion, _: RunLimits) -> Sc
     inside = (time >= 0.0) & (time <= motion.duration)
     time, output = time[inside], output[inside]
     fit = fit_rate(time, output, motion)
-    scale, offset = (1.0 / (1.0 + fit.scale_factor_error),
-                     -fit.bias / (1.0 + fit.scale_factor_error))
+    scale = 1.0 / (1.0 + fit.scale_factor_error)
+    offset = -fit.bias / (1.0 + fit.scale_factor_error)
     columns = np.column_stack([output, np.ones(len(output))])
     scores = columns * (columns @ (scale, offset) - motion.rate_at(time))[:, None]
     jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
@@ -395,21 +394,19 @@ def _apply_drift(fit: ScaleBiasFit, drift: BiasDrift) -> ScaleBiasFit:
                / stats.norm.ppf(0.975)) ** 2
     scatter = student * sums @ sums.T
     slope = scatter[0, 1] / scatter[1, 1]
-    known = np.array(
-        [math.sqrt(scatter[0, 0]),
-         math.hypot(drift.deviation, drift.wander_deviation)])
+    known = np.array([math.sqrt(scatter[0, 0]),
+                      math.hypot(drift.deviation, drift.wander_deviation)])
     deviations = np.sqrt(np.diag(scatter))
     return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
-                   + float(slope) * (drift.bias - fit.bias), covariance=scatter * np.outer(
-                       known / deviations, known / deviations))
+                   + float(slope) * (drift.bias - fit.bias),
+                   covariance=scatter * np.outer(known / deviations, known / deviations))
 
 
 def _build_model(output: Array, temperature: Array | None, fit: ScaleBiasFit,
                  noise: Noise) -> GyroModel:
-    model = GyroModel((Term(BIAS, (fit.bias,)),
-                       Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))),
-                      fit.covariance[::-1, ::-1], (float(output.min()), float(output.max())),
-                      noise=noise)
+    model = GyroModel(
+        (Term(BIAS, (fit.bias,)), Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))),
+        fit.covariance[::-1, ::-1], (float(output.min()), float(output.max())), noise=noise)
     if temperature is None:
         return model
     return replace(model, temperature_range=(float(temperature.min()), float(temperature.max())),

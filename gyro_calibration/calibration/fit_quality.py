@@ -113,8 +113,8 @@ def _average_windows(fit: ScaleBiasFit, time: Array, rate: Array,
     count = np.bincount(place, minlength=_WINDOW_COUNT)
     if length < 1.0 or not count.all():
         return None
-    error = (np.interp(gyro_time, time, integrate(time, rate)) -
-             (1.0 + fit.scale_factor_error) * heading)
+    error = (np.interp(gyro_time, time, integrate(time, rate))
+             - (1.0 + fit.scale_factor_error) * heading)
     middle, known, turned = (np.bincount(place, values) / count
                              for values in (gyro_time, heading, error))
     return _WindowMeans(length, middle, known, turned, float(np.std(error - turned[place])))
@@ -124,11 +124,10 @@ def _fit_windows(windows: _WindowMeans, walk_range: tuple[float, float],
                  reference_range: tuple[float, float]) -> GridFit:
     """Fit a bias, with ranges of N, rad/√s, and of the errors of the means of windows, rad."""
     ones = np.ones(len(windows.time) - 1)
-    return fit_noise_grid(
-        np.diff(windows.heading_error), np.diff(windows.time)[:, None],
-        [BandedNoise('angle_random_walk', 2.0 / 3.0 * windows.duration * ones,
-                     windows.duration / 6.0 * ones, walk_range),
-         BandedNoise('reference', 2.0 * ones, -ones, reference_range)])
+    return fit_noise_grid(np.diff(windows.heading_error), np.diff(windows.time)[:, None],
+                          [BandedNoise('angle_random_walk', 2.0 / 3.0 * windows.duration * ones,
+                                       windows.duration / 6.0 * ones, walk_range),
+                           BandedNoise('reference', 2.0 * ones, -ones, reference_range)])
 
 
 def add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
@@ -170,15 +169,13 @@ def refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
     DataRefused : the standard deviation exceeds the limit, and the error without the calibration
 
     """
-    error_with = math.sqrt((fit.covariance[1, 1] * DRIVE_DURATION
-                            + 2.0 * fit.covariance[0, 1] * DRIVE_ANGLE) * DRIVE_DURATION
-                           + fit.covariance[0, 0] * DRIVE_ANGLE ** 2)
+    error_with = math.sqrt(
+        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * DRIVE_ANGLE)
+        * DRIVE_DURATION + fit.covariance[0, 0] * DRIVE_ANGLE ** 2)
     error_without = math.hypot(fit.bias * DRIVE_DURATION, fit.scale_factor_error * DRIVE_ANGLE)
     if error_with > max(limit, error_without):
         raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
-                          'deg/s only, which lets a heading drift by '
-                          f'{error_with / DEGREE:.0f} deg in five minutes; without the '
-                          'calibration it '
-                          f'is {error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
-                          'for '
-                          'longer')
+                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
+                          'deg in five minutes; without the calibration it is '
+                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
+                          'for longer')

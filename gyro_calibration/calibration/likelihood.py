@@ -255,8 +255,8 @@ class _RunAlignment:
         """
         base = self._smoothing_time
         integral, later, earlier = (self._integral_at(at + shift) for shift in (0.0, base, -base))
-        rate, acceleration = (0.5 * (later - earlier) / base,
-                              (later - 2.0 * integral + earlier) / base ** 2)
+        rate = 0.5 * (later - earlier) / base
+        acceleration = (later - 2.0 * integral + earlier) / base ** 2
         return rate + constant * acceleration, acceleration, integral + constant * rate
 
     def _integral_at(self, at: Array) -> Array:
@@ -287,17 +287,16 @@ class _RunAlignment:
         fine = np.arange(-5, 6) * 0.002
         deepest = [min((self._misfit(offset), offset) for offset in bottom + fine)
                    for bottom in bottoms]
-        alike = [
-            offset for misfit, offset in deepest if misfit <= _MAX_MISFIT_RATIO * min(deepest)[0]
-        ]
+        alike = [offset
+                 for misfit, offset in deepest if misfit <= _MAX_MISFIT_RATIO * min(deepest)[0]]
         return float(min(alike, key=abs))
 
     def _misfit(self, offset: float) -> float:
         data = self.increments_at(offset)
         if len(data.gyro_increments) < 10:
             return math.inf
-        return float(np.mean(np.abs(robust_residual(data.columns[:, :2], data.gyro_increments,
-                                                    3))))
+        return float(
+            np.mean(np.abs(robust_residual(data.columns[:, :2], data.gyro_increments, 3))))
 
 
 def block_duration(motion: Motion) -> float:
@@ -305,8 +304,8 @@ def block_duration(motion: Motion) -> float:
     block = min(MAX_BLOCK_DURATION, motion.duration / 40.0)
     time = np.arange(0.0, motion.duration, block / 64.0)
     heading = motion.heading_at(time[:len(time) // 64 * 64]).reshape(-1, 64)
-    whole, within = np.var(heading), [np.var(heading.reshape(-1, size), axis=1).mean()
-                                      for size in (64, 32, 16, 8, 4)]
+    whole = np.var(heading)
+    within = [np.var(heading.reshape(-1, size), axis=1).mean() for size in (64, 32, 16, 8, 4)]
     halvings = int(np.argmax(np.append(np.array(within) < 0.05 * whole, True)))
     return block / 2.0 ** halvings
 
@@ -322,8 +321,8 @@ def _select_reference_points(motion: Motion, block: float,
     if not step:
         return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
                                 np.empty((len(motion.time), 0)))
-    step_crossings, constant_readings = (_find_step_crossings(motion, step),
-                                         _find_constant_readings(motion, step, block))
+    step_crossings = _find_step_crossings(motion, step)
+    constant_readings = _find_constant_readings(motion, step, block)
     order = np.argsort(np.append(step_crossings.time, constant_readings.time), kind='stable')
     time, heading, variance, shared = (np.concatenate(
         [getattr(points, name) for points in (step_crossings, constant_readings)])[order]
@@ -343,8 +342,8 @@ _MAX_TURN_GROUPS = 12
 #: heading: their times, s, and prior standard deviation, 1.
 _RESPONSE_DELAYS, _RESPONSE_DEVIATION = (0.15, 0.3, 0.45, 0.6, 0.8), 0.3
 #: Possible factors of the prior standard deviations of the response, and of slips.
-_TRACKING_FACTORS, _SLIP_FACTORS = (np.array([0.001, 0.1,
-                                              1.0]), np.array([0.001, 0.03, 0.1, 0.3, 1.0]))
+_TRACKING_FACTORS, _SLIP_FACTORS = (np.array([0.001, 0.1, 1.0]),
+                                    np.array([0.001, 0.03, 0.1, 0.3, 1.0]))
 
 
 def tracking_error_columns(motion: Motion, time: Array,
@@ -378,30 +377,23 @@ def tracking_error_columns(motion: Motion, time: Array,
     # the mean over the turns is delay, lag and scale
     contrasts = helmert(count).T
     columns = [rate[:, None] * (inside @ contrasts), acceleration[:, None] * (inside @ contrasts)]
-    columns.append(np.column_stack([
-        heading - 2.0 * motion.heading_at(time - late) + motion.heading_at(time - 2.0 * late)
-        for late in _RESPONSE_DELAYS]))
-    deviations = [
-        np.full(count - 1, _TURN_DELAY_DEVIATION),
-        np.full(count - 1, _TURN_LAG_DEVIATION),
-        np.full(len(_RESPONSE_DELAYS), _RESPONSE_DEVIATION)
-    ]
+    columns.append(
+        np.column_stack([heading - 2.0 * motion.heading_at(time - late)
+                         + motion.heading_at(time - 2.0 * late) for late in _RESPONSE_DELAYS]))
+    deviations = [np.full(count - 1, _TURN_DELAY_DEVIATION),
+                  np.full(count - 1, _TURN_LAG_DEVIATION),
+                  np.full(len(_RESPONSE_DELAYS), _RESPONSE_DEVIATION)]
     following, slips = _TRACKING_FACTORS, np.ones(1)
     if slip_deviation:
         ending = inside & (rate * acceleration < 0.0)[:, None]
-        columns += [
-            np.cumsum(heading_change * part, axis=0) for part in (inside @ contrasts, ending)
-        ]
+        columns += [np.cumsum(heading_change * part, axis=0)
+                    for part in (inside @ contrasts, ending)]
         deviations.append(np.full(2 * count - 1, slip_deviation))
         slips = _SLIP_FACTORS
-    prior_factors = np.hstack([
-        np.repeat(
-            np.tile(following, len(slips))[:, None], 2 * count - 2 + len(_RESPONSE_DELAYS),
-            axis=1),
-        np.repeat(
-            np.repeat(slips, len(following))[:, None], (2 * count - 1) * bool(slip_deviation),
-            axis=1)
-    ])
+    prior_factors = np.hstack([np.repeat(np.tile(following, len(slips))[:, None],
+                                         2 * count - 2 + len(_RESPONSE_DELAYS), axis=1),
+                               np.repeat(np.repeat(slips, len(following))[:, None],
+                                         (2 * count - 1) * bool(slip_deviation), axis=1)])
     if sense.min() < 0.0 < sense.max():
         columns.append(np.cumsum(np.abs(heading_change), axis=0))
         deviations.append(np.array([ASYMMETRY_DEVIATION]))
@@ -424,10 +416,9 @@ def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
     speed = np.abs(np.diff(heading) / np.diff(time))
     relative_deviation = (np.maximum(np.append(speed, 0.0), np.append(0.0, speed)[:len(time)])
                           if len(time) else time)
-    relative_deviation = np.where(
-        change[index] > 1.5 * step, 1.0,
-        np.clip(relative_deviation * np.diff(motion.time)[index] / step, _MIN_CROSSING_DEVIATION,
-                1.0))
+    relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
+                                  np.clip(relative_deviation * np.diff(motion.time)[index] / step,
+                                          _MIN_CROSSING_DEVIATION, 1.0))
     # none has more weight than the median one: the accuracy of a reference is seldom that of its
     # slowest steps
     relative_deviation = (np.maximum(relative_deviation, np.median(relative_deviation))
@@ -458,9 +449,9 @@ def _find_constant_readings(motion: Motion, step: float, block: float) -> _Refer
     is_used[[0, -1]] = True
     rest_columns = np.zeros((len(begins), 2))
     if len(begins) > 2:
-        rest_columns[0, 0], rest_columns[-1, 1] = (durations[end]
-                                                   > max(block, 2.0 * durations[next_to])
-                                                   for end, next_to in ((0, 1), (-1, -2)))
+        rest_columns[0, 0], rest_columns[-1, 1] = (
+            durations[end] > max(block, 2.0 * durations[next_to])
+            for end, next_to in ((0, 1), (-1, -2)))
     variance = np.where(rest_columns.any(axis=1), 1.0, np.bincount(run))
     kept = is_used[run]
     return _ReferencePoints(motion.time[kept], motion.heading[kept], variance[run[kept]],
@@ -601,15 +592,15 @@ def _average_over_noise(data: _Increments, prior_factors: Array) -> _ModelAverag
         change = np.einsum('...ij,...j->...i', inverse,
                            gradient - precision * (unregularized - data.prior_mean))
         dof = count - 1.0 - np.einsum('...ij,...ji->...', inverse, matrix)
-        residual_squares = squares + np.einsum('...i,...i->...', change, np.einsum(
-            '...ij,...j->...i', matrix, change) - 2.0 * gradient)
+        residual_squares = squares + np.einsum(
+            '...i,...i->...', change,
+            np.einsum('...ij,...j->...i', matrix, change) - 2.0 * gradient)
         variance = np.maximum(residual_squares / dof, min_variance)
     values = unregularized + change
-    logarithms = -0.5 * (
-        (count - len(data.prior_deviation) - 1.0) * np.log(variance) + dof + determinant
-        + (((values - data.prior_mean) / priors)[..., known] ** 2
-           + 2.0 * np.log(priors[:, known])).sum(axis=-1)
-        + np.linalg.slogdet(scaled)[1] + 2.0 * np.log(size).sum(axis=-1)).ravel()
+    logarithms = -0.5 * ((count - len(data.prior_deviation) - 1.0) * np.log(variance) + dof
+                         + determinant + (((values - data.prior_mean) / priors)[..., known] ** 2
+                                          + 2.0 * np.log(priors[:, known])).sum(axis=-1)
+                         + np.linalg.slogdet(scaled)[1] + 2.0 * np.log(size).sum(axis=-1)).ravel()
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     # the variance is estimated too, so the values have Student's distribution, which is wider
@@ -712,9 +703,9 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         stretch_probability, stretch_values, stretch_covariance = _weigh_stretch(
             estimate, data, found, inside, noise_deviation)
         difference = stretch_values - values
-        covariance = ((1.0 - stretch_probability) * covariance
-                      + stretch_probability * stretch_covariance + stretch_probability *
-                      (1.0 - stretch_probability) * np.outer(difference, difference))
+        covariance = (
+            (1.0 - stretch_probability) * covariance + stretch_probability * stretch_covariance
+            + stretch_probability * (1.0 - stretch_probability) * np.outer(difference, difference))
         values = values + stretch_probability * difference
     scale, bias = values.tolist()
     # with a slip, first the columns of the differences between turns, then of the ends of turns
@@ -723,14 +714,15 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
     return ScaleBiasFit(
         scale - 1.0, bias, covariance, offset, math.sqrt(estimate.rate_variance),
-        math.sqrt(estimate.rate_variance * estimate.noise.ratio)
-        / abs(_nonzero_scale(estimate.values[0])),
+        math.sqrt(estimate.rate_variance * estimate.noise.ratio) / abs(
+            _nonzero_scale(estimate.values[0])),
         (abs(found.excess_rate) * float(inside.sum()),
-         math.sqrt(found.explained_squares) / noise_deviation), delay_change,
-        np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
+         math.sqrt(found.explained_squares) / noise_deviation),
+        delay_change, np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
         *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
-        *_residual_squares(data, estimate, alignment.is_measured), slip_deviation=math.sqrt(
-            float(np.mean(slips ** 2))) if slip_deviation and len(slips) else 0.0)
+        *_residual_squares(data, estimate, alignment.is_measured),
+        slip_deviation=math.sqrt(float(np.mean(slips ** 2))) if slip_deviation and len(slips)
+        else 0.0)
 
 
 #: The noise is estimated again where the offset changed by more than this, s.
@@ -760,8 +752,8 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     heading, elapsed, shared, gyro_angle = (data.start_offsets[0], data.start_offsets[1],
                                             data.start_offsets[2:-1], data.start_offsets[-1])
     scale, bias = _nonzero_scale(estimate.values[0]), estimate.values[1]
-    prior, first = (estimate.noise.ratio * data.reference_variance[0],
-                    np.eye(len(data.gyro_increments))[0])
+    prior = estimate.noise.ratio * data.reference_variance[0]
+    first = np.eye(len(data.gyro_increments))[0]
     error = prior * float(estimate.noise.solve(estimate.residual)[0])
     weighted = estimate.noise.solve(data.columns)
     left = (float(estimate.noise.solve(first)[0])
@@ -837,8 +829,7 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
     noise_deviation = max(float(np.median(np.abs(robust))) / 0.6745
                           * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
     edges = np.unique(
-        np.linspace(0, len(robust),
-                    min(len(robust), _MAX_EDGES) + 1).astype(np.intp))
+        np.linspace(0, len(robust), min(len(robust), _MAX_EDGES) + 1).astype(np.intp))
     steps = np.where(np.arange(len(robust))[:, None] >= edges, interval[:, None], 0.0)
     prior = noise_deviation / estimate.prior_deviation
     found = find_deviating_stretch(
@@ -886,11 +877,10 @@ def find_deviating_stretch(columns: Array, steps: Array, observed: Array) -> Dev
     gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
     first, last = np.unravel_index(int(gains.argmax()), gains.shape)
     gain = float(gains[first, last])
-    return DeviatingStretch(int(first), int(last),
-                            float(differences[first, last] / max(norms[first, last], 1e-300)),
-                            gain,
-                            float(observed @ observed - np.sum((basis.T @ observed) ** 2)) - gain,
-                            gains[distinct], norms[distinct])
+    return DeviatingStretch(
+        int(first), int(last), float(differences[first, last] / max(norms[first, last], 1e-300)),
+        gain, float(observed @ observed - np.sum((basis.T @ observed) ** 2)) - gain,
+        gains[distinct], norms[distinct])
 
 
 #: Fraction of a stretch that the columns of a fit must not explain, so that the two are

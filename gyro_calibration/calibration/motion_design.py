@@ -93,8 +93,8 @@ class RobotLimits:
     def max_turn_rate(self, angle: float) -> float:
         """Return the fastest rate, rad/s, whose ramps fit into a turn by an angle above 0, rad."""
         jerked = 0.5 * self.acceleration ** 2 / self.jerk
-        steep, low = (math.sqrt(jerked ** 2 + self.acceleration * angle) - jerked,
-                      (0.25 * angle ** 2 * self.jerk) ** (1.0 / 3.0))
+        steep = math.sqrt(jerked ** 2 + self.acceleration * angle) - jerked
+        low = (0.25 * angle ** 2 * self.jerk) ** (1.0 / 3.0)
         return min(self.rate, low if low < 2.0 * jerked else steep)
 
     def max_turn_angle(self, duration: float) -> float:
@@ -225,9 +225,8 @@ class CalibrationForecast:
         # the probability of another turn of the robot is no noise, but part of the stated variance
         combination_excess = (combined - run_share @ stated @ run_share.T
                               - variance * np.outer(gain, gain))
-        return (np.column_stack([
-            run_share @ weights, gain
-        ]), run_share @ tracking_weights @ tracking_weights.T @ run_share.T + combination_excess)
+        return (np.column_stack([run_share @ weights, gain]), run_share @ tracking_weights
+                @ tracking_weights.T @ run_share.T + combination_excess)
 
 
 @dataclass(frozen=True)
@@ -260,8 +259,8 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
     begin = duration + (rest_times[-1] if rest_duration else 0.0)
     edges = np.concatenate([np.linspace(0.0, duration, cells + 1), duration + rest_times,
                             begin + np.linspace(0.0, drive_duration, drive_cells + 1)[1:]])
-    covariance, spread = (increment_covariance(noise,
-                                               edges), _block_weights(blocks, duration / blocks))
+    covariance = increment_covariance(noise, edges)
+    spread = _block_weights(blocks, duration / blocks)
     sums = np.tril(np.full((drive_cells, drive_cells), drive_duration / drive_cells))
     white = spread @ spread.T * (noise.angle_random_walk ** 2 * cells / duration)
     before = cells + len(rest_times)
@@ -269,11 +268,10 @@ def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration
     if rest_duration:
         observation_matrix = np.zeros((len(spread) + 1, before))
         observation_matrix[:-1, :cells], observation_matrix[-1, -1] = spread, 1.0
-    return _NoiseCovariances(
-        np.linalg.inv(white),
-        observation_matrix @ covariance[:before, :before] @ observation_matrix.T,
-        observation_matrix @ covariance[:before, before:] @ sums.T,
-        ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
+    return _NoiseCovariances(np.linalg.inv(white), observation_matrix
+                             @ covariance[:before, :before] @ observation_matrix.T,
+                             observation_matrix @ covariance[:before, before:] @ sums.T,
+                             ((sums @ covariance[before:, before:]) * sums).sum(axis=1))
 
 
 def _block_weights(blocks: int, length: float) -> Array:
@@ -302,10 +300,10 @@ def build_motion(robot: RobotLimits, turns: list[Turn], first_rest: float) -> Mo
     """Return the motion of a rest and then turns; angles are large enough for their rates."""
     time, rate = [0.0, first_rest], [0.0, 0.0]
     for turn in turns:
-        ramp, steady = (_ramp_shape(robot, turn.rate),
-                        abs(turn.angle) / turn.rate - robot.ramp_duration(turn.rate))
-        up, down = (time[-1] + ramp[0][1:],
-                    time[-1] + ramp[0][1:] + ramp[0][-1] + max(steady, 0.0))
+        ramp = _ramp_shape(robot, turn.rate)
+        steady = abs(turn.angle) / turn.rate - robot.ramp_duration(turn.rate)
+        up = time[-1] + ramp[0][1:]
+        down = time[-1] + ramp[0][1:] + ramp[0][-1] + max(steady, 0.0)
         rates = math.copysign(turn.rate, turn.angle) * ramp[1]
         time += [*up, *([down[0] - ramp[0][1]] if steady > 1e-9 else []), *down]
         rate += [*rates[1:], *([rates[-1]] if steady > 1e-9 else []), *rates[-2::-1]]
@@ -373,18 +371,16 @@ class _MotionFamily:
         """Return turns of these proportions, at fractions of the fastest rate, in the time."""
         robot, gaps = self._robot, len(angles) - 1
         ends = np.cumsum(angles)
-        max_stretch = min([
-            place / end
-            for place, end in ((self._reach_up, ends.max()), (self._reach_down, -ends.min()))
-            if end > _MIN_ANGLE
-        ])
+        max_stretch = min(
+            [place / end for place, end in ((self._reach_up, ends.max()),
+                                            (self._reach_down, -ends.min())) if end > _MIN_ANGLE])
         rates = np.array([speed * robot.max_turn_rate(abs(angle) * max_stretch)
                           for speed, angle in zip(speeds, angles)])
         stretch = ((self._moving_duration * (1.0 - rest_share) - robot.ramp_duration(rates).sum())
                    / (np.abs(angles) / rates).sum())
         angles = angles * min(stretch, max_stretch)
-        left = (self._moving_duration - float(
-            (np.abs(angles) / rates + robot.ramp_duration(rates)).sum()))
+        left = (self._moving_duration
+                - float((np.abs(angles) / rates + robot.ramp_duration(rates)).sum()))
         if (stretch <= 0.0 or left < -1e-9 or rates.min() < robot.slowest
                 or (np.abs(angles) < rates * robot.ramp_duration(rates)).any()):
             return None
@@ -438,24 +434,22 @@ def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
     """Refuse limits that leave no time or no place for a turn there and one back."""
     shortest = 2.0 * robot.rest + 4.0 * robot.ramp_duration(robot.slowest)
     if duration <= shortest:
-        raise DataRefused(
-            f'{duration:g} s are too short for rests of {robot.rest:g} s at both ends, a turn '
-            f'there and one back, which take more than {shortest:.3g} s: give more seconds, or '
-            'less rest')
-    angle, heading_span = (robot.slowest * robot.ramp_duration(robot.slowest),
-                           max(robot.highest, -robot.lowest))
+        raise DataRefused(f'{duration:g} s are too short for rests of {robot.rest:g} s at both '
+                          f'ends, a turn there and one back, which take more than {shortest:.3g} '
+                          's: give more seconds, or less rest')
+    angle = robot.slowest * robot.ramp_duration(robot.slowest)
+    heading_span = max(robot.highest, -robot.lowest)
     if heading_span <= angle:
-        raise DataRefused(
-            f'the place leaves a turn of {heading_span / DEGREE:.3g} deg, and at the slowest '
-            'smooth rate '
-            f'the ramps alone need {angle / DEGREE:.3g} deg: give more place or more acceleration')
+        raise DataRefused(f'the place leaves a turn of {heading_span / DEGREE:.3g} deg, and at '
+                          f'the slowest smooth rate the ramps alone need {angle / DEGREE:.3g} '
+                          'deg: give more place or more acceleration')
 
 
 def require_credible(plan: Plan, limits: RunLimits | None = None) -> Plan:
     """Return the plan, or refuse one whose self-calibration would be refused."""
     limits, motion = limits or RunLimits(), plan.motion
-    deviation, spread = (plan.prediction.scale_deviation,
-                         float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05)))))
+    deviation = plan.prediction.scale_deviation
+    spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
     if deviation > limits.max_scale_deviation or spread < limits.min_rate_spread:
         raise DataRefused(
             f'the best motion of {motion.duration:g} s determines the scale factor to '

@@ -216,20 +216,15 @@ class TridiagonalMatrix:
 
     def whiten(self, columns: Array) -> Array:
         """Return D^(-1/2) L⁻¹ times columns, shape (n,) or (n, k)."""
-        whitened = solve_banded(
-            (1, 0), np.array([np.ones(len(self._d)), np.append(self._e, 0.0)]), columns
-        )
+        whitened = solve_banded((1, 0), np.array([np.ones(len(self._d)), np.append(self._e, 0.0)]),
+                                columns)
         return (whitened.T / np.sqrt(self._d)).T
 
 
-def heading_noise(
-    time: Array,
-    rate: Array,
-    point_variance: Array | None = None,
-    with_angle_noise: bool = False,
-    typical_reference_noise: float = math.radians(1.0),
-    angle_random_walk: tuple[float, float] | None = None,
-) -> list[BandedNoise]:
+def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
+                  with_angle_noise: bool = False,
+                  typical_reference_noise: float = math.radians(1.0),
+                  angle_random_walk: tuple[float, float] | None = None) -> list[BandedNoise]:
     """
     Return the parts of the noise of increments between headings.
 
@@ -260,9 +255,8 @@ def heading_noise(
     ]
     if with_angle_noise:
         angle = np.abs(0.5 * (rate[1:] + rate[:-1]) * interval)
-        parts.append(
-            BandedNoise('turned', angle, None,
-                        (1e-3 * typical_reference_noise, 1e1 * typical_reference_noise)))
+        parts.append(BandedNoise('turned', angle, None,
+                                 (1e-3 * typical_reference_noise, 1e1 * typical_reference_noise)))
     return parts
 
 
@@ -271,12 +265,9 @@ def _difference_covariance(variance: Array) -> tuple[Array, Array]:
     return variance[1:] + variance[:-1], -variance[:-1]
 
 
-def bias_wander_columns(
-    time: Array,
-    bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
-    rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
-    cosine_count: int = COSINE_COUNT,
-) -> tuple[Array, list[SharedNoise]]:
+def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
+                        rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
+                        cosine_count: int = COSINE_COUNT) -> tuple[Array, list[SharedNoise]]:
     """
     Return the columns of a wandering bias in increments between points, and its noise parts.
 
@@ -302,14 +293,10 @@ def bias_wander_columns(
     duration = float(time[-1] - time[0])
     omega = math.pi * np.arange(1, max(min(cosine_count, (len(time) - 1) // 2), 1) + 1) / duration
     columns = np.diff(np.sin(omega * (time - time[0])[:, None]) / omega, axis=0)
-    parts = [
-        SharedNoise(name, 2.0 / duration / omega**power, limits, mean)
-        for name, power, mean, limits in (
-            ('bias_instability', 1, 2.0 / math.pi, bias_instability),
-            ('rate_random_walk', 2, duration / 3.0, rate_random_walk),
-        )
-        if limits is not None
-    ]
+    parts = [SharedNoise(name, 2.0 / duration / omega**power, limits, mean)
+             for name, power, mean, limits in (
+                 ('bias_instability', 1, 2.0 / math.pi, bias_instability),
+                 ('rate_random_walk', 2, duration / 3.0, rate_random_walk)) if limits is not None]
     return columns, parts
 
 
@@ -347,8 +334,7 @@ class _Regression:
         if not self.shared:
             return fixed
         variance = sizes[:, : len(self.shared)] ** 2 @ np.array(
-            [part.variance for part in self.shared]
-        )
+            [part.variance for part in self.shared])
         return np.concatenate([fixed, 1.0 / np.maximum(variance, 1e-300)], axis=1)
 
     def solve(self, covariance: TridiagonalMatrix,
@@ -365,37 +351,24 @@ class _Regression:
         gram = self.columns.T @ weighted
         # scaled, since the columns have different units
         scale = 1.0 / np.sqrt(np.maximum(np.diag(gram[:, :-1]) + precisions, 1e-300))
-        normal = (
-            (gram[:, :-1] + precisions[:, :, None] * np.eye(len(gram)))
-            * scale[:, :, None]
-            * scale[:, None, :]
-        )
-        inverse = (
-            np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-            if self.value_count and np.linalg.cond(normal[0]) > 1e12
-            else np.linalg.inv(normal)
-        )
+        normal = ((gram[:, :-1] + precisions[:, :, None] * np.eye(len(gram))) * scale[:, :, None]
+                  * scale[:, None, :])
+        inverse = (np.linalg.pinv(normal, rcond=1e-12, hermitian=True) if self.value_count
+                   and np.linalg.cond(normal[0]) > 1e12 else np.linalg.inv(normal))
         log_determinant = np.linalg.slogdet(normal)[1] - 2.0 * np.log(scale).sum(axis=1)
         inverse = inverse * scale[:, :, None] * scale[:, None, :]
         values = inverse @ gram[:, -1]
         squares = self.observed @ weighted[:, -1] - values @ gram[:, -1]
         proper = np.log(np.where(precisions > 0.0, precisions, 1.0)).sum(axis=1)
-        return (-0.5 *
-                (covariance.log_determinant + log_determinant - proper + squares), values, inverse)
+        return (-0.5 * (covariance.log_determinant + log_determinant - proper + squares), values,
+                inverse)
 
 
-def fit_noise_grid(
-    observed: Array,
-    columns: Array,
-    banded: Sequence[BandedNoise],
-    shared_columns: Array | None = None,
-    shared: Sequence[SharedNoise] = (),
-    prior_mean: Array | None = None,
-    prior_deviation: Array | None = None,
-    noisy_column: int | None = None,
-    wandering_value: int | None = None,
-    hierarchical_priors: Sequence[HierarchicalPrior] = (),
-) -> GridFit:
+def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise],
+                   shared_columns: Array | None = None, shared: Sequence[SharedNoise] = (),
+                   prior_mean: Array | None = None, prior_deviation: Array | None = None,
+                   noisy_column: int | None = None, wandering_value: int | None = None,
+                   hierarchical_priors: Sequence[HierarchicalPrior] = ()) -> GridFit:
     """
     Estimate values by a likelihood over a grid of the sizes of the noise.
 
@@ -423,27 +396,22 @@ def fit_noise_grid(
     count = columns.shape[1]
     if len(observed) <= count:
         raise ValueError(
-            f'{len(observed)} observations do not determine {count} values and their noise'
-        )
+            f'{len(observed)} observations do not determine {count} values and their noise')
     mean = np.zeros(count) if prior_mean is None else prior_mean
     precision = np.zeros(count) if prior_deviation is None else 1.0 / np.square(prior_deviation)
     together = columns if shared_columns is None else np.column_stack([columns, shared_columns])
-    regression = _Regression(
-        observed - columns @ mean, together, count, precision, banded, shared, hierarchical_priors
-    )
+    regression = _Regression(observed - columns @ mean, together, count, precision, banded, shared,
+                             hierarchical_priors)
     axes = [_initial_axis(part.size_range) for part in regression.parts]
     for remaining in reversed(range(GRID_PASSES)):
         grid = _evaluate_grid(regression, axes)
         weights = np.exp(grid.log_likelihood - grid.log_likelihood.max())
         weights /= weights.sum()
         if remaining:
-            axes = [
-                _refine_axis(axis, grid.sizes[:, place], weights, part.size_range)
-                for place, (axis, part) in enumerate(zip(axes, regression.parts))
-            ]
+            axes = [_refine_axis(axis, grid.sizes[:, place], weights, part.size_range)
+                    for place, (axis, part) in enumerate(zip(axes, regression.parts))]
     unobservable_variance = grid.sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
-        [part.unobservable_variance for part in shared]
-    )
+        [part.unobservable_variance for part in shared])
     if wandering_value is not None:
         grid.covariance[:, wandering_value, wandering_value] += unobservable_variance
     return _average_grid(regression, grid, weights, mean, noisy_column,
@@ -478,10 +446,8 @@ def _refine_axis(axis: Array, sizes: Array, weights: Array, limits: tuple[float,
     middle = float(weights @ logarithms)
     spread = math.sqrt(float(weights @ (logarithms - middle) ** 2))
     half_width = max(2.5 * spread, 0.6 * step)
-    low, high = (
-        min(max(end, math.log(limits[0])), math.log(limits[1]))
-        for end in (middle - half_width, middle + half_width)
-    )
+    low, high = (min(max(end, math.log(limits[0])), math.log(limits[1]))
+                 for end in (middle - half_width, middle + half_width))
     return np.exp(np.linspace(low, high, len(axis)))
 
 
@@ -504,14 +470,12 @@ def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
     return _Grid(*(np.concatenate(each) for each in zip(*found)))
 
 
-def _average_grid(
-    regression: _Regression, grid: _Grid, weights: Array, mean: Array, noisy_column: int | None,
-    unobservable_variance: float
-) -> GridFit:
+def _average_grid(regression: _Regression, grid: _Grid, weights: Array, mean: Array,
+                  noisy_column: int | None, unobservable_variance: float) -> GridFit:
     values = weights @ grid.values
     deviations = grid.values - values
-    covariance = (np.tensordot(weights, grid.covariance, 1) +
-                  (deviations * weights[:, None]).T @ deviations)
+    covariance = (np.tensordot(weights, grid.covariance, 1)
+                  + (deviations * weights[:, None]).T @ deviations)
     best = int(grid.log_likelihood.argmax())
     banded, count = len(regression.banded), regression.value_count
     noise = regression.banded_covariance(grid.sizes[best, :banded])
@@ -520,30 +484,19 @@ def _average_grid(
     names = [part.name for part in regression.parts]
     likeliest_sizes = dict(zip(names, grid.sizes[best].tolist()))
     if noisy_column is not None:
-        corrected = _errors_in_variables(
-            regression, noise, precisions[0], likeliest_sizes, all_values, mean, noisy_column
-        )
+        corrected = _errors_in_variables(regression, noise, precisions[0], likeliest_sizes,
+                                         all_values, mean, noisy_column)
         values = values + (corrected - all_values)[:count]
         all_values = corrected
     residual = regression.observed - regression.columns @ all_values
     of_values = regression.observed - regression.columns[:, :count] @ all_values[:count]
     influence = noise.solve(regression.columns) @ inverse[:, :count] * of_values[:, None]
-    return GridFit(
-        values + mean,
-        covariance,
-        {name: _interval_95(grid.sizes[:, place], weights) for place, name in enumerate(names)},
-        likeliest_sizes,
-        float(grid.log_likelihood[best]),
-        float(
-            np.log(np.mean(np.exp(grid.log_likelihood - grid.log_likelihood[best])))
-            + grid.log_likelihood[best]
-        ),
-        residual,
-        all_values[count:],
-        influence,
-        unobservable_variance,
-        noise,
-    )
+    return GridFit(values + mean, covariance, {name: _interval_95(grid.sizes[:, place], weights)
+                                               for place, name in enumerate(names)},
+                   likeliest_sizes, float(grid.log_likelihood[best]),
+                   float(np.log(np.mean(np.exp(grid.log_likelihood - grid.log_likelihood[best])))
+                         + grid.log_likelihood[best]),
+                   residual, all_values[count:], influence, unobservable_variance, noise)
 
 
 def _interval_95(sizes: Array, weights: Array) -> tuple[float, float, float]:
@@ -554,21 +507,12 @@ def _interval_95(sizes: Array, weights: Array) -> tuple[float, float, float]:
     return math.exp(float(weights @ np.log(sizes))), math.exp(low), math.exp(high)
 
 
-def _errors_in_variables(
-    regression: _Regression,
-    noise: TridiagonalMatrix,
-    precision: Array,
-    likeliest_sizes: Mapping[str, float],
-    values: Array,
-    mean: Array,
-    column_index: int,
-) -> Array:
+def _errors_in_variables(regression: _Regression, noise: TridiagonalMatrix, precision: Array,
+                         likeliest_sizes: Mapping[str, float], values: Array, mean: Array,
+                         column_index: int) -> Array:
     """Return the values with a noisy column smoothed by what is observed as the instrument."""
-    parts = [
-        (likeliest_sizes[part.name] ** 2, part)
-        for part in regression.banded
-        if part.name in ('reference', 'motion')
-    ]
+    parts = [(likeliest_sizes[part.name] ** 2, part)
+             for part in regression.banded if part.name in ('reference', 'motion')]
     for _ in range(3):
         scale = values[column_index] + mean[column_index]
         solved = noise.solve(regression.observed - regression.columns @ values)
@@ -580,14 +524,9 @@ def _errors_in_variables(
         weighted = noise.solve(instrument)
         normal = weighted.T @ regression.columns + np.diag(precision)
         sizes = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(normal)), 1e-300))
-        values = (
-            sizes
-            * np.linalg.lstsq(
-                normal * np.outer(sizes, sizes),
-                sizes * (weighted.T @ regression.observed),
-                rcond=1e-13,
-            )[0]
-        )
+        values = sizes * np.linalg.lstsq(normal * np.outer(sizes, sizes),
+                                         sizes * (weighted.T @ regression.observed),
+                                         rcond=1e-13)[0]
     return values
 
 

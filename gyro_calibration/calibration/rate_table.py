@@ -283,10 +283,9 @@ def _replace_value(term: Term, index: int, value: float) -> Term:
 def _linear_misfit(dwells: Dwells, terms: Sequence[Term]) -> float:
     """Return the residual sum of squares with the coefficients fitted and the shapes fixed."""
     channels = channels_of(dwells)
-    columns = [
-        term.columns(channels)[place - len(term.effect.nonlinear_parameters)] for term in terms
-        for place in term.fitted_indices if place >= len(term.effect.nonlinear_parameters)
-    ]
+    columns = [term.columns(channels)[place - len(term.effect.nonlinear_parameters)]
+               for term in terms
+               for place in term.fitted_indices if place >= len(term.effect.nonlinear_parameters)]
     error = unexplained_error(dwells, terms)
     matrix = np.column_stack([*columns, np.zeros(len(dwells))])
     return float(np.sum((error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0]) ** 2))
@@ -333,8 +332,8 @@ def _assemble_calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scat
     orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
     whitened = whitener.whiten(unexplained_error(used, terms))
     left_out, deviation = np.full(len(dwells), np.nan), np.full(len(dwells), np.nan)
-    left_out[scatter.inliers], deviation[scatter.inliers] = (_left_out_residuals(
-        orthogonal, whitened, whitener), whitener.deviation)
+    left_out[scatter.inliers], deviation[scatter.inliers] = (
+        _left_out_residuals(orthogonal, whitened, whitener), whitener.deviation)
     return Calibration(terms, dwells, scatter, unexplained_error(dwells, terms), left_out,
                        deviation, float(np.linalg.cond(triangle)),
                        len(used) - len(lengths), float(whitened @ whitened))
@@ -400,9 +399,8 @@ def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> EffectsUnid
             f'{names[0]} cannot be determined from these dwells; {alike[0].experiment}', names)
     advice = '; '.join(dict.fromkeys(effect.experiment for effect in alike[::-1]
                                      if effect.experiment))
-    return EffectsUnidentifiable(
-        f'{", ".join(names)} look alike in these dwells and cannot be distinguished; {advice}, or '
-        'leave one out', names)
+    return EffectsUnidentifiable(f'{", ".join(names)} look alike in these dwells and cannot be '
+                                 f'distinguished; {advice}, or leave one out', names)
 
 
 # bins of errors

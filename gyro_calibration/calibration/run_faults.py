@@ -149,12 +149,10 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
     DataRefused : with the cause that explains it best
 
     """
-    trials = ({
-        name: _best_trial(make_trials(run, motion, largest_offset))
-        for name, make_trials in _FAULT_TRIALS.items()
-    })
-    name = min(trials, key=lambda each: trials[each][0] * (_SLIP_PENALTY
-                                                           if each == 'slip' else 1.0))
+    trials = {name: _best_trial(make_trials(run, motion, largest_offset))
+              for name, make_trials in _FAULT_TRIALS.items()}
+    name = min(trials,
+               key=lambda each: trials[each][0] * (_SLIP_PENALTY if each == 'slip' else 1.0))
     unexplained, value = trials[name]
     if _SLIP_PENALTY * unexplained > fit_profile(run, motion,
                                                  largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
@@ -168,9 +166,8 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
 
 def fit_profile(run: RunPieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
     """Return the unexplained fraction of the squares at the best delay, and the scale there."""
-    return min(
-        run.fit_scale(run.reference_angle(motion, offset))
-        for offset in _trial_offsets(largest_offset))
+    return min(run.fit_scale(run.reference_angle(motion, offset))
+               for offset in _trial_offsets(largest_offset))
 
 
 #: Unexplained part of a run, and the value of what was tried: a speed, s, or a turn in rad with
@@ -191,9 +188,8 @@ def _trial_offsets(largest_offset: float) -> Array:
 def _try_early_ends(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
     """Try ends of the motion, each at the delay that fits the part before it best."""
     for end in np.arange(0.05, 0.97, 0.0125) * motion.duration:
-        yield _best_trial(
-            (run.fit_scale(run.reference_angle(motion, offset, end=end))[0], (float(end), ))
-            for offset in _trial_offsets(largest_offset)[::2])
+        yield _best_trial((run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
+                           (float(end),)) for offset in _trial_offsets(largest_offset)[::2])
 
 
 def _try_speeds(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
@@ -229,16 +225,14 @@ _FAULT_TRIALS: dict[str, Callable[[RunPieces, Motion, float], Trials]] = {
 _FAULT_MESSAGES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
     'early': lambda value, motion: (
         f"the robot stopped at about {value[0]:.1f} s of the profile's {motion.duration:.1f} s: "
-        'drive the whole profile'),
-    'speed': lambda value, motion: (
-        f'the robot drove the profile {value[0]:.2f} times as fast as given, in '
-        f'{motion.duration / value[0]:.1f} s instead of {motion.duration:.1f} s: '
-        'drive it at its own speed, or give the profile that was driven'),
+        'drive the whole profile'), 'speed': lambda value, motion: (
+            f'the robot drove the profile {value[0]:.2f} times as fast as given, in '
+            f'{motion.duration / value[0]:.1f} s instead of {motion.duration:.1f} s: '
+            'drive it at its own speed, or give the profile that was driven'),
     'late': lambda value, _: (
         f'the robot began {abs(value[0]):.1f} s {"after" if value[0] > 0 else "before"} '
         'the profile: begin with it, or allow a larger time offset'),
-    'slip': lambda value, _: format_slip(abs(value[0]), value[1]),
-}
+    'slip': lambda value, _: format_slip(abs(value[0]), value[1])}
 
 
 def format_slip(angle: float, time: float, sigmas: float = math.nan) -> str:

@@ -140,8 +140,8 @@ class Whitener:
                  @ self._eigenvectors.swapaxes(1, 2))
         columns = values.reshape(len(values), -1)
         along = inner @ sum_by_part(self._shared[:, :, None] * columns[:, None, :], self.parts)
-        return values + np.einsum('ni,nim->nm', self._shared,
-                                  along[self.parts]).reshape(values.shape)
+        return values + np.einsum('ni,nim->nm', self._shared, along[self.parts]).reshape(
+            values.shape)
 
 
 # its size
@@ -200,13 +200,12 @@ def _smooth_surface(dwells: Dwells) -> Array:
     rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
     temperature = (np.zeros(len(rate)) if dwells.temperature is None
                    else dwells.temperature - dwells.temperature.mean())
-    temperature = temperature / max(float(np.abs(temperature).max()),
-                                    0.5 * MIN_TEMPERATURE_SPREAD)
+    temperature = temperature / max(float(np.abs(temperature).max()), 0.5 * MIN_TEMPERATURE_SPREAD)
     powers = sorted(((i, j) for i in range(6) for j in range(3)),
                     key=lambda power: (power[0] + 2 * power[1], power[1]))
     products = [rate ** i * temperature ** j for i, j in powers]
-    columns = np.column_stack([*products[:4], np.abs(rate), *products[4:]])[
-        :, :max(len(rate) // 3, min(len(rate) - 1, 2))]
+    columns = np.column_stack([*products[:4], np.abs(rate),
+                               *products[4:]])[:, :max(len(rate) // 3, min(len(rate) - 1, 2))]
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, sizes > 1e-4 * sizes[0]]
 
@@ -370,10 +369,8 @@ def _average_over_scatter(sums: _SweepProducts, dof: int,
 
     """
     has_sweep_scatter = bool(units.any())
-    axes = ([
-        np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)])
-        if has_sweep_scatter else np.zeros(1)
-    ] * 2)
+    axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)]) if has_sweep_scatter
+            else np.zeros(1)] * 2
     for _ in range(2 if has_sweep_scatter else 1):
         found = [_evaluate_scatter(sums, dof,
                                    units * np.column_stack([np.full(len(axes[1]), bias), axes[1]]))
@@ -412,8 +409,8 @@ def _scatter_prior(sizes: Array) -> Array:
     """Return the prior of each size: one half at 0, a half Cauchy above."""
     if len(sizes) == 1:
         return np.ones(1)
-    return np.concatenate([[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2)
-                           * math.log(sizes[2] / sizes[1])])
+    return np.concatenate(
+        [[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2) * math.log(sizes[2] / sizes[1])])
 
 
 def _refine_axis(sizes: Array, weights: Array) -> Array:

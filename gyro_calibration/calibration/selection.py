@@ -57,10 +57,8 @@ TECHNOLOGY_EFFECTS = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_N
 _CONFOUNDED_EFFECTS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
 #: Effects of every gyro that are fitted where their standard deviation is below these, which are
 #: those of data sheets.
-_TYPICAL_SLOPES = {
-    BIAS_TEMPERATURE: BIAS_SLOPE_DEVIATION,
-    SCALE_FACTOR_TEMPERATURE: SCALE_SLOPE_DEVIATION
-}
+_TYPICAL_SLOPES = {BIAS_TEMPERATURE: BIAS_SLOPE_DEVIATION,
+                   SCALE_FACTOR_TEMPERATURE: SCALE_SLOPE_DEVIATION}
 #: Effect -> another one that it is fitted with only.
 _REQUIRED_EFFECTS = {BIAS_TEMPERATURE_QUADRATIC: BIAS_TEMPERATURE}
 
@@ -150,9 +148,9 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     return Selection(best, choices, confounders)
 
 
-def fit_supported_effects(
-        dwells: Dwells, technology: str | None = None, false_alarm_rate: float = FALSE_ALARM_RATE
-) -> tuple[Calibration, tuple[ConfoundedPair, ...]]:
+def fit_supported_effects(dwells: Dwells, technology: str | None = None,
+                          false_alarm_rate: float = FALSE_ALARM_RATE) -> tuple[
+                                  Calibration, tuple[ConfoundedPair, ...]]:
     """Fit the supported effects, without reasons, at a false alarm rate."""
     scatter = estimate_scatter(dwells)
     base = _fit_base(dwells, scatter)
@@ -211,9 +209,8 @@ def _add_effects(fit: Calibration, candidates: Sequence[Effect],
         new = [effect for effect in candidates if _can_add(effect, fit.effects)]
         tried = [_try_fit(fit.dwells, _add_with_required(fit.effects, effect), fit.scatter)
                  for effect in new]
-        better = [
-            each for each in tried if each is not None and _is_supported(fit, each, significance)
-        ]
+        better = [each
+                  for each in tried if each is not None and _is_supported(fit, each, significance)]
         if not better:
             return fit
         fit = min(better, key=Calibration.cross_validation_misfit)
@@ -247,9 +244,8 @@ def _remove_superfluous(fit: Calibration, base: Sequence[Effect],
 # confounders
 
 
-def resolve_confounders(
-        fit: Calibration, technology: str | None,
-        bounded_effect: Effect | None = None) -> tuple[Calibration, tuple[ConfoundedPair, ...]]:
+def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect: Effect
+                        | None = None) -> tuple[Calibration, tuple[ConfoundedPair, ...]]:
     """
     Decide between effects that explain the same errors.
 

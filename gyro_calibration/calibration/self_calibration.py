@@ -223,8 +223,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     # twice their standard deviation
     scale, bias_floor = 1.0 + fit.scale_factor_error, 0.0 if noise is None else noise.allan_floor
     unobservable = np.diag(
-        [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2, bias_floor ** 2 +
-         (scale * reference.rate_deviation) ** 2])
+        [(scale * max(reference.scale_deviation, 2.0 * fit.slip_deviation)) ** 2,
+         bias_floor ** 2 + (scale * reference.rate_deviation) ** 2])
     fit = replace(fit, covariance=fit.covariance + unobservable,
                   goodness=_goodness_of_fit(fit, reference, noise))
     if prior is not None and np.isfinite(fit.covariance).all():
@@ -299,8 +299,8 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     unexplained, scale = fit_profile(run, motion, largest_offset)
     if unexplained <= MAX_UNEXPLAINED_SHARE:
-        unit = (describe_unit_error(scale) if abs(scale
-                                                  - 1.0) > limits.max_scale_factor_error else '')
+        unit = (describe_unit_error(scale) if abs(scale - 1.0) > limits.max_scale_factor_error
+                else '')
         if unit:
             raise DataRefused(unit)
         refuse_scale(scale - 1.0, 'profile', "set the driver's parameter invert")
@@ -308,8 +308,7 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
     if rate_spread < limits.min_rate_spread:
         raise DataRefused('the profile turns at one speed (its rate varies by '
                           f'{rate_spread / DEGREE:.2f} deg/s): scale and bias cannot be '
-                          'separated; '
-                          'turn both ways, with stops')
+                          'separated; turn both ways, with stops')
     if unexplained > MAX_UNEXPLAINED_SHARE:
         if np.std(run.gyro_angle) < 0.1 * np.std(run.reference_angle(motion)):
             refuse_scale(scale - 1.0, 'profile', '')
@@ -339,14 +338,12 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           f'{limits.max_bias / DEGREE:g} deg/s: do not turn the robot by hand')
     if deviation > limits.max_scale_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
-                          f'wanted {100 * limits.max_scale_deviation:g} %: turn further, '
-                          'faster, or more often, '
-                          'and check that the profile is the one that was driven')
+                          f'wanted {100 * limits.max_scale_deviation:g} %: turn further, faster, '
+                          'or more often, and check that the profile is the one that was driven')
     # against measured headings the deviations include the noise of mount and encoder
     unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
-    if (motion.rate is not None and fit.goodness is not None
-            and unexplained_angle > limits.max_unexplained_angle
-            and fit.goodness.noise_ratio > limits.max_noise_ratio):
+    if (motion.rate is not None and fit.goodness is not None and unexplained_angle
+            > limits.max_unexplained_angle and fit.goodness.noise_ratio > limits.max_noise_ratio):
         raise DataRefused(f'the run is {fit.goodness.noise_ratio:.1f} times as noisy as the model '
                           f'states, at most {limits.max_noise_ratio:g} are allowed: fasten the '
                           'gyro, stop vibration, or measure the noise again (allan)')
@@ -404,10 +401,9 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None 
     variance = rest_variance(noise, duration, white_deviation, half_difference)
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
     scale = 1.0 + fit.scale_factor_error
-    check = RestCheck(
-        mean, deviation,
-        max(limits.max_rest_rate, -float(ndtri(0.5 * false_refusal_rate)) * deviation),
-        _update_with_rest(fit, scale * mean, scale ** 2 * variance))
+    check = RestCheck(mean, deviation, max(limits.max_rest_rate,
+                                           -float(ndtri(0.5 * false_refusal_rate)) * deviation),
+                      _update_with_rest(fit, scale * mean, scale ** 2 * variance))
     if half_difference > 2.0 * max(MAX_NOISE_SIGMAS * white_deviation, _MIN_DRIVING_RATE_CHANGE):
         raise DataRefused('after the run the robot still moved, its rate changed by '
                           f'{half_difference / DEGREE:.2f} deg/s: leave it at rest after the run')
@@ -572,8 +568,8 @@ def calibrate_bias(time: Array, rate: Array, limits: RunLimits | None = None,
     changes = np.abs(np.concatenate([blocks - np.median(blocks),
                                      (sums[-1] - sums[:-1]) / last - sums[:-1] / first]))
     deviations = within * np.sqrt(np.concatenate([np.ones(10), 1.0 / first + 1.0 / last]))
-    significant_changes = (changes[changes > np.maximum(MAX_NOISE_SIGMAS * deviations, 0.05
-                                                        * DEGREE)])
+    significant_changes = (
+        changes[changes > np.maximum(MAX_NOISE_SIGMAS * deviations, 0.05 * DEGREE)])
     if len(significant_changes):
         raise DataRefused('the gyro was moved: its mean changed by '
                           f'{significant_changes.max() / DEGREE:.2f} '

@@ -83,8 +83,8 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
     def excess_variance(rate: Array, warm: Array) -> Array:
         """Return the variance of the larger fit less that of the values, (rad/s)²."""
         wide, row = extended_columns(rate, warm) / lengths, columns(rate, warm)
-        return np.maximum(((wide @ inverse) * wide).sum(axis=1)
-                          - ((row @ covariance) * row).sum(axis=1), 0.0)
+        return np.maximum(
+            ((wide @ inverse) * wide).sum(axis=1) - ((row @ covariance) * row).sum(axis=1), 0.0)
 
     ends, sides = np.array([low - half_width, high + half_width]), np.array([-1.0, 1.0])
     at_rest = excess_variance(np.zeros(2), ends).max()
@@ -99,10 +99,9 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
 
 def _unfitted_columns(relative_rate: Array, temperature_offset: Array) -> Array:
     """Return slopes and curves over temperature, and powers of the rate, shape (n, 6)."""
-    return np.column_stack([
-        temperature_offset, temperature_offset ** 2, temperature_offset * relative_rate,
-        temperature_offset ** 2 * relative_rate, relative_rate ** 2, relative_rate ** 3
-    ])
+    return np.column_stack(
+        [temperature_offset, temperature_offset ** 2, temperature_offset * relative_rate,
+         temperature_offset ** 2 * relative_rate, relative_rate ** 2, relative_rate ** 3])
 
 
 def _unfitted_deviations(fastest: float) -> Sequence[float]:

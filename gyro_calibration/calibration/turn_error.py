@@ -95,9 +95,8 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
     refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
     rests, remark = _find_rests(dwells)
-    nearest = [
-        _find_nearest_rest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()
-    ]
+    nearest = [_find_nearest_rest(dwells, place, rests)
+               for place in np.flatnonzero(wanted).tolist()]
     # eq. 1 and 2, and eq. 13, 15 and 16
     static, modelled = (_error_per_turn(dwells, error, wanted, nearest)
                         for error in (dwells.output - dwells.rate, rate - dwells.rate))
@@ -172,8 +171,8 @@ def _find_nearest_rest(dwells: Dwells, index: int, rests: list[_SweepRest]) -> _
     """Return the rest of a dwell's sweep, or else the nearest in temperature, then in order."""
     sweep = int(dwells.sweep[index])
     temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[index])
-    return min(rests, key=lambda rest: (
-        rest.sweep != sweep, abs(rest.temperature - temperature), abs(rest.sweep - sweep)))
+    return min(rests, key=lambda rest: (rest.sweep != sweep, abs(rest.temperature - temperature),
+                                        abs(rest.sweep - sweep)))
 
 
 # rates by a model

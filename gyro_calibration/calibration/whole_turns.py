@@ -115,12 +115,11 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     count = _count_turns(gyro_angle / FULL_TURN, turns, limits)
     scale = gyro_angle / (count * FULL_TURN)
     if abs(scale - 1.0) > limits.max_scale_factor_error:
-        raise DataRefused(
-            f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
-            f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, and look at the '
-            'sensitivity')
-    angle_variance = (white_density * duration + variance * duration ** 2 +
-                      (scale * mark_deviation) ** 2)
+        raise DataRefused(f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
+                          f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, '
+                          'and look at the sensitivity')
+    angle_variance = (white_density * duration + variance * duration ** 2
+                      + (scale * mark_deviation) ** 2)
     shared = -variance * duration / (count * FULL_TURN)
     covariance = np.array([[angle_variance / (count * FULL_TURN) ** 2, shared],
                            [shared, variance]])
@@ -140,10 +139,9 @@ def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, 
         steady = int(np.argmax(np.append(np.abs(values - middle) > limit, True)))
         lengths.append(steady * _PART_DURATION - _REST_MARGIN)
         if lengths[-1] < MIN_REST_DURATION:
-            raise DataRefused(
-                f'the robot rests for {max(lengths[-1], 0.0):.1f} s {name} the turns, wanted '
-                f'{MIN_REST_DURATION:g} s at least: leave it at rest on the mark, and record '
-                'until after that')
+            raise DataRefused(f'the robot rests for {max(lengths[-1], 0.0):.1f} s {name} the '
+                              f'turns, wanted {MIN_REST_DURATION:g} s at least: leave it at rest '
+                              'on the mark, and record until after that')
     if sum(lengths) >= time[-1] - time[0] - 2.0 * _REST_MARGIN:
         raise DataRefused('the gyro rests all the time: did the robot turn, '
                           'and does the gyro respond?')
@@ -184,7 +182,6 @@ def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
     if abs(measured - count) > (MAX_COUNT_ERROR if turns else MAX_COUNTING_SCALE_ERROR
                                 * abs(count)):
         given = f', and {turns} were given' if turns else ''
-        raise DataRefused(
-            f'the gyro counts {measured:.2f} turns{given}, which is not near '
-            'one whole number; close the turns on the mark, count them, or make fewer')
+        raise DataRefused(f'the gyro counts {measured:.2f} turns{given}, which is not near one '
+                          'whole number; close the turns on the mark, count them, or make fewer')
     return count

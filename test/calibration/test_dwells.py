@@ -348,9 +348,8 @@ def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
 # Deviations
 
 def test_variances_that_differ_by_chance_become_one(generator):
-    found = [
-        shrink_variances(generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)
-    ]
+    found = [shrink_variances(generator.chisquare(11, 40) / 11.0, np.full(40, 11))
+             for _ in range(200)]
     # Without shrinkage, each would have an error of 43 %.
     assert np.sqrt(np.mean((np.array(found) - 1.0) ** 2)) < 0.15
     assert np.mean(found) == pytest.approx(1.0, abs=0.02)

@@ -108,18 +108,16 @@ def test_the_model_holds_what_was_found():
 
 LATE = np.arange(len(CLEAN)) < 9990
 REST = motion_from_rates(np.array([0.0, 100.0]), np.array([0.5, 0.5]))
-REFUSED = {
-    'no heading': (replace(
-        CLEAN, reference_heading=None), 'reference_heading_deg'), 'no time': (replace(
-            CLEAN, time=None), 'time_s'), 'lost reference': (replace(
-                CLEAN, reference_heading=np.where(LATE, np.nan, CLEAN.reference_heading)), 'the '
-                                                             'reference has a value in 10'),
-    'lost gyro': (replace(CLEAN, output=np.where(LATE, np.nan, CLEAN.output)), 'the gyro has a '
-                  'value in 10'), 'short': (log_of(SWING, 5.0), 'at least 10 s'),
-    'one speed': (log_of(REST, 100.0), 'in both senses, or at another speed too, or with a rest'),
-    'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'), 'dead': (replace(
-        CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead'),
-}
+REFUSED = {'no heading': (replace(CLEAN, reference_heading=None), 'reference_heading_deg'),
+           'no time': (replace(CLEAN, time=None), 'time_s'), 'lost reference': (
+               replace(CLEAN, reference_heading=np.where(LATE, np.nan, CLEAN.reference_heading)),
+               'the reference has a value in 10'),
+           'lost gyro': (replace(CLEAN, output=np.where(LATE, np.nan, CLEAN.output)),
+                         'the gyro has a value in 10'),
+           'short': (log_of(SWING, 5.0), 'at least 10 s'), 'one speed': (
+               log_of(REST, 100.0), 'in both senses, or at another speed too, or with a rest'),
+           'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'),
+           'dead': (replace(CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead')}
 
 
 @pytest.mark.parametrize('method', ['likelihood', 'rate'])
@@ -137,9 +135,8 @@ def test_lost_samples_are_counted_and_do_not_look_like_bias():
     0.6 deg/s, were the stamps not believed.
     """
     kept = ~((SWING.rate_at(CLEAN.time) > 1.0) & (np.arange(len(CLEAN)) % 40 == 7))
-    log = replace(
-        CLEAN,
-        **{name: getattr(CLEAN, name)[kept] for name in ('time', 'output', 'reference_heading')})
+    log = replace(CLEAN, **{name: getattr(CLEAN, name)[kept]
+                            for name in ('time', 'output', 'reference_heading')})
     found = calibrate_encoder(log)
     assert found.lost_samples == np.sum(~kept) > 80
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
@@ -167,8 +164,8 @@ def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
 
 
 def test_the_temperature_of_the_log_is_that_of_the_model():
-    model = calibrate_encoder(replace(CLEAN, temperature=np.linspace(20.0, 30.0,
-                                                                     len(CLEAN)))).model
+    model = calibrate_encoder(replace(CLEAN,
+                                      temperature=np.linspace(20.0, 30.0, len(CLEAN)))).model
     assert (model.temperature_range, model.reference_temperature) == ((20.0, 30.0),
                                                                       pytest.approx(25.0))
 
@@ -184,12 +181,12 @@ def test_the_residual_heading_is_what_the_calibration_leaves():
 @pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
 def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
     """As benchmarks/encoder_intervals.py does for more noises and 400 runs."""
-    found = np.array([run(('white, flicker, rate '
-                           'random walk', seed, 300.0)) for seed in range(runs)])
+    found = np.array(
+        [run(('white, flicker, rate random walk', seed, 300.0)) for seed in range(runs)])
     within = (np.abs(found[:, 0]) < 1.96 * found[:, 1]).sum(axis=0)
     assert (within >= fewest(runs, 0.95)).all(), within
-    assert (found[:, 1].mean(axis=0) < 3.0 * np.sqrt(
-        (found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
+    assert (found[:, 1].mean(axis=0)
+            < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
 
 
 @pytest.mark.parametrize('step, noise, runs', [

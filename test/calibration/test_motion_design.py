@@ -65,8 +65,8 @@ ABILITIES = {
 
 @cache
 def planned(name):
-    return find_best_motion(ABILITIES[name], CalibrationForecast(XV3500, 20.0, ROBOT_MOTION,
-                                                                 160.0), 20.0,
+    return find_best_motion(ABILITIES[name],
+                            CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0), 20.0,
                             np.random.default_rng(0), 30)
 
 
@@ -99,9 +99,8 @@ def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
     """In 4.5 s from rest: 1 deg/s² gives 4.5 deg/s, 5 deg/s³ gives 5 (4.5 / 2)² = 25.3 deg/s."""
     ability, forecast = SLUGGISH[name], CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
     fastest = {'hardly any acceleration': 4.5, 'hardly any jerk': 25.3125}[name] * DEGREE
-    simple, motion = (plain_motion(ability, 20.0),
-                      find_best_motion(ability, forecast, 20.0, np.random.default_rng(1),
-                                       5).motion)
+    simple = plain_motion(ability, 20.0)
+    motion = find_best_motion(ability, forecast, 20.0, np.random.default_rng(1), 5).motion
     for each in (simple, motion):
         assert (can_follow(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
                 and abs(each.heading[-1]) < 1e-9)
@@ -122,9 +121,9 @@ def test_it_tells_the_scale_better_than_a_plain_motion(name):
 
 def test_no_random_motion_that_the_robot_can_do_is_better():
     """500 motions of random turns, rates and rests, stretched to the limit of time or place."""
-    ability, forecast, generator = (ABILITIES['a cable'],
-                                    CalibrationForecast(XV3500, 20.0, ROBOT_MOTION,
-                                                        160.0), np.random.default_rng(3))
+    ability = ABILITIES['a cable']
+    forecast = CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
+    generator = np.random.default_rng(3)
     family, errors = _MotionFamily(ability, 20.0), []
     for _ in range(500):
         ends = np.append(generator.uniform(-1.0, 1.0, generator.integers(1, 8)), 0.0)
@@ -170,8 +169,8 @@ def test_a_calibration_states_what_the_plan_promised(size):
         fit = self_calibrate(time[time < 21.0], rate[time < 21.0], CALIBRATION_MOTION, noise=noise,
                              reference=ReferenceErrors())
         rest = find_rest_after(time, rate, fit, CALIBRATION_MOTION)
-        deviations.append(np.sqrt(np.diag(
-            check_rest(time[rest], rate[rest], fit, noise).fit.covariance)))
+        deviations.append(
+            np.sqrt(np.diag(check_rest(time[rest], rate[rest], fit, noise).fit.covariance)))
     promised = CalibrationForecast(noise, 20.0, ROBOT_MOTION, 160.0).predict(CALIBRATION_MOTION)
     ratio = np.median(deviations, axis=0) / (promised.scale_deviation, promised.bias_deviation)
     assert (np.abs(np.log(ratio)) < math.log(1.1)).all(), ratio
@@ -185,9 +184,9 @@ def test_flicker_and_random_walk_part_the_bias_from_that_of_the_drive_as_simulat
             bias = simulate_noise(noise, 3600, 0.1, generator)[1800:]
             differences.append(bias[:200].mean() - bias[200:].mean())
         # with white noise the fit takes the mean over the run
-        white, both = (CalibrationForecast(replace(each,
-                                                   angle_random_walk=1e-3), 20.0, ROBOT_MOTION,
-                                           160.0, 0.0).predict(CALIBRATION_MOTION).bias_deviation
+        white, both = (CalibrationForecast(replace(each, angle_random_walk=1e-3), 20.0,
+                                           ROBOT_MOTION, 160.0,
+                                           0.0).predict(CALIBRATION_MOTION).bias_deviation
                        for each in (Noise(), noise))
         low, high = rms_bounds(1499)
         assert low < np.std(differences, ddof=1) / math.sqrt(both ** 2 - white ** 2) < high
@@ -210,8 +209,9 @@ def test_fits_scatter_as_predicted(name, late, lag):
     motion, errors = planned(name).motion, []
     rate = followed(motion, late, lag)
     for seed in range(20):
-        fit = fit_likelihood(TIME, rate + simulate_noise(
-            WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])), motion, 0.2)
+        fit = fit_likelihood(
+            TIME, rate + simulate_noise(WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])),
+            motion, 0.2)
         errors.append((fit.scale_factor_error, fit.bias))
     expected = CalibrationForecast(WHITE, 20.0, ROBOT_MOTION, 160.0, 0.0).predict(motion)
     ratios = np.std(errors, axis=0, ddof=1) / (expected.scale_deviation, expected.bias_deviation)
@@ -236,8 +236,8 @@ def test_the_heading_of_a_drive_errs_as_predicted():
 
 def test_where_the_drive_turns_round_and_round_the_motion_gains_heading():
     round_and_round = constant_rate_motion([(160.0, 45.0)])
-    forecast, generator = (CalibrationForecast(XV3500, 20.0, round_and_round,
-                                               160.0), np.random.default_rng(0))
+    forecast = CalibrationForecast(XV3500, 20.0, round_and_round, 160.0)
+    generator = np.random.default_rng(0)
     chosen = find_best_motion(ABILITIES['free'], forecast, 20.0, generator, 15).prediction
     assert (chosen.heading_error
             < 0.85 * forecast.predict(plain_motion(ABILITIES['free'], 20.0)).heading_error)

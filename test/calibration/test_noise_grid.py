@@ -55,9 +55,8 @@ def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
              BandedNoise('b', np.linspace(1.0, 2.0, n), None, (1.5, 1.5))]
     variance = np.array([1.0, 0.5, 0.1])
     found = fit_noise_grid(observed, columns, parts, shared, [_shared('c', variance, 2.0)])
-    dense = 0.25 * (
-        2.0 * np.eye(n) - 0.9 * np.eye(n, k=1) - 0.9 * np.eye(n, k=-1)
-    ) + 2.25 * np.diag(np.linspace(1.0, 2.0, n))
+    dense = 0.25 * (2.0 * np.eye(n) - 0.9 * np.eye(n, k=1)
+                    - 0.9 * np.eye(n, k=-1)) + 2.25 * np.diag(np.linspace(1.0, 2.0, n))
     dense += shared @ np.diag(4.0 * variance) @ shared.T
     inverse = np.linalg.inv(dense)
     information = columns.T @ inverse @ columns
@@ -86,10 +85,8 @@ def test_whitened_noise_is_independent():
 
 
 def test_the_sizes_of_the_noise_are_found():
-    found = fitted(
-        *headings(
-            np.random.default_rng(2), 2000, walk=0.5 * DEGREE, reference=0.2 * DEGREE, motion=0.1)
-    )
+    found = fitted(*headings(np.random.default_rng(2), 2000, walk=0.5 * DEGREE,
+                             reference=0.2 * DEGREE, motion=0.1))
     for name, size in (('angle_random_walk', 0.5 * DEGREE), ('reference', 0.2 * DEGREE),
                        ('motion', 0.1)):
         estimate, low, high = found.sizes[name]
@@ -126,8 +123,8 @@ def test_noise_of_the_reference_does_not_make_the_scale_smaller():
 def test_a_gap_of_the_reference_is_a_long_span():
     time, rate, turned, seen = headings(np.random.default_rng(3))
     kept = (time < 60.0) | (time > 150.0)
-    whole, parts = (fitted(time, rate, turned, seen),
-                    fitted(time[kept], rate[kept], turned[kept], seen[kept]))
+    whole = fitted(time, rate, turned, seen)
+    parts = fitted(time[kept], rate[kept], turned[kept], seen[kept])
     assert parts.values[0] == pytest.approx(SCALE, abs=4.0 * parts.deviations[0])
     assert parts.values[1] == pytest.approx(BIAS, abs=4.0 * parts.deviations[1])
     assert parts.deviations[0] > whole.deviations[0]
@@ -137,8 +134,8 @@ def test_a_value_that_nothing_shows_keeps_its_prior():
     time, rate, turned, seen = headings(np.random.default_rng(4))
     columns = np.column_stack([np.zeros(len(time) - 1), np.diff(time)])
     found = fit_noise_grid(np.diff(turned - SCALE * seen), columns, heading_noise(time, rate),
-                           prior_mean=np.array([1.0,
-                                                0.0]), prior_deviation=np.array([0.02, math.inf]))
+                           prior_mean=np.array([1.0, 0.0]),
+                           prior_deviation=np.array([0.02, math.inf]))
     assert found.values[0] == pytest.approx(1.0) and found.deviations[0] == pytest.approx(0.02)
     # five deviations of the mean of an angle random walk of 0.2 deg/√s over 240 s
     assert found.values[1] == pytest.approx(BIAS, abs=5.0 * 0.2 * DEGREE / math.sqrt(240.0))

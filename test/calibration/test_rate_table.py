@@ -55,9 +55,8 @@ RARE = 1e-4
 def dwells(rate, error, temperature=None, deviation=None, sweep=None):
     """Return dwells with rates and errors in rad/s."""
     rate = np.asarray(rate, dtype=float)
-    return Dwells(rate, rate + error, temperature,
-                  np.full(len(rate), np.nan) if deviation is None else deviation,
-                  np.zeros(len(rate), int) if sweep is None else sweep,
+    return Dwells(rate, rate + error, temperature, np.full(len(rate), np.nan) if deviation is None
+                  else deviation, np.zeros(len(rate), int) if sweep is None else sweep,
                   tuple(f'row {row + 1}' for row in range(len(rate))))
 
 
@@ -81,10 +80,10 @@ def test_a_sine_that_is_zero_at_the_rates_of_all_dwells_is_chance():
     assert replace(fit, terms=(*fit.terms, sine)).p_value(SINE_RESPONSE) == 1.0
 
 
-@pytest.mark.parametrize('terms, table', [
-    (CUBIC, Table()), (SINE, Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)),
-    (SINE, Table(told=True)),
-    (CUBIC, Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True))])
+@pytest.mark.parametrize(
+    'terms, table', [(CUBIC, Table()), (SINE, Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)),
+                     (SINE, Table(told=True)),
+                     (CUBIC, Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True))])
 @pytest.mark.parametrize('runs', [10, pytest.param(100, marks=pytest.mark.evidence)])
 def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs):
     generator = np.random.default_rng(7)
@@ -176,9 +175,8 @@ def test_intervals_from_three_speeds_hold_the_truth(runs):
     generator = np.random.default_rng(3)
     held = 0
     for _ in range(runs):
-        table = dwells(
-            [0.0, 3.49, 4.71],
-            0.01 + 0.02 * np.array([0.0, 3.49, 4.71]) + 1e-3 * generator.standard_normal(3))
+        table = dwells([0.0, 3.49, 4.71], 0.01 + 0.02 * np.array([0.0, 3.49, 4.71])
+                       + 1e-3 * generator.standard_normal(3))
         fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR))
         held += abs(fit.terms[1].values[0] - 0.02) < 1.96 * math.sqrt(fit.model.covariance[1, 1])
     assert binom.ppf(RARE, runs, 0.95) <= held <= binom.ppf(1 - RARE, runs, 0.95)
@@ -258,8 +256,8 @@ def test_what_one_sweep_alone_shows_cannot_be_left_out():
 
 def test_an_outlying_dwell_is_not_fitted():
     table = measured(SINE)
-    off = replace(table, output=table.output
-                  + np.where(np.arange(len(table)) == 30, 0.5 * DEGREE, 0.0))
+    off = replace(table,
+                  output=table.output + np.where(np.arange(len(table)) == 30, 0.5 * DEGREE, 0.0))
     effects, others = [term.effect for term in SINE], np.arange(len(table)) != 30
     fit = fit_effects(off, effects)
     clean = fit_effects(select_dwells(table, others), effects,
@@ -279,11 +277,10 @@ def test_bins_hold_all_dwells_that_were_fitted_and_know_what_sweeps_share():
 
 
 def test_rates_beyond_the_top_of_a_sine_are_reported():
-    beyond, within = (
-        fit_effects(
-            measured((*LINEAR, Term(SINE_RESPONSE, (0.25, 1.0))), fastest=fastest * DEGREE),
-            (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE))
-        for fastest in (450.0, 250.0))
+    beyond, within = (fit_effects(measured((*LINEAR, Term(SINE_RESPONSE, (0.25, 1.0))),
+                                           fastest=fastest * DEGREE),
+                                  (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE))
+                      for fastest in (450.0, 250.0))
     # 90 degrees of phase are at 360 deg/s
     assert (within.min_non_monotonic_rate is None
             and 300.0 < beyond.min_non_monotonic_rate / DEGREE < 400.0)

@@ -84,16 +84,15 @@ def output(seed=0, motion=CALIBRATION_MOTION, time=TIME, level=1.0):
 @pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
 def test_the_goodness_of_fit_has_the_probability_that_it_says(runs):
     """The probability is uniform where the noise is as stated: mean to 4 standard errors."""
-    probabilities = [
-        self_calibrate(TIME, output(seed), CALIBRATION_MOTION,
-                       noise=XV3500.noise).goodness.probability for seed in range(runs)
-    ]
+    probabilities = [self_calibrate(TIME, output(seed), CALIBRATION_MOTION,
+                                    noise=XV3500.noise).goodness.probability
+                     for seed in range(runs)]
     assert np.mean(probabilities) == pytest.approx(0.5, abs=4.0 / math.sqrt(12.0 * runs))
 
 
 def test_noise_beyond_the_models_is_reported_and_more_of_it_refused():
-    goodness = (self_calibrate(TIME, output(level=3.0), CALIBRATION_MOTION,
-                               noise=XV3500.noise).goodness)
+    goodness = (
+        self_calibrate(TIME, output(level=3.0), CALIBRATION_MOTION, noise=XV3500.noise).goodness)
     assert (goodness.probability < MIN_FIT_PROBABILITY
             and goodness.noise_ratio == pytest.approx(3.0, rel=0.4))
     assert 'more than the noise explains' in str(goodness)
@@ -295,8 +294,7 @@ def test_the_start_heading_is_found_with_its_deviation(runs):
         errors = 0.5 * DEGREE * np.random.default_rng([seed, 4]).standard_normal(401)
         fit = fit_likelihood(
             TIME, output(seed),
-            motion_from_headings(readings,
-                                 CALIBRATION_MOTION.heading_at(readings) + errors))
+            motion_from_headings(readings, CALIBRATION_MOTION.heading_at(readings) + errors))
         sizes.append(abs(fit.start_heading + errors[0]) / fit.start_heading_deviation)
         assert fit.start_heading_deviation < 0.25 * DEGREE
     assert np.sum(np.array(sizes) < 1.96) >= fewest(runs, 0.93), np.sort(sizes)
@@ -378,8 +376,8 @@ def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, run)
              '--reference-scale-deviation', '0.5')
     code, text, _ = run(*words, '--json')
     found = json.loads(text)
-    assert (code == 0 and found['scale_factor_error_standard_deviation'] == pytest.approx(
-        0.0052, abs=0.0003))
+    assert (code == 0 and found['scale_factor_error_standard_deviation']
+            == pytest.approx(0.0052, abs=0.0003))
     assert (abs(found['rest_rate_rad_s']) < found['rest_limit_rad_s']
             and found['degrees_of_freedom'] > 20)
     assert (found['time_offset_standard_deviation_s'] < 0.01 and 0.0 < found['probability'] < 1.0
@@ -406,12 +404,10 @@ def test_the_verb_calibrates_by_turns(tmp_path, run):
     assert code == 0 and '2 full turns clockwise' in text
 
 
-@pytest.mark.parametrize('words, said',
-                         [(['--turns', '3', '--profile', 'p.csv'], 'were both given'),
-                          (['--marking', '2'], 'omit it')])
+@pytest.mark.parametrize('words, said', [(['--turns', '3', '--profile', 'p.csv'],
+                                          'were both given'), (['--marking', '2'], 'omit it')])
 def test_the_verb_refuses_options_that_exclude_each_other(tmp_path, run, words, said):
-    code, _, error = run('self-calibrate',
-                         write_log(tmp_path / 'log.csv', *turned(1)), *words)
+    code, _, error = run('self-calibrate', write_log(tmp_path / 'log.csv', *turned(1)), *words)
     assert code == 2 and said in error
 
 

@@ -105,8 +105,8 @@ def test_the_rate_that_is_proposed_distinguishes_confounders(runs):
     for _ in range(runs):
         table = Table().measure(truth, generator)
         rate = select_effects(table).confounders[0].distinguishing_rate
-        more, fast = (Table(sweeps=1, rates=4).measure(truth, generator),
-                      np.array([rate, -rate, rate, -rate]))
+        more = Table(sweeps=1, rates=4).measure(truth, generator)
+        fast = np.array([rate, -rate, rate, -rate])
         noise = more.output - truth.output(more.rate, more.temperature)
         more = replace(more, rate=fast, output=truth.output(fast, more.temperature) + noise)
         pair = select_effects(join_dwells([table, more])).confounders[0]

@@ -86,8 +86,7 @@ def test_the_likelihood_needs_no_common_rate_and_no_common_start(gyro, reference
     time = np.arange(21 * gyro) / gyro - 0.5
     rate = (1 + S) * CALIBRATION_MOTION.rate_at(time - offset) + B
     fit = fit_likelihood(
-        time, rate,
-        sampled(CALIBRATION_MOTION, reference) if reference else CALIBRATION_MOTION)
+        time, rate, sampled(CALIBRATION_MOTION, reference) if reference else CALIBRATION_MOTION)
     # at 20 Hz the error is that of the trapezoid rule between the samples about a corner
     assert (fit.scale_factor_error, fit.bias) == pytest.approx(
         (S, B), abs=1e-6 if gyro == 100 else 1e-5)
@@ -207,8 +206,7 @@ def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
                                   'slip up to 1 % of each turn'])
 def test_a_robot_that_follows_each_turn_otherwise_is_calibrated_within_its_interval(kind):
     """Earlier, soft ramps were refused, and half of the intervals contained such a slip."""
-    found = [tried(kind, GYROS['XV-3500'], (4, seed))
-             for seed in range(6)]
+    found = [tried(kind, GYROS['XV-3500'], (4, seed)) for seed in range(6)]
     assert not [each for each in found if isinstance(each, str)]
     sizes = np.array([np.abs(errors / deviations) for errors, deviations in found])
     assert (np.sqrt(np.mean(sizes ** 2, axis=0)) < rms_bounds(6)[1]).all(), np.round(sizes, 1)
@@ -226,9 +224,9 @@ def bumped(seed, degrees):
     return RATE + np.where((start <= TIME) & (start + 0.3 > TIME), degrees * DEGREE / 0.3, 0.0)
 
 
-@pytest.mark.parametrize('degrees, runs', [
-    (2.0, 7), *(pytest.param(degrees, 20, marks=pytest.mark.evidence)
-                for degrees in (5.0, 3.0, 2.0))])
+@pytest.mark.parametrize('degrees, runs',
+                         [(2.0, 7), *(pytest.param(degrees, 20, marks=pytest.mark.evidence)
+                                      for degrees in (5.0, 3.0, 2.0))])
 def test_a_slip_or_bump_is_refused(degrees, runs):
     """Measured: all of 40 runs for 5, 3 and 2 deg; 1 deg is accepted, as the limit states."""
     refused = 0
@@ -243,8 +241,7 @@ def test_a_slip_or_bump_is_refused(degrees, runs):
 def test_a_bump_below_the_limit_does_little_harm():
     errors = [
         self_calibrate(TIME, run(seed, bumped(seed, 0.5)), CALIBRATION_MOTION).scale_factor_error
-        - XV3500_S for seed in range(10)
-    ]
+        - XV3500_S for seed in range(10)]
     assert np.abs(errors).max() < 0.005
 
 

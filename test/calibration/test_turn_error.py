@@ -199,8 +199,8 @@ def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_te
     fit = fit_effects(found, (rate_temperature_polynomial(3, 2),))
     kept = fit.scatter.inliers
     errors = compute_turn_errors(select_dwells(found, kept), predict_left_out_rates(fit)[kept])
-    assert (summarize_errors(errors.static).largest > 0.02 * TURN > summarize_errors(
-        errors.modelled).largest)
+    assert (summarize_errors(errors.static).largest > 0.02 * TURN
+            > summarize_errors(errors.modelled).largest)
     assert summarize_errors(errors.static).rms > 10.0 * summarize_errors(errors.modelled).rms
 
 

@@ -32,7 +32,5 @@ from gyro_calibration.calibration.dwells.table import (
     SteadinessLimits,
 )
 
-__all__ = [
-    'Dwells', 'Numbers', 'SteadinessLimits', 'extract_dwells', 'find_dwells', 'dwells_from_table',
-    'join_dwells', 'format_list', 'select_dwells'
-]
+__all__ = ['Dwells', 'Numbers', 'SteadinessLimits', 'extract_dwells', 'find_dwells',
+           'dwells_from_table', 'join_dwells', 'format_list', 'select_dwells']

@@ -79,12 +79,10 @@ def _average_slopes(samples: Samples, dwells: Sequence[Numbers],
     # the encoder. The smaller one is used.
     variance = min((_map_to_array(_variance_from_batch_slopes, time, angles, batches)
                     for angles in (gyro_angle, errors)), key=np.median)
-    encoder_deviation = (
-        abs(samples.scale)
-        * np.array([_encoder_slope_deviation(*each, step) for each in zip(time, heading)]))
-    return (_map_to_array(fit_slope, time,
-                          heading), _map_to_array(fit_slope, time,
-                                                  gyro_angle), variance, encoder_deviation)
+    encoder_deviation = abs(samples.scale) * np.array(
+        [_encoder_slope_deviation(*each, step) for each in zip(time, heading)])
+    return (_map_to_array(fit_slope, time, heading), _map_to_array(fit_slope, time, gyro_angle),
+            variance, encoder_deviation)
 
 
 def _map_to_array(function: Callable[..., float], *columns: Iterable[Any]) -> Array:

@@ -67,8 +67,7 @@ def select_usable_samples(log: Log) -> tuple[Samples, list[str]]:
         for values in (log.reference_rate, log.reference_heading, log.temperature))
     places = [f'{time[run.start]:.2f} s' for run in find_runs(lost)]
     remark = (f'the reference was lost {format_occurrences(len(places))}, for {lost.sum()} '
-              'samples, '
-              f'at {format_list(places)}; they are left out')
+              f'samples, at {format_list(places)}; they are left out')
     return (Samples(time[good], output[good], rate, heading, temperature),
             [remark] if places else [])
 
@@ -108,8 +107,8 @@ def describe_missing_samples(log: Log, samples: Samples,
     if lost is None:
         yield 'the stamps are too irregular to count lost samples'
         return
-    gaps = np.flatnonzero((lost > 0) & (
-        np.interp(time[1:], samples.time, mark_dwells(samples, dwells)) > 0.5))
+    gaps = np.flatnonzero(
+        (lost > 0) & (np.interp(time[1:], samples.time, mark_dwells(samples, dwells)) > 0.5))
     if len(gaps):
         yield (f'samples missing within the dwells: {lost[gaps].sum()}, '
                f'after {format_list([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
@@ -133,8 +132,8 @@ def duration(time: Array, part: slice | Numbers) -> float:
 def count_samples(time: Array, span: float) -> int:
     """Return the number of samples in a span by the mean interval; stamps may come in bursts."""
     steps = np.diff(time)
-    return (round(span / float(steps[steps < _MAX_SAMPLE_INTERVAL].mean())) if
-            (steps < _MAX_SAMPLE_INTERVAL).any() else 0)
+    return (round(span / float(steps[steps < _MAX_SAMPLE_INTERVAL].mean()))
+            if (steps < _MAX_SAMPLE_INTERVAL).any() else 0)
 
 
 def fit_slope(x: Array, values: Array) -> float:

@@ -36,9 +36,8 @@ def trim_settling(samples: Samples, dwells: Sequence[Numbers],
     mirrored = [(len(time) - 1 - rows)[::-1] for rows in dwells[:-1]]
     after = max(limits.margin,
                 _settling_time(time, error, dwells[1:], rate_change, limits.max_settling_time))
-    before = max(
-        limits.margin,
-        _settling_time(-time[::-1], error[::-1], mirrored, -rate_change, limits.max_settling_time))
+    before = max(limits.margin, _settling_time(-time[::-1], error[::-1], mirrored, -rate_change,
+                                               limits.max_settling_time))
     kept = [rows[(time[rows] >= time[rows[0]] + after) & (time[rows] <= time[rows[-1]] - before)]
             for rows in dwells]
     return kept, f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut away'

@@ -34,10 +34,9 @@ def find_straight_heading(time: Array, heading: Array, limits: SteadinessLimits)
     step = quantization_step(heading)
     edges, times, headings = _average_blocks(time, heading)
     tolerance = step + _straightness_tolerance(headings, limits.max_heading_deviation)
-    stretches = [
-        cone for cone in _split_into_lines(times, headings, 2.0 * tolerance, limits.max_gap)
-        if duration(times, cone) >= 0.5 * limits.min_duration
-    ]
+    stretches = [cone
+                 for cone in _split_into_lines(times, headings, 2.0 * tolerance, limits.max_gap)
+                 if duration(times, cone) >= 0.5 * limits.min_duration]
     parts = _drop_overlaps(
         _extend_line(times, headings, cone, tolerance, step) for cone in stretches)
     whole = [slice(int(edges[part.start]), int(edges[part.stop]))
@@ -87,17 +86,17 @@ def _extend_line(time: Array, heading: Array, stretch: slice, tolerance: float,
     fifth = _length(stretch) // 5
     middle = slice(stretch.start + fifth, stretch.stop - fifth)
     # By at most its own length at both ends, so that the time is linear in the length of the log.
-    first, last = (max(0, stretch.start - _length(stretch)),
-                   min(len(time), stretch.stop + _length(stretch)))
+    first = max(0, stretch.start - _length(stretch))
+    last = min(len(time), stretch.stop + _length(stretch))
     line = heading[middle].mean() + fit_slope(time[middle], heading[middle]) * (
         time[first:last] - time[middle].mean())
     deviation = np.abs(heading[first:last] - line)
     beyond = np.flatnonzero(deviation > tolerance)
     before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
-    begin = (0 if not len(before) else
-             int(before[-1]) + 1 + _count_ramp_blocks(deviation[before[-1]::-1], tolerance, step))
-    end = (len(deviation) if not len(after) else
-           int(after[0]) - _count_ramp_blocks(deviation[after[0]:], tolerance, step))
+    begin = (0 if not len(before) else int(before[-1]) + 1
+             + _count_ramp_blocks(deviation[before[-1]::-1], tolerance, step))
+    end = (len(deviation) if not len(after)
+           else int(after[0]) - _count_ramp_blocks(deviation[after[0]:], tolerance, step))
     return slice(first + begin, first + max(begin, end))
 
 
@@ -136,7 +135,5 @@ def _has_constant_slope(time: Array, heading: Array, step: float,
         return True
     slopes = np.array([fit_slope(time[quarter], heading[quarter]) for quarter in quarters])
     blur = 8.0 * step / (time[-1] - time[0])
-    return bool(
-        np.ptp(slopes) <= 2.0
-        * (limits.max_rate_deviation + limits.relative_rate_deviation * np.abs(slopes).max())
-        + blur)
+    return bool(np.ptp(slopes) <= 2.0 * (limits.max_rate_deviation + limits.relative_rate_deviation
+                                         * np.abs(slopes).max()) + blur)

@@ -87,10 +87,10 @@ def find_dwell_rows(log: Log, limits: SteadinessLimits) -> DwellRows:
         raise DataRefused(_format_unsteady(found, limits))
     if found.dwell_share > 0.25:
         return found
-    return found._replace(remarks=(
-        *found.remarks, f'only {100.0 * found.dwell_share:.0f} % of the time is in dwells; '
-                        '--method '
-        'likelihood uses all of it, where there is a heading'))
+    return found._replace(
+        remarks=(*found.remarks,
+                 f'only {100.0 * found.dwell_share:.0f} % of the time is in dwells; '
+                 '--method likelihood uses all of it, where there is a heading'))
 
 
 def _has_values(reference: Array | None) -> bool:
@@ -121,14 +121,11 @@ def _find_by_reference(log: Log, limits: SteadinessLimits) -> DwellRows:
         kept.append(fresh[~is_outlier[fresh]])
     whole, cut = trim_settling(samples, kept, limits)
     whole, divided = _split_by_temperature(samples, whole, limits)
-    rows = [
-        part for part in whole
-        if len(part) >= MIN_DWELL_SAMPLES and duration(samples.time, part) >= limits.min_duration
-    ]
+    rows = [part for part in whole if len(part) >= MIN_DWELL_SAMPLES
+            and duration(samples.time, part) >= limits.min_duration]
     if short := len(whole) - len(rows):
         lost.append(f'steady stretches shorter than {limits.min_duration:g} s without the '
-                    'settling, '
-                    f'left out: {short}')
+                    f'settling, left out: {short}')
     return DwellRows(samples, rows, (*lost, cut, *divided,
                                      *_describe_left_out(samples, rows, is_outlier, is_repeated),
                                      *describe_missing_samples(log, samples, rows)))
@@ -145,8 +142,7 @@ def _describe_left_out(samples: Samples, dwells: list[Numbers], is_outlier: Mask
               for run in find_runs(is_repeated & within)]
     if places:
         yield (f'the output was repeated {format_occurrences(len(places))}, at '
-               f'{format_list(places)}; '
-               'the repeats are left out')
+               f'{format_list(places)}; the repeats are left out')
 
 
 def _find_steady_parts(samples: Samples, limits: SteadinessLimits) -> list[slice]:
@@ -176,15 +172,12 @@ def _split_by_temperature(samples: Samples, dwells: list[Numbers],
     """Divide the dwells in which the temperature changes, so that its slope can be fitted."""
     if samples.temperature is None:
         return dwells, []
-    pieces = [
-        _count_temperature_parts(samples.time[rows], samples.temperature[rows], limits)
-        for rows in dwells
-    ]
+    pieces = [_count_temperature_parts(samples.time[rows], samples.temperature[rows], limits)
+              for rows in dwells]
     parts = [part for rows, number in zip(dwells, pieces) for part in np.array_split(rows, number)]
     more = len(parts) - len(dwells)
     remark = (f'dwells that warmed or cooled by more than {limits.max_temperature_change:g} K are '
-              'divided, '
-              f'which makes {more} more')
+              f'divided, which makes {more} more')
     return parts, [remark] if more else []
 
 

@@ -104,14 +104,13 @@ def join_dwells(parts: Sequence[Dwells]) -> Dwells:
     if temperatures and not has_temperature:
         remarks += (f'{len(parts) - len(temperatures)} of {len(parts)} logs hold no temperature, '
                     'so that of the others is not used',)
-    return Dwells(
-        np.concatenate([part.rate for part in parts]),
-        np.concatenate([part.output for part in parts]),
-        np.concatenate(temperatures) if has_temperature else None,
-        np.concatenate([part.deviation for part in parts]),
-        np.concatenate([part.sweep + number for part, number in zip(parts, first_sweep)]),
-        sum((part.location for part in parts), ()), remarks, sum((part.rows for part in parts),
-                                                                 ()))
+    return Dwells(np.concatenate([part.rate for part in parts]),
+                  np.concatenate([part.output for part in parts]),
+                  np.concatenate(temperatures) if has_temperature else None,
+                  np.concatenate([part.deviation for part in parts]), np.concatenate(
+                      [part.sweep + number for part, number in zip(parts, first_sweep)]),
+                  sum((part.location for part in parts), ()), remarks,
+                  sum((part.rows for part in parts), ()))
 
 
 def dwells_from_table(log: Log) -> Dwells:
@@ -170,9 +169,8 @@ def find_dwells(log: Log, limits: SteadinessLimits | None = None) -> Dwells:
     rate, output, deviation = average_dwells(samples, dwells)
     time, temperature = samples.time, samples.temperature
     row = np.searchsorted(np.asarray(log.time), time)
-    return Dwells(rate, output,
-                  None if temperature is None
-                  else np.array([temperature[rows].mean() for rows in dwells]),
-                  deviation, number_sweeps(rate),
+    return Dwells(rate, output, None if temperature is None
+                  else np.array([temperature[rows].mean() for rows in dwells]), deviation,
+                  number_sweeps(rate),
                   tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells),
                   remarks, tuple(row[rows] for rows in dwells))
