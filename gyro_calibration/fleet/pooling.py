@@ -209,11 +209,10 @@ class _Solution:
                 unit_columns[:, :, part, place] = summed(equations.unit_sums,
                                                          weight * column * fixed[:, place])
         if equations.drives:
-            drive_weight, index = (weight[:, equations.on_drive],
-                                   fixed_count + np.arange(equations.drives))
-            right[:, index] = (
-                self._drive_deviation
-                * summed(equations.drive_sums, drive_weight * of.value[equations.on_drive]))
+            drive_weight = weight[:, equations.on_drive]
+            index = fixed_count + np.arange(equations.drives)
+            right[:, index] = self._drive_deviation * summed(
+                equations.drive_sums, drive_weight * of.value[equations.on_drive])
             for part, column in enumerate(equations.unit_columns[equations.on_drive].T):
                 unit_columns[:, equations.pair_unit, part,
                              index[equations.pair_drive]] = self._drive_deviation * summed(
@@ -233,9 +232,8 @@ class _Solution:
         self._right = tau[:, None] * unit_right
         lighter = self._within @ self._across
         rows = count, equations.units * parts
-        triangle = np.linalg.cholesky(
-            normal - np.swapaxes(lighter.reshape(*rows, total), 1, 2)
-            @ self._across.reshape(*rows, total))
+        triangle = np.linalg.cholesky(normal - np.swapaxes(lighter.reshape(*rows, total), 1, 2)
+                                      @ self._across.reshape(*rows, total))
         self._inverse = np.linalg.inv(triangle)  # of at most some hundred columns
         reduced = right - np.einsum('puac,pua->pc', lighter, self._right)
         half = np.einsum('pij,pj->pi', self._inverse, reduced)
@@ -305,14 +303,13 @@ class PooledValue:
             columns=self._fixed[:, 1:])
         self.variance_names = _identifiable_variances(observed)
         self._coordinate_bounds = _variance_bounds(self._scaled_observations, self.variance_names)
-        self._equations = _Equations(self._scaled_observations, self._fixed, DRIVES
-                                     in self.variance_names)
+        self._equations = _Equations(self._scaled_observations, self._fixed,
+                                     DRIVES in self.variance_names)
         self._best_point = self._find_best_point()
         self.likeliest_variances = {
             name: float(value[0]) * (1.0 if name == OWN_SHARE else self._value_scale ** 2)
             for name, value in self._variances_at(self._best_point[None]).items()
-            if name in self.variance_names
-        }
+            if name in self.variance_names}
         self._sample_points, self._sample_weights = self._sample_variances()
         self._cached_solution: _Solution | None = None
 
@@ -341,9 +338,8 @@ class PooledValue:
         """Return the point of largest restricted likelihood, optionally without one variance."""
         if not self.variance_names:
             return np.empty(0)
-        bounds = [(self._coordinate_bounds[name][0], )
-                  * 2 if name == excluded else self._coordinate_bounds[name]
-                  for name in self.variance_names]
+        bounds = [(self._coordinate_bounds[name][0],) * 2 if name == excluded
+                  else self._coordinate_bounds[name] for name in self.variance_names]
         point = np.array([low + 0.3 * (high - low) for low, high in bounds])
         for place, (low, high) in enumerate(bounds):
             if high > low:
@@ -352,10 +348,8 @@ class PooledValue:
         found = minimize(self._objective, point, method='L-BFGS-B', jac=True, bounds=bounds,
                          options={'maxiter': 60})
         # the gradient search often misses an optimum at the floor
-        ends = [
-            _replace_coordinate(found.x, place, np.array([low]))
-            for place, (low, _) in enumerate(bounds)
-        ]
+        ends = [_replace_coordinate(found.x, place, np.array([low]))
+                for place, (low, _) in enumerate(bounds)]
         tried = np.vstack([found.x, point, *ends])
         best: Array = tried[np.argmax(self._log_likelihood(tried))]
         return best
@@ -370,8 +364,8 @@ class PooledValue:
         """Return points of the variances, shape (points, names), and their weights."""
         if not self.variance_names:
             return np.empty((1, 0)), np.ones(1)
-        uniform = (qmc.Halton(len(self.variance_names),
-                              scramble=False).random(_SAMPLE_POINTS + 1)[1:])
+        uniform = qmc.Halton(len(self.variance_names), scramble=False).random(
+            _SAMPLE_POINTS + 1)[1:]
         sample, log_density = np.empty_like(uniform), np.zeros(_SAMPLE_POINTS)
         for place, name in enumerate(self.variance_names):
             axis = np.linspace(*self._coordinate_bounds[name], _SLICE_POINTS)
@@ -508,9 +502,8 @@ def _identifiable_variances(observed: Observations) -> list[str]:
     logs = np.bincount(observed.unit)
     names = [UNITS] if len(logs) > 1 else []
     for name, column in zip(SLOPES, observed.columns.T[:observed.slope_count]):
-        unit_count = sum(
-            len(np.unique(column[observed.unit == unit])) >= _MIN_SLOPE_LOGS
-            for unit in range(len(logs)))
+        unit_count = sum(len(np.unique(column[observed.unit == unit])) >= _MIN_SLOPE_LOGS
+                         for unit in range(len(logs)))
         names += [name] if unit_count > 1 else []
     if len(logs) == 1 or logs.max() > 1:
         names.append(POWER_ONS)
@@ -523,12 +516,9 @@ def _identifiable_variances(observed: Observations) -> list[str]:
 def _variance_bounds(observed: Observations, names: list[str]) -> dict[str, tuple[float, float]]:
     """Return the ends of each coordinate: the logarithm of floor, and of floor plus largest."""
     square = float(np.median(observed.deviation ** 2))
-    floors = {
-        **dict.fromkeys((UNITS, *SLOPES),
-                        square * len(np.unique(observed.unit)) / len(observed)), DRIVES: square
-        * len(np.unique(observed.drive)) / len(observed),
-        POWER_ONS: square
-    }
+    floors = {**dict.fromkeys((UNITS, *SLOPES),
+                              square * len(np.unique(observed.unit)) / len(observed)),
+              DRIVES: square * len(np.unique(observed.drive)) / len(observed), POWER_ONS: square}
     found = {}
     for name in names:
         floor = max(floors.get(name, 0.0), 1e-8)
@@ -558,13 +548,11 @@ def _log_prior(equations: _Equations, variances: Mapping[str, Array]) -> Array:
         if name in variances:
             first, second = ((equations.unit_sums @ (column ** power / variance).T).T
                              for power in (1, 2))
-            found = found + jeffreys(name, 1.0 / np.maximum(second - first ** 2 / known,
-                                                            1e-12 * known))
+            found = found + jeffreys(name,
+                                     1.0 / np.maximum(second - first ** 2 / known, 1e-12 * known))
     if DRIVES in variances:
-        found = (
-            found
-            + jeffreys(DRIVES, 1.0 /
-                       (equations.drive_sums @ (1.0 / variance[:, equations.on_drive]).T).T))
+        found = found + jeffreys(
+            DRIVES, 1.0 / (equations.drive_sums @ (1.0 / variance[:, equations.on_drive]).T).T)
     return found
 
 

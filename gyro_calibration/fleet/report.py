@@ -113,48 +113,36 @@ def _type_sections(summary: TypeSummary, index: int) -> Iterator[Markup]:
     yield element('section', element('h2', name), element('ul', *items), _variance_table(summary))
     values = [each for each in summary.values.values() if not each.is_slow]
     yield element(
-        'section', element('h2', f'{name}: units'),
-        element('p', 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
-                class_='quiet'),
-        element(
-            'div',
-            *(draw_chart(
-                _interval_chart(each, f't{index}-{each.name}-units', 'unit', summary.units,
-                                each.units, 'after')) for each in values), class_='pairs'),
-        _unit_table(summary, values))
+        'section', element('h2', f'{name}: units'), element(
+            'p', 'Bars: 95 % intervals of the mean of a unit over its power-ons.', class_='quiet'),
+        element('div', *(draw_chart(_interval_chart(each, f't{index}-{each.name}-units', 'unit',
+                                                    summary.units, each.units, 'after'))
+                         for each in values), class_='pairs'), _unit_table(summary, values))
     shared = [each for each in summary.values.values() if DRIVES in each.components]
     if shared:
-        yield element(
-            'section', element('h2', f'{name}: drives'),
-            element(
-                'p', 'An error that all units of a drive have in common is assigned to its '
-                'reference or to the vehicle.', class_='quiet'),
-            element(
-                'div',
-                *(draw_chart(
-                    _interval_chart(each, f't{index}-{each.name}-drives', 'drive', summary.drives,
-                                    each.drives, 'before')) for each in shared), class_='pairs'))
+        yield element('section', element('h2', f'{name}: drives'),
+                      element('p', 'An error that all units of a drive have in common is '
+                              'assigned to its reference or to the vehicle.', class_='quiet'),
+                      element('div', *(draw_chart(_interval_chart(
+                          each, f't{index}-{each.name}-drives', 'drive', summary.drives,
+                          each.drives, 'before')) for each in shared), class_='pairs'))
     if len(summary.dates) > 1:
         yield element(
             'section', element('h2', f'{name}: over time'),
-            element(
-                'div',
-                *(draw_chart(_dates_chart(summary, each, f't{index}-{each.name}-dates'))
-                  for each in values), class_='pairs'))
+            element('div', *(draw_chart(_dates_chart(summary, each, f't{index}-{each.name}-dates'))
+                             for each in values), class_='pairs'))
 
 
 def _variance_table(summary: TypeSummary) -> Markup:
     drifts = any(each.slopes for each in summary.values.values())
-    heads = [
-        'value', 'mean of the type', 'one more unit', *(text for _, text in _COMPONENT_LABELS),
-        *(['drift'] if drifts else [])
-    ]
+    heads = ['value', 'mean of the type', 'one more unit',
+             *(text for _, text in _COMPONENT_LABELS), *(['drift'] if drifts else [])]
     rows = [[_cell(readable_name(each.name)), _interval_cell(each, each.mean, 0),
              _interval_cell(each, each.new_unit, 0),
              *(_component_cell(each, each.components.get(name)) for name, _ in _COMPONENT_LABELS),
-             *([_cell('; '.join(
-                 format_interval(slope, 0, f'{each.unit}/{_SLOPE_UNITS[name]}', each.name)
-                 for name, slope in each.slopes.items()))] if drifts else [])]
+             *([_cell('; '.join(format_interval(slope, 0, f'{each.unit}/{_SLOPE_UNITS[name]}',
+                                                each.name)
+                                for name, slope in each.slopes.items()))] if drifts else [])]
             for each in summary.values.values()]
     return _table(heads, rows)
 
@@ -177,9 +165,8 @@ def _unit_table(summary: TypeSummary, values: Sequence[ValueSummary]) -> Markup:
 
 def _log_section(records: Sequence[Mapping[str, Any]]) -> Markup:
     names = list(dict.fromkeys(name for each in records for name in each.get('values', ())))
-    heads = [
-        'log', 'type', 'unit', 'drive', 'date', *map(readable_name, names), 'diagnosis', 'remark'
-    ]
+    heads = ['log', 'type', 'unit', 'drive', 'date', *map(readable_name, names), 'diagnosis',
+             'remark']
     rows = []
     for each in records:
         file = each['log'].rpartition('/')[2]
@@ -225,23 +212,21 @@ def _component_cell(value: ValueSummary, component: Component | None) -> Markup:
     low, high = (format_amount(end, value.unit, value.name)
                  for end in (component.low, component.high))
     text = (f'{format_amount(component.estimate, value.unit, value.name)} ({low} to '
-            f'{high})' if component.low > 0.0
-            else f'less than {high}')
+            f'{high})' if component.low > 0.0 else f'less than {high}')
     return _cell(text, component.estimate)
 
 
 def _interval_chart(value: ValueSummary, name: str, kind: str, names: Sequence[str],
                     interval: Interval, style: str) -> Chart:
     unit, factor = display_unit(value.unit, value.name)
-    middle, half = (0.5 * (interval.high + interval.low), 0.5 *
-                    (interval.high - interval.low) / NORMAL_QUANTILE_975)
-    return Chart(
-        name, f'{readable_name(value.name)} by {kind}',
-        f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
-        f'across zero is not determined. {kind.capitalize()}s: {", ".join(names)}.', kind, '',
-        np.arange(1.0,
-                  len(names) + 1.0), readable_name(value.name), unit,
-        [Line(kind, style, factor * middle, factor * half, draw_dots=True)], x_names=names)
+    middle = 0.5 * (interval.high + interval.low)
+    half = 0.5 * (interval.high - interval.low) / NORMAL_QUANTILE_975
+    return Chart(name, f'{readable_name(value.name)} by {kind}',
+                 f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
+                 f'across zero is not determined. {kind.capitalize()}s: {", ".join(names)}.',
+                 kind, '', np.arange(1.0, len(names) + 1.0), readable_name(value.name), unit,
+                 [Line(kind, style, factor * middle, factor * half, draw_dots=True)],
+                 x_names=names)
 
 
 def _dates_chart(found: TypeSummary, each: ValueSummary, name: str) -> Chart:
@@ -249,9 +234,9 @@ def _dates_chart(found: TypeSummary, each: ValueSummary, name: str) -> Chart:
     unit, factor = display_unit(each.unit, each.name)
     dated = [record for record in each.records if record['date']]
     place = np.array([found.dates.index(record['date']) + 1.0 for record in dated])
-    value: Array = np.array([
-        record['slow' if each.is_slow else 'values'][each.name]['value']
-        - float(each.units.value[found.units.index(record['unit'])]) for record in dated])
+    value: Array = np.array(
+        [record['slow' if each.is_slow else 'values'][each.name]['value']
+         - float(each.units.value[found.units.index(record['unit'])]) for record in dated])
     return Chart(name, f'{readable_name(each.name)} less that of the unit',
                  f'dates: {", ".join(found.dates)}', 'date', '', place, readable_name(each.name),
                  unit, [Line('log', 'measured', factor * value, draw_dots=True)],
@@ -319,6 +304,6 @@ def _parquet_content(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> 
     except ImportError:
         return None
     stream = io.BytesIO()
-    parquet.write_table(pyarrow.table({
-        name: [row.get(name) for row in rows] for name in columns}), stream)
+    parquet.write_table(pyarrow.table({name: [row.get(name) for row in rows] for name in columns}),
+                        stream)
     return stream.getvalue()

@@ -143,9 +143,8 @@ def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
     # four tests of each value: outlying units, outlying drives, changes, effects of the type; and
     # three of the effects of diagnoses: of the type, of a unit, of a drive
     tests = 4 * sum(map(len, values.values())) + 3 * len(types)
-    return [
-        _summarize_type(kind, logs[kind], values[kind], FALSE_ALARM_RATE / tests) for kind in types
-    ]
+    return [_summarize_type(kind, logs[kind], values[kind], FALSE_ALARM_RATE / tests)
+            for kind in types]
 
 
 def _list_values(records: Sequence[Record]) -> list[tuple[str, bool]]:
@@ -216,9 +215,8 @@ def _collect_observations(records: Sequence[Record], name: str, key: str, units:
     drive = np.array([drives.index(str(each['drive'])) if each['drive'] else -1
                       for each in records])
     days = [date.fromisoformat(each['date']).toordinal() for each in records if each['date']]
-    temperatures = [
-        float(each['temperature']) for each in records if each['temperature'] is not None
-    ]
+    temperatures = [float(each['temperature'])
+                    for each in records if each['temperature'] is not None]
     columns = {covariate: column - column.mean() for covariate, column in (
         ('age', np.array(days) / 365.25), ('temperature', np.array(temperatures)))
         if len(column) == len(records) and _varies_within_units(column, unit)}
@@ -252,12 +250,10 @@ def describe_type(summary: TypeSummary) -> Iterator[str]:
         alternatives = f'; not distinguishable from {names}' if others else ''
         size = format_interval(first.mean, 0, first.unit, first.name)
         yield (f'{readable_name(first.name)}: it repeats in all units, so the model of the type '
-               'lacks '
-               f'it: {size}{alternatives}')
+               f'lacks it: {size}{alternatives}')
     elif slow:
         yield (f'{join_list([readable_name(each.name) for each in slow])}: none repeats; in '
-               'single logs '
-               'they are the random walk of the bias')
+               'single logs they are the random walk of the bias')
     yield from (_describe_count(each, len(summary.units)) for each in count_effects(summary))
 
 
@@ -275,29 +271,23 @@ def _describe_value(summary: TypeSummary, value: ValueSummary) -> Iterator[str]:
             yield f'{readable_name(value.name)} {meanings[owner]}'
     for outlier in value.outlying_units:
         yield (f'{readable_name(value.name)}: unit {to_printable(summary.units[outlier.group])} '
-               'differs from its '
-               f'type by {format_amount(outlier.excess, value.unit, value.name)} '
+               f'differs from its type by {format_amount(outlier.excess, value.unit, value.name)} '
                f'(probability {outlier.p_value:.1g})')
     for outlier in value.outlying_drives:
         yield (f'{readable_name(value.name)}: all units of drive '
-               f'{to_printable(summary.drives[outlier.group])} '
-               f'deviate by {format_amount(outlier.excess, value.unit, value.name)}, an error of '
-               'the '
+               f'{to_printable(summary.drives[outlier.group])} deviate by '
+               f'{format_amount(outlier.excess, value.unit, value.name)}, an error of the '
                f'reference (probability {outlier.p_value:.1g})')
     for change in value.changes:
         yield (f'{readable_name(value.name)}: unit {to_printable(summary.units[change.unit])} '
-               'changed by '
-               f'{format_amount(change.size, value.unit, value.name)} on '
-               f'{summary.dates[change.first_date]} '
-               f'(probability {change.p_value:.1g})')
+               f'changed by {format_amount(change.size, value.unit, value.name)} on '
+               f'{summary.dates[change.first_date]} (probability {change.p_value:.1g})')
 
 
 def find_missing_effects(summary: TypeSummary) -> list[ValueSummary]:
     """Return the slow effects that repeat in all units, the most significant first."""
-    slow = [
-        each for each in summary.values.values()
-        if each.is_slow and each.p_value < summary.significance
-    ]
+    slow = [each for each in summary.values.values()
+            if each.is_slow and each.p_value < summary.significance]
     return sorted(slow, key=lambda each: each.p_value)
 
 
@@ -345,9 +335,8 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
         for kind in ('unit', 'drive'):
             other = 'drive' if kind == 'unit' else 'unit'
             groups = {str(each[kind]) for each in logs} - {''}
-            group_masks = ({
-                name: np.array([each[kind] == name for each in logs]) for name in groups
-            })
+            group_masks = {name: np.array([each[kind] == name for each in logs])
+                           for name in groups}
             if len(groups) > 1:
                 type_chances.append(
                     max(_count_probability(shows_effect[~of]) for of in group_masks.values()))
@@ -355,10 +344,10 @@ def count_effects(summary: TypeSummary) -> list[EffectCount]:
                 owners += [(len(groups) * _count_probability(shows_effect[of]), kind, name)
                            for name, of in sorted(group_masks.items())
                            if len({each[other] for each, one in zip(logs, of) if one}) > 1]
-        type_candidate = ((max(type_chances), 'type', '') if len(type_chances) > 1 else
-                          (1.0, '', ''))
-        chance, owner, name = (type_candidate if type_candidate[0] < summary.significance else min(
-            [*owners, type_candidate]))
+        type_candidate = ((max(type_chances), 'type', '') if len(type_chances) > 1
+                          else (1.0, '', ''))
+        chance, owner, name = (type_candidate if type_candidate[0] < summary.significance
+                               else min([*owners, type_candidate]))
         result.append(EffectCount(effect, int(shows_effect.sum()), len({
             each['unit'] for each, one in zip(logs, shows_effect) if one}), len(logs), *(
                 (owner, name) if chance < summary.significance else ('', '')), min(chance, 1.0)))

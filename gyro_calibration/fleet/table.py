@@ -73,9 +73,9 @@ class FleetLog:
 
     def fill_missing(self, stated: Mapping[str, str]) -> FleetLog:
         """Return the entry with its empty fields filled."""
-        new: dict[str, Any] = {name: to_printable(text.strip()) for name, text in stated.items()
-                               if name in ENTRY_KEYS and text.strip()
-                               and getattr(self, name) in ('', None)}
+        new: dict[str, Any] = {name: to_printable(text.strip())
+                               for name, text in stated.items() if name in ENTRY_KEYS
+                               and text.strip() and getattr(self, name) in ('', None)}
         if 'temperature' in new:
             new['temperature'] = _parse_temperature(self.log, new['temperature'])
         if 'date' in new:
@@ -192,8 +192,8 @@ def _resolve_log_path(path: str, log: str) -> str:
 
 
 def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
-    if not set(columns) <= {'log', *ENTRY_KEYS} or 'log' not in columns or len(
-            set(columns)) < len(columns):
+    if not set(columns) <= {'log', *ENTRY_KEYS} or 'log' not in columns or len(set(columns)) < len(
+            columns):
         raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
                          f'{", ".join(ENTRY_KEYS)}, each once')
     lines = _read_text(path).splitlines()
@@ -243,8 +243,7 @@ def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -
 
     """
     stem = re.sub(f'({"|".join(map(re.escape, sorted(LOG_SUFFIXES, key=len, reverse=True)))})$',
-                  '',
-                  Path(entry.log).name, flags=re.IGNORECASE)
+                  '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
         entry = entry.fill_missing(found.groupdict())
     return entry.fill_missing(_read_notes(entry.log)).fill_missing(_parse_file_name(stem))
@@ -265,10 +264,8 @@ def _parse_file_name(stem: str) -> dict[str, str]:
 def _read_notes(path: str) -> dict[str, str]:
     """Return the fields in the notes of a log, or in the metadata of a recording."""
     if os.path.isdir(path):
-        return {
-            **_read_custom_data(Path(path)),
-            **_read_recording_metadata(sorted(Path(path).glob('*.mcap')))
-        }
+        return {**_read_custom_data(Path(path)),
+                **_read_recording_metadata(sorted(Path(path).glob('*.mcap')))}
     if path.endswith('.mcap'):
         return _read_recording_metadata([Path(path)])
     if not path.lower().endswith(('.csv', '.csv.gz')):
@@ -286,12 +283,8 @@ def _read_notes(path: str) -> dict[str, str]:
         lines.append(line)
     text = '\n'.join(lines)  # such as "unit: 7" or "unit 7, drive h"
     found = {name.lower(): value for name, value in reversed(_WORDED_NOTE.findall(text))}
-    return {
-        **found,
-        **{
-            name.lower(): value for name, value in reversed(_KEYED_NOTE.findall(text))
-        }
-    }
+    return {**found,
+            **{name.lower(): value for name, value in reversed(_KEYED_NOTE.findall(text))}}
 
 
 def _read_custom_data(folder: Path) -> dict[str, str]:

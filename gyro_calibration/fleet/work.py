@@ -98,9 +98,8 @@ def fit_slow_effects(log: Log, time_offset: float = 0.0,
     if heading is None:
         span_edges, columns, rate = ends, [], np.zeros(len(ends))
     else:
-        span_edges = (heading[0][np.unique(
-            np.searchsorted(heading[0], ends).clip(0,
-                                                   len(heading[0]) - 1))])
+        span_edges = (
+            heading[0][np.unique(np.searchsorted(heading[0], ends).clip(0, len(heading[0]) - 1))])
         true_heading = np.interp(span_edges, *heading)
         columns, rate = [np.diff(true_heading)], np.gradient(true_heading, span_edges)
     if len(span_edges) < 10:
@@ -111,10 +110,9 @@ def fit_slow_effects(log: Log, time_offset: float = 0.0,
     for name, (unit, column) in _slow_effect_columns(log, span_edges).items():
         if names is not None and name not in names:
             continue
-        fit = fit_noise_grid(increments, np.column_stack([*columns,
-                                                          np.diff(span_edges), column]), noise,
-                             *bias_wander_columns(span_edges), noisy_column=0 if columns else None,
-                             wandering_value=len(columns))
+        fit = fit_noise_grid(increments, np.column_stack([*columns, np.diff(span_edges), column]),
+                             noise, *bias_wander_columns(span_edges),
+                             noisy_column=0 if columns else None, wandering_value=len(columns))
         found[name] = {'value': float(fit.values[-1]), 'deviation': float(fit.deviations[-1]),
                        'unit': unit}
     return {name: each for name, each in found.items()
@@ -137,8 +135,7 @@ def _estimate_rest_bias(log: Log) -> tuple[float, float]:
         raise DataRefused(f'rests for less than {_MIN_LOG_DURATION:.0f} s: record for longer')
     span_edges = np.linspace(time[0], time[-1], _SPAN_COUNT + 1)
     increments = np.diff(np.interp(span_edges, time, integrate(time, log.output[known])))
-    fit = fit_noise_grid(increments,
-                         np.diff(span_edges)[:, None],
+    fit = fit_noise_grid(increments, np.diff(span_edges)[:, None],
                          _noise_parts(span_edges, np.zeros(len(span_edges)), is_rest=True),
                          *bias_wander_columns(span_edges), wandering_value=0)
     return float(fit.values[0]), float(fit.deviations[0])
@@ -173,11 +170,8 @@ def _slow_effect_columns(log: Log, span_edges: Array) -> dict[str, tuple[str, Ar
     if log.temperature is not None and np.isfinite(log.temperature).all():
         temperature_deviation = log.temperature - log.temperature.mean()
         if np.ptp(temperature_deviation) > 0.0:
-            found['bias_temperature'] = ('rad/s/K',
-                                         np.diff(
-                                             np.interp(span_edges, log.time,
-                                                       integrate(log.time,
-                                                                 temperature_deviation))))
+            found['bias_temperature'] = 'rad/s/K', np.diff(
+                np.interp(span_edges, log.time, integrate(log.time, temperature_deviation)))
     return found
 
 
@@ -241,8 +235,8 @@ def process_log(task: LogTask) -> dict[str, Any]:
 
     """
     try:
-        entry = describe_log(task.entry,
-                             task.file_pattern).fill_missing({'type': task.default_type})
+        entry = describe_log(task.entry, task.file_pattern).fill_missing(
+            {'type': task.default_type})
         content = sha256_digest(*list_recording_files(task.entry.log))
         key = _record_key(task, content)
         found = _load_record(task.record_path, key)
@@ -283,10 +277,8 @@ def _format_reason(error: Exception, path: str) -> str:
 def _record_key(task: LogTask, content: str) -> str:
     """Return a hash of all that the record depends on."""
     generator_state = None if task.generator is None else task.generator.bit_generator.state
-    identity = [
-        SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log, content,
-        generator_state
-    ]
+    identity = [SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log, content,
+                generator_state]
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()
 
 
@@ -366,8 +358,7 @@ def calibrate_log(log: Log,
     table_quality = None if log.time is not None else inspect_record(log)
     if table_quality is not None and is_implausible_factor(table_quality.unit_factor):
         raise DataRefused(f'{table_quality.findings[0].evidence}: correct the unit or the sign of '
-                          'the '
-                          'column of the gyro')
+                          'the column of the gyro')
     return 'dwells', select_effects(extract_dwells(log), technology).calibration.model, {}
 
 
@@ -398,10 +389,9 @@ def _summarize_diagnosis(task: LogTask, log: Log) -> dict[str, Any]:
         }
     page = task.record_path.with_suffix('.html')
     write_atomically(page, render_report(found).encode())
-    findings = [
-        {'effect': each.effect, 'status': each.status, 'p_value': each.p_value,
-         'ambiguous_with': list(each.ambiguous_with),
-         'parameters': {name: value.to_dict() for name, value in each.parameters.items()}}
-        for each in found.findings]
+    findings = [{'effect': each.effect, 'status': each.status, 'p_value': each.p_value,
+                 'ambiguous_with': list(each.ambiguous_with),
+                 'parameters': {name: value.to_dict() for name, value in each.parameters.items()}}
+                for each in found.findings]
     return {'diagnosis': {'verdict': found.verdict, 'reason': '', 'findings': findings},
             'page': f'logs/{page.name}'}

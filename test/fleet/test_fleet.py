@@ -186,8 +186,8 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
     write_log(logs / 'd_unit1.csv', replace(rates, output=rates.output / DEGREE))
     write_log(logs / 'd_unit2.csv', replace(rates, time=1000.0 * rates.time))
     write_log(logs / 'e_unit3.csv', drive(0.01, 5))
-    (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n' + (
-        logs / 'e_unit3.csv').read_text())
+    (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n'
+                                      + (logs / 'e_unit3.csv').read_text())
     (logs / 'e_unit3.csv').unlink()
     assert run(logs, '--out', tmp_path / 'out') == 0
     told = json.loads(capsys.readouterr().out)
@@ -200,8 +200,8 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
                             'd_unit2.csv'}
     assert not any('\n' in each for each in reasons.values())
     # types are pooled apart
-    assert {each['type']: each['units']
-            for each in told['types']} == {'': ['1', '2'], 'FOG': ['3']}
+    assert {each['type']: each['units'] for each in told['types']} == {
+        '': ['1', '2'], 'FOG': ['3']}
 
 
 def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, capsys):
@@ -216,14 +216,14 @@ def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, cap
                   Log(time=0.05 * np.arange(1300), output=factor * rest))
         write_log(tmp_path / f'logs/type_2_unit{unit}.csv',
                   Log(output=(factor if unit else -1.0) * table, reference_rate=rate))
-    (tmp_path / 'logs.csv').write_text('log,unit,type\n' + ''.join(
-        f'logs/{kind}_unit{unit}.csv,{unit},{kind}\n' for kind in ('rest', 'type_2')
-        for unit in range(5)))
+    (tmp_path / 'logs.csv').write_text(
+        'log,unit,type\n' + ''.join(f'logs/{kind}_unit{unit}.csv,{unit},{kind}\n'
+                                    for kind in ('rest', 'type_2') for unit in range(5)))
     assert run(tmp_path / 'logs.csv', '--out', tmp_path / 'out') == 0
     told = json.loads(capsys.readouterr().out)
     reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
-    assert set(reasons) == {f'{name}.csv' for name in (
-        'rest_unit3', 'type_2_unit0', 'type_2_unit3')}
+    assert set(reasons) == {f'{name}.csv'
+                            for name in ('rest_unit3', 'type_2_unit0', 'type_2_unit3')}
     assert 'its white noise is 5' in reasons['rest_unit3.csv']
     assert '-1 is -1' in reasons['type_2_unit0.csv']
     assert '180/pi' in reasons['type_2_unit3.csv']
@@ -359,13 +359,14 @@ def records(ramp=0.0, wander=1.0):
 
     def of(value, deviation, unit):
         return {'value': value, 'deviation': deviation, 'unit': unit}
-    return [{'log': f'{drive}{unit}', 'unit': str(unit), 'type': 'DOT', 'drive': 'hijk'[drive],
-             'date': '', 'temperature': None, 'diagnosis': None, 'page': '',
-             'noise': {'angle_random_walk': 1e-4}, 'values': {
-                 'bias': of(unit + 1e-3 * generator.standard_normal(), 1e-3, 'rad/s'),
-                 'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')},
-             'slow': {'rate_ramp': of(ramp + wander * generator.standard_normal(), wander,
-                                      'rad/s²')}} for unit in range(5) for drive in range(4)]
+    return [
+        {'log': f'{drive}{unit}', 'unit': str(unit), 'type': 'DOT', 'drive': 'hijk'[drive],
+         'date': '', 'temperature': None, 'diagnosis': None, 'page': '',
+         'noise': {'angle_random_walk': 1e-4},
+         'values': {'bias': of(unit + 1e-3 * generator.standard_normal(), 1e-3, 'rad/s'),
+                    'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')},
+         'slow': {'rate_ramp': of(ramp + wander * generator.standard_normal(), wander, 'rad/s²')}}
+        for unit in range(5) for drive in range(4)]
 
 
 @pytest.mark.parametrize(('ramp', 'said'), [(0.0, 'none repeats'), (12.0, 'the type lacks it')])
@@ -379,11 +380,9 @@ def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
 
 
 def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
-    shown = {'hysteresis': lambda unit, drive: True,
-             'reference_scale': lambda unit, drive: True,
-             'bandwidth': lambda unit, drive: unit == '2',
-             'outliers': lambda unit, drive: drive == 'j',
-             'quantization': lambda unit, drive: (unit, drive) in (('1', 'h'), ('3', 'k')),
+    shown = {'hysteresis': lambda unit, drive: True, 'reference_scale': lambda unit, drive: True,
+             'bandwidth': lambda unit, drive: unit == '2', 'outliers': lambda unit, drive: drive
+             == 'j', 'quantization': lambda unit, drive: (unit, drive) in (('1', 'h'), ('3', 'k')),
              'bias': lambda unit, drive: True}
     (found,) = summarize_types([{**each, 'diagnosis': {'findings': [
         {'effect': name, 'status': 'established'} for name, of in shown.items()
@@ -391,8 +390,7 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
         for each in records()])
     assert {each.effect: (each.owner, each.name, each.logs) for each in count_effects(found)} == {
         'hysteresis': ('type', '', 20), 'reference_scale': ('type', '', 20),
-        'bandwidth': ('unit', '2', 4),
-        'outliers': ('drive', 'j', 5), 'quantization': ('', '', 2)}
+        'bandwidth': ('unit', '2', 4), 'outliers': ('drive', 'j', 5), 'quantization': ('', '', 2)}
     told = '; '.join(describe_type(found))
     assert 'hysteresis: established in 20 of 20 logs, of 5 of 5 units: the model' in told
     assert 'reference scale: established in 20 of 20 logs, of 5 of 5 units: the ref' in told
@@ -483,8 +481,8 @@ def test_tables_hold_a_row_for_each_log_and_for_each_value_of_a_unit():
 
 def test_a_cluster_gives_what_processes_give():
     distributed = pytest.importorskip('distributed')
-    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None,
-                                  protocol='tcp') as local, cluster_executors(
-                                      local.scheduler_address) as create:
+    with distributed.LocalCluster(
+            n_workers=1, processes=False, dashboard_address=None,
+            protocol='tcp') as local, cluster_executors(local.scheduler_address) as create:
         assert dict(run_tasks(abs, range(-3, 3), 2, create)) == {
             number: abs(number) for number in range(-3, 3)}
