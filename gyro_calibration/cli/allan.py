@@ -40,11 +40,10 @@ DISPLAY_UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGRE
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'allan', _allan,
-                           'find the noise figures of a gyro in a record at rest, by its Allan '
-                           'deviation', 'rest.csv --rate 100 --picture allan.png --model '
-                                        'model.yaml '
-                           '--out model.yaml')
+    parser = verb.add_verb(
+        verbs, 'allan', _allan,
+        'find the noise figures of a gyro in a record at rest, by its Allan deviation',
+        'rest.csv --rate 100 --picture allan.png --model model.yaml --out model.yaml')
     verb.add_log_options(parser)
     verb.add_picture_option(parser, 'the chart')
     parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model to add the '
@@ -80,8 +79,8 @@ def answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[s
     """Return the noise figures as lines for people."""
     lost = int(np.isnan(record.rate).sum())
     return [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
-            f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks,
-            _floor_line(chart, fit),
+            f'{len(record.rate) * record.interval:.5g} s at rest.',
+            *record.remarks, _floor_line(chart, fit),
             *(_figure_line(symbol, figure) for symbol, figure in fit.figures.items()),
             _fit_line(fit)]
 
@@ -100,10 +99,8 @@ def _figure_line(symbol: str, figure: NoiseFigure) -> str:
 def figure_labels(fit: NoiseFit) -> dict[str, str]:
     """Return the labels in a chart of the detected figures, by symbol."""
     return {
-        symbol: f'{_figure_name(figure)} {symbol} = '
-        f'{figure.value * DISPLAY_UNITS[symbol][1]:.3g} '
-        f'{DISPLAY_UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value
-    }
+        symbol: f'{_figure_name(figure)} {symbol} = {figure.value * DISPLAY_UNITS[symbol][1]:.3g} '
+        f'{DISPLAY_UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value}
 
 
 def _figure_name(figure: NoiseFigure) -> str:
@@ -113,9 +110,8 @@ def _figure_name(figure: NoiseFigure) -> str:
 def _floor_line(chart: AllanChart, fit: NoiseFit) -> str:
     unit, factor = DISPLAY_UNITS['B']
     floor = chart.floor
-    text = (f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} '
-            f'at {floor.time:.4g} s, 95 %: {floor.lower * factor:.4g} '
-            f'to {floor.upper * factor:.4g}')
+    text = (f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} '
+            f's, 95 %: {floor.lower * factor:.4g} to {floor.upper * factor:.4g}')
     if fit.is_floor_reached:
         return f'{text}.'
     return (f'{text}. The deviation still falls at the end of the chart; record longer to reach '
@@ -142,10 +138,11 @@ def _fit_line(fit: NoiseFit) -> str:
 
 def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
           fit: NoiseFit) -> dict[str, Any]:
-    figures = {figure.term.name: {
-        'symbol': symbol, 'unit': figure.term.unit, 'value': figure.value, 'lower': figure.lower,
-        'upper': figure.upper, 'seen': bool(figure.value),
-        'standard_deviation': figure.standard_deviation} for symbol, figure in fit.figures.items()}
+    figures = {figure.term.name: {'symbol': symbol, 'unit': figure.term.unit,
+                                  'value': figure.value, 'lower': figure.lower,
+                                  'upper': figure.upper, 'seen': bool(figure.value),
+                                  'standard_deviation': figure.standard_deviation}
+               for symbol, figure in fit.figures.items()}
     columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower,
                'upper': chart.upper, 'degrees_of_freedom': chart.degrees_of_freedom,
                'differences': chart.difference_count, 'fit': fit.deviation(chart.time)}
@@ -153,9 +150,8 @@ def _data(given: argparse.Namespace, record: RestRecord, chart: AllanChart,
             'remarks': list(record.remarks), **figures,
             'floor': {**vars(chart.floor), 'reached': fit.is_floor_reached},
             'fitted_from_s': fit.min_time, 'fitted_to_s': fit.max_time, 'misfit': fit.misfit,
-            'rivals': list(fit.alternatives),
-            'gauss_markov': None if fit.process is None else {
-                'standard_deviation': fit.process.standard_deviation,
-                'correlation_time_s': fit.process.correlation_time},
+            'rivals': list(fit.alternatives), 'gauss_markov': None if fit.process is None
+            else {'standard_deviation': fit.process.standard_deviation,
+                  'correlation_time_s': fit.process.correlation_time},
             'chart': {name: values.tolist() for name, values in columns.items()},
             'picture': given.picture, 'out': given.out}

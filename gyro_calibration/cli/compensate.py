@@ -100,8 +100,8 @@ class _Totals:
 
     def add(self, piece: CompensatedBlock) -> None:
         log, columns = piece.log, piece.columns
-        self.lost_samples, self.longest_gap_s = (piece.intervals.lost_samples,
-                                                 piece.intervals.longest_gap)
+        self.lost_samples = piece.intervals.lost_samples
+        self.longest_gap_s = piece.intervals.longest_gap
         self.rows += len(log)
         without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
         self.rows_without_output += without
@@ -186,9 +186,8 @@ def integrate_log(logs: Iterable[Log], model: GyroModel, threshold: Threshold,
 
 def _integrate_blocks(logs: Iterable[Log], model: GyroModel,
                       threshold: Threshold) -> Iterator[CompensatedBlock]:
-    integrator, compensation = (BlockIntegrator(threshold, model.noise,
-                                                uncertainty_covariance(model)),
-                                LogCompensation(model))
+    integrator = BlockIntegrator(threshold, model.noise, uncertainty_covariance(model))
+    compensation = LogCompensation(model)
     variance: float | None = None
     for log in logs:
         known = plausible_rows(model, log)
@@ -196,12 +195,11 @@ def _integrate_blocks(logs: Iterable[Log], model: GyroModel,
             # The noise of a rate depends on the interval between samples. That of the first block
             # is used for all rates, since a lost sample does not reduce the noise of a gyro. Rows
             # without output may lie between samples.
-            variance = 0.0 if log.time is None else model.noise.rate_variance(float(np.median(
-                np.diff(log.time[known] if known.sum() > 1 else log.time))))
-        yield CompensatedBlock(
-            log, known,
-            _compensated_columns(model, compensation, integrator, variance, rows_of(log, known)),
-            integrator.intervals)
+            variance = 0.0 if log.time is None else model.noise.rate_variance(
+                float(np.median(np.diff(log.time[known] if known.sum() > 1 else log.time))))
+        yield CompensatedBlock(log, known, _compensated_columns(model, compensation, integrator,
+                                                                variance, rows_of(log, known)),
+                               integrator.intervals)
 
 
 def track_log(log: Log, model: GyroModel, hindsight: bool,
@@ -303,20 +301,19 @@ def _interpolate_block(piece: CompensatedBlock,
                        around: list[dict[str, Array]]) -> CompensatedBlock:
     assert piece.log.time is not None
     true = np.concatenate([columns[_TRUE_TIME_COLUMN] for columns in around])
-    stamps, columns = piece.log.time[piece.is_plausible], {
-        name: values for name, values in piece.columns.items() if name != _TRUE_TIME_COLUMN}
+    stamps = piece.log.time[piece.is_plausible]
+    columns = {name: values for name, values in piece.columns.items() if name != _TRUE_TIME_COLUMN}
     if len(true):
-        columns.update({
-            name: np.interp(stamps, true, np.concatenate([each[name] for each in around]))
-            for name in _MOVED_COLUMNS
-        })
+        columns.update(
+            {name: np.interp(stamps, true, np.concatenate([each[name] for each in around]))
+             for name in _MOVED_COLUMNS})
     return replace(piece, columns=columns)
 
 
 def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answer:
     data: dict[str, Any] = {'out': given.out, **asdict(found)}
-    heading, deviation, *_ = (data.pop(name) for name in (
-        'heading', 'deviation', 'unknown', 'errors', 'first_error'))
+    heading, deviation, *_ = (
+        data.pop(name) for name in ('heading', 'deviation', 'unknown', 'errors', 'first_error'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
     if heading is not None:
         # The deviation is zero where the model has neither noise nor covariance.

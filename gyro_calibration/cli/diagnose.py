@@ -37,10 +37,9 @@ import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'diagnose', _diagnose, 'measure the error of a simulation, name '
-                                                         'the '
-                           'cause, extend the model, measure the gain',
-                           'drive.csv --model gyro.yaml --out diagnosis')
+    parser = verb.add_verb(verbs, 'diagnose', _diagnose,
+                           'measure the error of a simulation, name the cause, extend the model, '
+                           'measure the gain', 'drive.csv --model gyro.yaml --out diagnosis')
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
                         'ideal gyro with the bias and scale factor error that fit the logs best')
@@ -61,8 +60,8 @@ def _diagnose(given: argparse.Namespace) -> Answer:
                               on_progress)
     found = replace(found, logs=tuple(given.log))
     if found.model is not model:
-        found = replace(found, model=replace(
-            found.model, origin={**found.model.origin, **verb.make_origin(found.logs)}))
+        found = replace(found, model=replace(found.model, origin={**found.model.origin,
+                                                                  **verb.make_origin(found.logs)}))
     written = write_diagnosis(given.out, found) if given.out else []
     return Answer([*terminal_lines(found), *written], found.to_dict())
 
@@ -76,9 +75,9 @@ def diagnose_logs(logs: Sequence[Log], model: GyroModel | None, seed: int, kind:
         raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
                          'alone, or give the sample rate in Hz with --rate')
     found = (diagnose_table(logs[0], None if model is None else merge_self_calibration(model),
-                            on_progress=on_progress) if table
-             else diagnose(logs, np.random.default_rng(seed), model, names=names,
-                           on_progress=on_progress, reference_kind=kind))
+                            on_progress=on_progress)
+             if table else diagnose(logs, np.random.default_rng(seed), model, names=names,
+                                    on_progress=on_progress, reference_kind=kind))
     return (found if model is None or is_model_extended(found)
             else replace(found, before=model, model=model))
 

@@ -106,5 +106,5 @@ def _iterate_samples(time: Array, output: Array, temperature: Array | None,
     length = float(times[-1] + np.median(np.diff(times)))
     for start in chain([0.0], (length * number
                                for number in range(1, sys.maxsize if repeats else 1))):
-        yield from (Sample(output, temperature, start + time) for time, output, temperature
-                    in zip(times.tolist(), outputs, temperatures))
+        yield from (Sample(output, temperature, start + time)
+                    for time, output, temperature in zip(times.tolist(), outputs, temperatures))

@@ -45,8 +45,7 @@ def _export(given: argparse.Namespace) -> Answer:
     if given.span * given.sample_rate < 2.0:
         raise UsageError(f'--span {given.span:g} is shorter than two samples; give at least '
                          f'{2.0 / given.sample_rate:g} s')
-    temperature = (model.reference_temperature if given.temperature is None
-                   else given.temperature)
+    temperature = model.reference_temperature if given.temperature is None else given.temperature
     noise_figures, error = simulator_parameters(model, given.sample_rate, temperature, given.span)
     text, left_out = export_model(noise_figures, model, given.to)
     data = {'to': given.to, 'out': given.out, 'text': text, 'left_out': left_out,

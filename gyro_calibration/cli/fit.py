@@ -55,17 +55,14 @@ _DISPLAY_UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEG
 
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb.add_verb(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an '
-                                               'encoder, '
-                           'or any log with a reference',
-                           'table.csv --out model.yaml')
+                           'encoder, or any log with a reference', 'table.csv --out model.yaml')
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
-                        help='dwells: means at constant rates; '
-                        'likelihood: maximum likelihood from the reference heading; '
-                        'course: a course over ground, as from satellite navigation; '
-                        'rate: the rate of the reference heading, sample by sample. '
-                        'Default: by the columns of the log')
+                        help='dwells: means at constant rates; likelihood: maximum likelihood '
+                        'from the reference heading; course: a course over ground, as from '
+                        'satellite navigation; rate: the rate of the reference heading, '
+                        'sample by sample. Default: by the columns of the log')
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
@@ -191,23 +188,17 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
             0, f'the log has a reference rate, and fewer than {MIN_DWELLS} stretches of '
             'constant rate; so the rate is integrated, and headings are compared. For other '
             'effects than bias and scale factor error, hold each rate for some seconds')
-    return Answer(
-        [
-            f'{len(log)} samples of {path}, {found.lost_samples} lost.',
-            *heading_lines(model, found, remarks)
-        ], {
-            'out': given.out,
-            'method': found.method,
-            **_model_data(model), 'time_offset_s': fit.time_offset,
-            'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
-            'reference_noise_rad': fit.reference_noise,
-            'lost_samples': found.lost_samples,
-            'rms_heading_before_rad': found.residual_before.rms,
-            'rms_heading_after_rad': found.residual_after.rms,
-            'largest_heading_before_rad': found.residual_before.largest,
-            'largest_heading_after_rad': found.residual_after.largest,
-            'remarks': remarks
-        }, (given.out, ))
+    return Answer([f'{len(log)} samples of {path}, {found.lost_samples} lost.',
+                   *heading_lines(model, found, remarks)],
+                  {'out': given.out, 'method': found.method, **_model_data(model),
+                   'time_offset_s': fit.time_offset,
+                   'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
+                   'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
+                   'rms_heading_before_rad': found.residual_before.rms,
+                   'rms_heading_after_rad': found.residual_after.rms,
+                   'largest_heading_before_rad': found.residual_before.largest,
+                   'largest_heading_after_rad': found.residual_after.largest, 'remarks': remarks},
+                  (given.out,))
 
 
 def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
@@ -336,8 +327,8 @@ def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
     """Give the dwells that were measured, and those that were not fitted."""
     table = fit.dwells
     slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
-    temperatures = ('' if table.temperature is None else
-                    f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC')
+    temperatures = ('' if table.temperature is None
+                    else f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC')
     sweeps = len(np.unique(table.sweep))
     yield (f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, '
            f'{slowest:.1f} to {fastest:.1f} deg/s{temperatures}.')
@@ -371,9 +362,8 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
                         'this factor.')
     if fit.min_non_monotonic_rate is not None:
         yield wrap_line(f'Above {fit.min_non_monotonic_rate / DEGREE:.0f} deg/s the modelled '
-                        'output does '
-                        'not increase with the rate, so one output has two rates: do not use the '
-                        'model there.')
+                        'output does not increase with the rate, so one output has two rates: do '
+                        'not use the model there.')
     if not fit.dof:
         yield wrap_line('There are as many values as dwells, so their standard deviations are '
                         'unknown: add dwells.')
@@ -390,9 +380,9 @@ def _bin_lines(fit: Calibration) -> Iterator[str]:
                f'{"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s')
         for part in bin_errors(fit, values):
             place = f'{part.low * factor:.1f} to {part.high * factor:.1f}'
-            before, residual, deviation, rms = (value / DEGREE
-                                                for value in (part.uncorrected, part.residual,
-                                                              part.deviation, part.rms))
+            before, residual, deviation, rms = (
+                value / DEGREE
+                for value in (part.uncorrected, part.residual, part.deviation, part.rms))
             yield (f'{place:22s} {part.count:6d} {before:18.4f} {residual:10.4f} '
                    f'{deviation:8.4f} {rms:8.4f}')
         yield ''

@@ -65,10 +65,9 @@ _COMPONENT_LABELS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'fleet', _fleet, 'calibrate and diagnose many logs of many '
-                                                   'gyros, '
-                           'and attribute errors to the unit, the type and the reference',
-                           'drives/ --out fleet')
+    parser = verb.add_verb(verbs, 'fleet', _fleet,
+                           'calibrate and diagnose many logs of many gyros, and attribute '
+                           'errors to the unit, the type and the reference', 'drives/ --out fleet')
     parser.add_argument('logs', metavar='LOGS', nargs='+', help='logs, folders or globs of them, '
                         'a list (.txt), or a table (.csv) with the columns log and any of unit, '
                         'type, drive, date, temperature')
@@ -86,13 +85,11 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only, which is '
                         'faster')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
-                        help='seed of the '
-                        'random draws of a diagnosis; default: 0')
+                        help='seed of the random draws of a diagnosis; default: 0')
     parser.add_argument('--workers', type=verb.positive_integer, metavar='N',
                         help='number of processes; default: one per core')
     parser.add_argument('--memory', type=verb.positive_number, metavar='GB',
-                        help='memory limit per '
-                        'worker; default: an equal share of this machine')
+                        help='memory limit per worker; default: an equal share of this machine')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
                         'as tcp://host:8786; its workers need the same files')
     return parser
@@ -111,9 +108,9 @@ def _fleet(given: argparse.Namespace) -> Answer:
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise UsageError(f'{given.out}: is a file, but must be a folder; give another name')
     generator = None if given.no_diagnosis else np.random.default_rng(given.seed)
-    records = _process_logs(given, [
-        LogTask(entry, folder, given.technology, given.pattern, generator, given.gyro_type or '',
-                given.rate) for entry in logs])
+    records = _process_logs(given, [LogTask(entry, folder, given.technology, given.pattern,
+                                            generator, given.gyro_type or '', given.rate)
+                                    for entry in logs])
     used = [each for each in records if each['status'] == DONE]
     if not used:
         first = records[0]

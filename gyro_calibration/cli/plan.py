@@ -101,8 +101,8 @@ def _plan(given: argparse.Namespace) -> Answer:
         for seconds in lengths:
             on_progress(None, f'for comparison, the best motion of {seconds:g} s')
             longer[seconds] = find_plan(seconds)[0].prediction
-    built_in = CalibrationForecast(noise, CALIBRATION_MOTION.duration, drive,
-                                   given.drive).predict(CALIBRATION_MOTION)
+    built_in = CalibrationForecast(noise, CALIBRATION_MOTION.duration, drive, given.drive).predict(
+        CALIBRATION_MOTION)
     rows = {'planned': plan.prediction,
             'plain': forecast.predict(plain_motion(robot, given.seconds)), 'built_in': built_in}
     if given.out:
@@ -166,25 +166,20 @@ _MOTION_LABELS = {'planned': 'planned', 'plain': 'one turn there and back',
 def _lines(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
            longer: dict[float, Prediction], is_built_in_feasible: bool) -> list[str]:
     rate, angle = plan.motion.rate_at(plan.motion.time) / DEGREE, plan.motion.heading / DEGREE
-    lines = [
-        f'A motion of {given.seconds:g} s with rates of {rate.min():.1f} to {rate.max():.1f} '
-        f'deg/s and headings of {angle.min():.0f} to {angle.max():.0f} deg.', '',
-        f'Expected of a calibration, and of the heading over {given.drive:g} s after it:']
-    lines += [
-        _row(
-            _MOTION_LABELS[name] +
-            ('' if is_built_in_feasible or name != 'built_in' else ', beyond the limits'), row)
-        for name, row in rows.items()
-    ]
+    lines = [f'A motion of {given.seconds:g} s with rates of {rate.min():.1f} to {rate.max():.1f} '
+             f'deg/s and headings of {angle.min():.0f} to {angle.max():.0f} deg.',
+             '', f'Expected of a calibration, and of the heading over {given.drive:g} s after it:']
+    lines += [_row(_MOTION_LABELS[name] + ('' if is_built_in_feasible or name != 'built_in'
+                                           else ', beyond the limits'), row)
+              for name, row in rows.items()]
     lines += [_row(f'planned, {seconds:g} s', row) for seconds, row in longer.items()]
     scale_gain, heading_gain = _gains(rows)
     return lines + [
-        '', 'Compared with one turn there and back, the scale factor is '
-        f'{scale_gain:.2f} times as accurate, and the mean heading error is '
-        f'{100 * abs(heading_gain):.2f} % '
+        '', f'Compared with one turn there and back, the scale factor is {scale_gain:.2f} times '
+        f'as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
         f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
-        f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the error, '
-        'independent of the calibration.']
+        f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the '
+        'error, independent of the calibration.']
 
 
 def _row(name: str, row: Prediction) -> str:
@@ -203,20 +198,10 @@ def _gains(rows: dict[str, Prediction]) -> tuple[float, float]:
 def _data(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
           longer: dict[float, Prediction], is_built_in_feasible: bool) -> dict[str, Any]:
     scale_gain, heading_gain = _gains(rows)
-    return {
-        'duration_s': plan.motion.duration,
-        'time_s': plan.motion.time.tolist(),
-        'rate_rad_s': plan.motion.rate_at(plan.motion.time).tolist(),
-        **{
-            name: asdict(row) for name, row in rows.items()
-        }, 'built_in_within_limits': is_built_in_feasible,
-        'scale_gain': scale_gain,
-        'heading_gain': heading_gain,
-        'more_seconds': [{
-            'duration_s': seconds,
-            **asdict(row)
-        } for seconds, row in longer.items()],
-        'drive_s': given.drive,
-        'seed': given.seed,
-        'out': given.out
-    }
+    return {'duration_s': plan.motion.duration, 'time_s': plan.motion.time.tolist(),
+            'rate_rad_s': plan.motion.rate_at(plan.motion.time).tolist(),
+            **{name: asdict(row) for name, row in rows.items()},
+            'built_in_within_limits': is_built_in_feasible, 'scale_gain': scale_gain,
+            'heading_gain': heading_gain, 'more_seconds': [{'duration_s': seconds, **asdict(row)}
+                                                           for seconds, row in longer.items()],
+            'drive_s': given.drive, 'seed': given.seed, 'out': given.out}

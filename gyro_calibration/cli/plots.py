@@ -81,10 +81,9 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
         axes.set(ylabel='difference [deg]',
                  title=f'Gyro {when}, less the {name}: rms {rms(error) / DEGREE:.3g} deg')
     below.set_xlabel('time [s]')
-    return _save_figure(figure, path, 'The lower panels show the difference about its mean, each '
-                                      'on its '
-                        'own scale. A slope is bias; what follows the turns is scale factor '
-                        'error; an '
+    return _save_figure(figure, path,
+                        'The lower panels show the difference about its mean, each on its own '
+                        'scale. A slope is bias; what follows the turns is scale factor error; an '
                         'even band is the resolution of the reference.')
 
 
@@ -120,8 +119,7 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
     below.plot(time, motion.heading_at(time) / DEGREE, color='black')
     below.set(xlabel='time [s]', ylabel='heading [deg]')
     return _save_figure(figure, path, 'Dotted: rate limit of the robot. Turns both ways separate '
-                                      'scale '
-                        'factor error and bias; rests show the bias.')
+                        'scale factor error and bias; rests show the bias.')
 
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
@@ -161,8 +159,7 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
     return _save_figure(figure, path, 'Slope -1/2: white noise, N at 1 s. Flat: flicker, at 0.664 '
-                                      'B. '
-                        'Slope +1/2: random walk of the bias.')
+                        'B. Slope +1/2: random walk of the bias.')
 
 
 # rate tables
@@ -180,8 +177,8 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
     output = np.linspace(*rate_range, 161)
     has_temperature = bool(np.isfinite(temperature_range).all()
                            and temperature_range[0] < temperature_range[1])
-    figure, panels = _panels(1, 2 if has_temperature else 1, (11, 5) if has_temperature else
-                             (7, 5))
+    figure, panels = _panels(1, 2 if has_temperature else 1,
+                             (11, 5) if has_temperature else (7, 5))
     if has_temperature:
         _draw_contours(panels[0, 0], model, output, np.linspace(*temperature_range, 81), dwells)
     temperatures = (np.linspace(*temperature_range, 4) if has_temperature
@@ -198,9 +195,8 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
              title='Error over the output')
     axes.legend(loc='best')
     return _save_figure(
-        figure, path, 'The error that the model removes; red: the output is above '
-        'the '
-        'true rate, blue: below it.' if has_temperature else 'The error that the model removes.')
+        figure, path, 'The error that the model removes; red: the output is above the true rate, '
+        'blue: below it.' if has_temperature else 'The error that the model removes.')
 
 
 def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Array,
@@ -299,17 +295,15 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
         axes.set(xlabel='rate [deg/s]', ylabel='error [deg per turn]', ylim=(-limit, limit),
                  title=f'Error of a turn of 360 deg with {words}: '
                  f'largest {np.abs(error).max() / DEGREE:.3g} deg')
-        percent = axes.secondary_yaxis('right', functions=(lambda degrees: degrees / 3.6,
-                                                           lambda percents: percents * 3.6))
+        percent = axes.secondary_yaxis(
+            'right', functions=(lambda degrees: degrees / 3.6, lambda percents: percents * 3.6))
         percent.set_ylabel('error [% of a turn]')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
     return _save_figure(figure, path, 'Greys in order: temperature. A step between the senses: '
-                                      'scale '
-                        'factor error; a curve: nonlinearity; growth towards slow turns: bias or '
-                        'noise. '
-                        f'Hatched: slower than {min_rate / DEGREE:g} deg/s, left out. Scales '
-                        'differ.')
+                        'scale factor error; a curve: nonlinearity; growth towards '
+                        'slow turns: bias or noise. Hatched: slower than '
+                        f'{min_rate / DEGREE:g} deg/s, left out. Scales differ.')
 
 
 def _panels(rows: int, columns: int, inches: tuple[float, float],

@@ -114,11 +114,10 @@ def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
 
     """
     stop = threading.Event()
-    signals = [signal.SIGINT, signal.SIGTERM, *(
-        [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else [])]
-    previous_handlers = ({
-        number: signal.signal(number, lambda *_: stop.set()) for number in signals
-    })
+    signals = [signal.SIGINT, signal.SIGTERM,
+               *([signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else [])]
+    previous_handlers = {number: signal.signal(number, lambda *_: stop.set())
+                         for number in signals}
     timer = threading.Timer(seconds, stop.set) if seconds else None
     if timer is not None:
         timer.daemon = True
@@ -218,8 +217,7 @@ class _Session:
                               'again')
         if not self.samples:
             raise DataRefused(f'no sample was received in {seconds:.1f} '
-                              f's{self._describe_failure()}; '
-                              f'no file was written: {self.remedy}')
+                              f's{self._describe_failure()}; no file was written: {self.remedy}')
         data = {'out': self._given.out, 'samples': self.samples, 'lost': self.lost,
                 'seconds': seconds, **self._answer_data()}
         lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, '
@@ -235,9 +233,8 @@ class _Session:
     def _remarks(self) -> list[str]:
         missed = (sorted(self._recorder.late_columns)
                   if isinstance(self._recorder, CsvRecorder) else [])
-        return ([f'{", ".join(missed)} began after the header of the log was written, and is '
-                 'not in it; record into .mcap instead.']
-                if missed else [])
+        return [f'{", ".join(missed)} began after the header of the log was written, and is '
+                'not in it; record into .mcap instead.'] if missed else []
 
 
 class _PortSession(_Session):
@@ -280,9 +277,8 @@ class _PortSession(_Session):
 
     def _file_notes(self) -> dict[str, str]:
         found, protocol = self._connection, self._connection.protocol
-        return recording_notes(port=self._given.port, device=found.path,
-                               protocol=protocol.name if protocol else '', baud=found.baud,
-                               axis=self._settings.axis,
+        return recording_notes(port=self._given.port, device=found.path, protocol=protocol.name
+                               if protocol else '', baud=found.baud, axis=self._settings.axis,
                                **(self._scale_notes(protocol) if protocol else {}))
 
     def _scale_notes(self, protocol: Protocol) -> dict[str, str]:
@@ -459,9 +455,8 @@ class _TopicSession(_Session):
     def _remarks(self) -> list[str]:
         remarks = [f'{topic}: {reason}; it was not recorded.'
                    for topic, reason in self._unknown_topics.items()]
-        remarks += [
-            f'{wrong}; it was recorded as it is.' for wrong in self._mismatched_topics.values()
-        ]
+        remarks += [f'{wrong}; it was recorded as it is.'
+                    for wrong in self._mismatched_topics.values()]
         if self._damaged_messages:
             remarks.append(f'{self._damaged_messages} messages could not be read.')
         if self._clock_steps.count:

@@ -47,8 +47,9 @@ def _reproduce(given: argparse.Namespace) -> Answer:
         found = {name: SOURCES[name](np.random.default_rng(given.seed),
                                      progress=_make_progress(name, on_progress)) for name in names}
     text = '\n\n'.join(render_page(reproduction) for reproduction in found.values())
-    return Answer([text], {'seed': given.seed, 'sources': {
-        name: reproduction.data() for name, reproduction in found.items()}})
+    return Answer([text],
+                  {'seed': given.seed,
+                   'sources': {name: reproduction.data() for name, reproduction in found.items()}})
 
 
 def _make_progress(name: str, on_progress: Callable[[float | None, str], None]) -> Progress:
@@ -66,13 +67,9 @@ def _make_progress(name: str, on_progress: Callable[[float | None, str], None]) 
 
 def render_page(reproduction: Reproduction) -> str:
     """Return title, assumptions, table and contradictions in Markdown."""
-    parts = [
-        f'## {reproduction.title}',
-        _bullet_list('Assumed:', reproduction.assumed),
-        _table(reproduction.comparisons),
-        _bullet_list('What does not hold:',
-                     [contradiction.sentence for contradiction in reproduction.contradictions])
-    ]
+    parts = [f'## {reproduction.title}', _bullet_list('Assumed:', reproduction.assumed),
+             _table(reproduction.comparisons), _bullet_list('What does not hold:', [
+                 contradiction.sentence for contradiction in reproduction.contradictions])]
     return '\n\n'.join(parts)
 
 

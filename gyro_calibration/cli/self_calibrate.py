@@ -68,8 +68,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
         f'positive; {_NEAREST}: the number nearest to the gyro')
     parser.add_argument('--marking', type=verb.non_negative_number, metavar='DEG',
                         help='standard deviation of the angle between both standstills on the '
-                        'mark, deg; '
-                        f'default: {MARK_DEVIATION / DEGREE:g}')
+                        f'mark, deg; default: {MARK_DEVIATION / DEGREE:g}')
     parser.add_argument('--method', choices=list(METHODS), default='likelihood',
                         help='default: likelihood; the others as published')
     parser.add_argument('--model', metavar='MODEL.yaml', help='model to compensate by first')
@@ -177,8 +176,8 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
 
 def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time, output = verb.require_time(given, log), verb.require_output(given, log)
-    known, rates = (_refuse_implausible(given, model, log),
-                    compensate_log(with_self_calibration(model, None), log))
+    known = _refuse_implausible(given, model, log)
+    rates = compensate_log(with_self_calibration(model, None), log)
     marking = MARK_DEVIATION if given.marking is None else given.marking * DEGREE
     found = calibrate_turns(time[known], rates[known],
                             None if given.turns == _NEAREST else given.turns, noise=model.noise,
@@ -191,11 +190,11 @@ def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -
         'rests_s': list(found.rest_durations),
         'marking_rad': marking
     }
-    return _store_and_answer(given, model, log, found.fit, known, 'turns', data, [
-        f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
-        'standstills '
-        f'of {before:.1f} and {after:.1f} s; standard deviation of the mark '
-        f'{marking / DEGREE:g} deg.'])
+    return _store_and_answer(
+        given, model, log, found.fit, known, 'turns', data,
+        [f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
+         f'standstills of {before:.1f} and {after:.1f} s; standard deviation of the mark '
+         f'{marking / DEGREE:g} deg.'])
 
 
 def _refuse_implausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
@@ -216,17 +215,16 @@ def _reference_errors(given: argparse.Namespace, motion: Motion) -> ReferenceErr
 
 
 def _store_and_answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: ScaleBiasFit,
-                      is_used: Mask, method: str, data: dict[str,
-                                                             Any], lines: list[str]) -> Answer:
+                      is_used: Mask, method: str, data: dict[str, Any],
+                      lines: list[str]) -> Answer:
     """Write the calibration, and return the answer."""
     calibration = make_self_calibration(fit, method, log, is_used)
     if given.out:
         write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
     implausible_count = int(
         np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible_rows(model, log)))
-    remarks = ([f'{implausible_count} rows have an implausible rate or temperature and are not '
-                'used.']
-               if implausible_count else [])
+    remarks = [f'{implausible_count} rows have an implausible rate or temperature and are not '
+               'used.'] if implausible_count else []
     first = f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {is_used.sum()} samples.'
     return Answer([first, *lines, *remarks],
                   {**calibration.to_dict(), 'samples': int(is_used.sum()),

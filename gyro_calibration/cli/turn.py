@@ -75,9 +75,9 @@ def _turn(given: argparse.Namespace) -> Answer:
     verb.require_output(given, log)  # a log with counts only is wrong use, as for other verbs
     found = extract_dwells(log)
     with show_progress('fit of effects, and errors of turns'):
-        rate, is_inlier, remarks, data = (_predict_by_fit(found, given.technology)
-                                          if given.model is None else _predict_by_model(
-                                              given, read_model(given.model), log, found))
+        rate, is_inlier, remarks, data = (
+            _predict_by_fit(found, given.technology) if given.model is None
+            else _predict_by_model(given, read_model(given.model), log, found))
         errors = compute_turn_errors(select_dwells(found, is_inlier), rate[is_inlier],
                                      given.slowest * DEGREE)
     if given.out:
@@ -149,8 +149,8 @@ def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
     steps = DEGREE * np.array([factor * 10.0 ** power
                                for power in range(-3, 5) for factor in (1, 2, 5)])
     # A step just below the fastest turn would make a nearly empty bin.
-    edges = np.concatenate([
-        [slowest], steps[(steps > 1.01 * slowest) & (steps < speed.max() / 1.2)], [speed.max()]])
+    edges = np.concatenate(
+        [[slowest], steps[(steps > 1.01 * slowest) & (steps < speed.max() / 1.2)], [speed.max()]])
     number = _bin_numbers(edges, speed)
     bins = [(-high, -low, (number == place) & (errors.rate < 0.0))
             for place, (low, high) in enumerate(zip(edges, edges[1:]))][::-1]
@@ -183,18 +183,16 @@ def _bin_numbers(edges: Array, values: Array) -> Any:
 def _lines(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> Iterator[str]:
     before, after = summarize_errors(errors.static), summarize_errors(errors.modelled)
     yield (f'Error of a turn of 360 deg: largest {_format_error(before.largest)} with the static '
-           'bias '
-           f'only, {_format_error(after.largest)} with the model, '
-           f'a factor of {_format_ratio(before.largest, after.largest)}; '
-           f'rms {_format_error(before.rms)} and {_format_error(after.rms)}, '
-           f'a factor of {_format_ratio(before.rms, after.rms)}.')
+           f'bias only, {_format_error(after.largest)} with the model, a factor of '
+           f'{_format_ratio(before.largest, after.largest)}; rms {_format_error(before.rms)} and '
+           f'{_format_error(after.rms)}, a factor of {_format_ratio(before.rms, after.rms)}.')
     yield (f'{len(errors)} turns, {given.slowest:g} deg/s and faster, '
            f'of {len(np.unique(errors.sweep))} sweeps in {given.log}.')
     for remark in remarks:
         yield f'{remark[0].upper()}{remark[1:]}.'
-    yield from _table('rate [deg/s]', errors, [
-        (low / DEGREE, high / DEGREE, mask)
-        for low, high, mask in _rate_bins(errors, given.slowest * DEGREE)])
+    yield from _table('rate [deg/s]', errors,
+                      [(low / DEGREE, high / DEGREE, mask)
+                       for low, high, mask in _rate_bins(errors, given.slowest * DEGREE)])
     yield from _table('temperature [degC]', errors, _temperature_bins(errors))
 
 

@@ -85,9 +85,8 @@ def show_progress(activity: str) -> Iterator[Callable[[float | None, str], None]
 @contextmanager
 def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
     """Show a bar of the bytes read of a log, and give the function that updates it."""
-    size = (sum(
-        os.path.getsize(file) for file in list_recording_files(path) if os.path.isfile(file))
-            or None)
+    size = sum(os.path.getsize(file)
+               for file in list_recording_files(path) if os.path.isfile(file)) or None
     with tqdm(total=size, desc=to_printable(path), unit='B', unit_scale=True, delay=PROGRESS_DELAY,
               leave=False, disable=None) as bar:
         yield lambda place: bar.update(place - bar.n)
@@ -239,8 +238,8 @@ def read(given: argparse.Namespace) -> Log:
                            on_progress)
     if given.unwrap and log.reference_heading is not None:
         time = require_time(given, log)
-        log = replace(log, reference_heading=unwrap_heading(
-            time, log.reference_heading, time, require_output(given, log))[0])
+        log = replace(log, reference_heading=unwrap_heading(time, log.reference_heading, time,
+                                                            require_output(given, log))[0])
     return _apply_invert(given, next(_cut_to_range(given, [log])))
 
 

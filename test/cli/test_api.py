@@ -36,17 +36,16 @@ import numpy as np
 import pytest
 
 ROOT = Path(gyro_calibration.__file__).parents[1]
-GYRO = read_model({'effects': {'bias': {'bias': 0.002}, 'scale_factor_error':
-                               {'scale_factor_error': 0.03}},
-                   'noise': {'angle_random_walk': 3e-4}})
+GYRO = read_model(
+    {'effects': {'bias': {'bias': 0.002}, 'scale_factor_error': {'scale_factor_error': 0.03}},
+     'noise': {'angle_random_walk': 3e-4}})
 NOISE = read_model({'effects': {}, 'noise': {'angle_random_walk': 3e-4}})
 
 
 def run_and_rest():
     """Return the log of the built-in motion and of 10 s of rest after it."""
-    return simulate(
-        GYRO, (np.append(CALIBRATION_MOTION.time, 30.0), np.append(CALIBRATION_MOTION.rate, 0.0)),
-        seed=1)
+    return simulate(GYRO, (np.append(CALIBRATION_MOTION.time, 30.0),
+                           np.append(CALIBRATION_MOTION.rate, 0.0)), seed=1)
 
 
 @pytest.fixture(scope='module')

@@ -79,8 +79,8 @@ def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, t
                                compensated.reference_rate, atol=1e-12)
 
 
-def test_compensate_measures_the_error_against_the_reference_from_its_first_row_on(run, model,
-                                                                                   tmp_path):
+def test_compensate_measures_the_error_against_the_reference_from_its_first_row_on(
+        run, model, tmp_path):
     reference = np.arange(200) * 1e-3 + 2.0
     reference[:20], reference[100:] = np.nan, reference[100:] - 0.01
     write_log(tmp_path / 'log.csv', Log(output=np.full(200, 0.1), time=np.arange(200) / 100.0,
@@ -135,8 +135,8 @@ def test_compensate_looks_for_rests(run, tmp_path, words, resting):
                '--out', tmp_path / 'out.csv', *words)[0] == 0
     found = read_log(tmp_path / 'out.csv')
     columns = {name: np.array(values, float) for name, values in found.others.items()}
-    error, deviation = (columns['heading_rad'] - found.reference_heading,
-                        columns['heading_std_rad'][-1])
+    error = columns['heading_rad'] - found.reference_heading
+    deviation = columns['heading_std_rad'][-1]
     assert abs(error[-1]) < 4.0 * deviation and (deviation < 0.03) == resting
     stands = found.reference_rate == 0.0
     assert (columns['resting'][stands].mean() > 0.85 and columns['resting'][~stands].mean() < 0.05
@@ -171,8 +171,7 @@ def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tol
         0.002, rel=tolerance)
 
 
-def test_a_new_model_names_its_log_and_a_given_one_keeps_its_origin(
-        run, log, model, tmp_path):
+def test_a_new_model_names_its_log_and_a_given_one_keeps_its_origin(run, log, model, tmp_path):
     write_log(tmp_path / 'rest.csv',
               Log(output=np.random.default_rng(1).normal(size=2000), time=np.arange(2000) / 100.0))
     for verb, given in (('self-calibrate', log), ('allan', tmp_path / 'rest.csv')):

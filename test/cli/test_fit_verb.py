@@ -77,13 +77,13 @@ def test_the_matrix_is_given_with_a_polynomial_only(run, table):
 
 def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
     # the record player of the blog, an L3G4200D at 70 mdps a count, turned clockwise
-    (tmp_path / 'player.csv'
-     ).write_text('reference_rate_dps,gyro_counts\n0,2.5654\n200,-2854.5\n270,-3857.9\n')
+    (tmp_path / 'player.csv').write_text(
+        'reference_rate_dps,gyro_counts\n0,2.5654\n200,-2854.5\n270,-3857.9\n')
     words = ['fit', tmp_path / 'player.csv', '--sensitivity', '0.07', '--invert', '--json']
     code, text, _ = run(*words)
     effects = strict(text)['effects']
-    assert code == 0 and effects['scale_factor_error']['scale_factor_error'][
-        'estimate'] == pytest.approx(6.65e-4, rel=1e-2)
+    assert code == 0 and effects['scale_factor_error'][
+        'scale_factor_error']['estimate'] == pytest.approx(6.65e-4, rel=1e-2)
     low, high = effects['bias']['bias']['ci95']
     assert low < -2.5654 * 0.07 * DEGREE < high
 
@@ -93,8 +93,8 @@ def test_three_steady_speeds_in_a_log_in_time_give_scale_and_bias(run, tmp_path)
     rate = np.array([0.0, 200.0, 270.0])[(time // 30.0).astype(int)]
     output = 0.5 + 1.02 * rate + 0.1 * generator.standard_normal(len(time))
     rows = [f'{t:.2f},{y:.4f},{w:.1f}' for t, y, w in zip(time, output, rate)]
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,reference_rate_dps\n' + '\n'.join(rows) +
-                                      '\n')
+    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,reference_rate_dps\n' + '\n'.join(rows)
+                                      + '\n')
     code, text, _ = run('fit', tmp_path / 'log.csv', '--json')
     answer = strict(text)
     low, high = answer['effects']['scale_factor_error']['scale_factor_error']['ci95']
@@ -103,11 +103,9 @@ def test_three_steady_speeds_in_a_log_in_time_give_scale_and_bias(run, tmp_path)
 
 def test_tables_in_several_files_are_one_calibration(run, tmp_path):
     generator = np.random.default_rng(3)
-    paths = [
-        write(tmp_path / f'{degc}.csv',
-              Table(sweeps=1, temperatures=(degc, degc)).measure(GyroModel(SINE), generator))
-        for degc in (20.0, 35.0, 50.0)
-    ]
+    paths = [write(tmp_path / f'{degc}.csv',
+                   Table(sweeps=1, temperatures=(degc, degc)).measure(GyroModel(SINE), generator))
+             for degc in (20.0, 35.0, 50.0)]
     code, text, _ = run('fit', *paths, '--json')
     answer = strict(text)
     assert code == 0 and answer['sweeps'] == 3 and 'scale_factor_temperature' in answer['effects']

@@ -108,8 +108,7 @@ def test_what_is_no_file_is_not_read(read, error, name, kind, tmp_path):
 @each_kind
 def test_what_is_no_file_is_neither_replaced_nor_removed_as_a_leftover(kind, folder, run):
     words = ['compensate', folder / 'log.csv', '--model', folder / 'model.yaml', '--out']
-    for name in ('.out.csv.abcd1234', '.calibration.yaml.abcd1234', 'there.csv',
-                 'calibration.yaml'):
+    for name in '.out.csv.abcd1234', '.calibration.yaml.abcd1234', 'there.csv', 'calibration.yaml':
         KINDS[kind](folder / name)
     before = {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()}
     assert run(*words, folder / 'out.csv')[0] == 0
@@ -149,8 +148,7 @@ def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, 
     (folder / 'circle.csv').symlink_to(folder / 'circle.csv')
     deny(monkeypatch, folder / 'closed')
     path = folder / path
-    for read, error in ((read_log, LogError), (read_model, ModelError),
-                        (read_motion, MotionError)):
+    for read, error in (read_log, LogError), (read_model, ModelError), (read_motion, MotionError):
         with pytest.raises(error) as raised:
             read(path)
         assert re.search(words, str(raised.value)) or 'closed' in str(path)
@@ -257,15 +255,13 @@ def test_nothing_that_a_terminal_obeys_is_printed(folder, run):
     name = folder / f'a{ESCAPES}b.csv'
     name.write_bytes((folder / 'log.csv').read_bytes())
     model, out = folder / 'model.yaml', folder / f'o{ESCAPES}.csv'
-    tries = [
-        ('compensate', name, '--model', model, '--out', out),
-        ('compensate', name, '--model', model, '--out', out, '--json'),
-        ('compensate', f'{name}2', '--model', model, '--out', out),
-        ('compensate', folder / 'log.csv', '--model', f'{model}{ESCAPES}', '--out', out),
-        ('compensate', name, f'--{ESCAPES}'),
-        ('simulate', '--motion', ESCAPES, '--model', model, '--out', out),
-        ('allan', name), ('diagnose', name, '--out', folder / 'd'),
-        ('fit', name, '--out', folder / 'm.yaml')]
+    tries = [('compensate', name, '--model', model, '--out', out),
+             ('compensate', name, '--model', model, '--out', out, '--json'),
+             ('compensate', f'{name}2', '--model', model, '--out', out),
+             ('compensate', folder / 'log.csv', '--model', f'{model}{ESCAPES}', '--out', out),
+             ('compensate', name, f'--{ESCAPES}'),
+             ('simulate', '--motion', ESCAPES, '--model', model, '--out', out), ('allan', name),
+             ('diagnose', name, '--out', folder / 'd'), ('fit', name, '--out', folder / 'm.yaml')]
     for text in (f'time_s,gyro_dps{ESCAPES}\n0,1\n', f'time_s,gyro_dps\n0,{ESCAPES}\n1,1\n',
                  f'{ESCAPES},gyro_dps,gyro_rad_s\n0,1,2\n'):
         path = folder / f'{len(tries)}.csv'
@@ -346,10 +342,9 @@ def test_equal_names_of_columns_take_no_longer_than_others(count, tmp_path):
 
 def mcap(content, compression, times):
     """Return an MCAP file of so many equal chunks."""
-    compress = {
-        'zstd': lambda data:
-            pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
-        'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
+    compress = {'zstd': lambda data:
+                pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
+                'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
     return MCAP + channel(1, '/imu', IMU) + times * chunk(
         compress(content), compression, len(content))
 
@@ -468,32 +463,29 @@ def odd_log(name):
         return ODD[name]
     value = ODD[name].partition(b',')[2].decode()
     step = {'fast': 1e-9, 'slow': 1e17}.get(name, 0.01)
-    rows = [(f'{row * step!r}', '1e19' if name == 'one huge' and row == 300
-             else '1' if name == 'half nan' and row % 2 else value, row % 60)
-            for row in range(600)]
+    rows = [(f'{row * step!r}', '1e19' if name == 'one huge' and row == 300 else '1'
+             if name == 'half nan' and row % 2 else value, row % 60) for row in range(600)]
     columns = 'time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc'
     return '\n'.join([columns,
                       *(f'{time},{rate},{rate},{warm}' for time, rate, warm in rows), '']).encode()
 
 
-VERBS = {
-    'compensate': 'compensate {log} --model {model} --out {out}',
-    'rest': 'compensate {log} --model {model} --out {out} --rest',
-    'hindsight': 'compensate {log} --model {model} --out {out} --hindsight',
-    'counts': 'compensate {log} --model {model} --out {out} --sensitivity 1e19',
-    'rate': 'compensate {log} --model {model} --out {out} --rate 1e-19',
-    'threshold': 'compensate {log} --model {model} --out {out} --threshold 0',
-    'fit': 'fit {log} --out {out}', 'polynomial': 'fit {log} --polynomial',
-    **{f'fit by {name}': f'fit {{log}} --method {name}'
-       for name in ('dwells', 'likelihood', 'rate')},
-    'allan': 'allan {log} --out {out}', 'self-calibrate': 'self-calibrate {log} --out {out}',
-    'profile': 'self-calibrate {log} --profile {log} --out {out}',
-    'turns': 'self-calibrate {log} --turns nearest --out {out}',
-    'turn': 'turn {log} --model {model}', 'plan': 'plan --limits {log}',
-    'simulate': 'simulate --motion {log} --model {model} --out {out}',
-    'diagnose': 'diagnose {log} --out {folder}',
-    'as a model': 'compensate {log} --model {log} --out {out}',
-}
+VERBS = {'compensate': 'compensate {log} --model {model} --out {out}',
+         'rest': 'compensate {log} --model {model} --out {out} --rest',
+         'hindsight': 'compensate {log} --model {model} --out {out} --hindsight',
+         'counts': 'compensate {log} --model {model} --out {out} --sensitivity 1e19',
+         'rate': 'compensate {log} --model {model} --out {out} --rate 1e-19',
+         'threshold': 'compensate {log} --model {model} --out {out} --threshold 0',
+         'fit': 'fit {log} --out {out}', 'polynomial': 'fit {log} --polynomial',
+         **{f'fit by {name}': f'fit {{log}} --method {name}'
+            for name in ('dwells', 'likelihood', 'rate')},
+         'allan': 'allan {log} --out {out}', 'self-calibrate': 'self-calibrate {log} --out {out}',
+         'profile': 'self-calibrate {log} --profile {log} --out {out}',
+         'turns': 'self-calibrate {log} --turns nearest --out {out}',
+         'turn': 'turn {log} --model {model}', 'plan': 'plan --limits {log}',
+         'simulate': 'simulate --motion {log} --model {model} --out {out}',
+         'diagnose': 'diagnose {log} --out {folder}',
+         'as a model': 'compensate {log} --model {log} --out {out}'}
 
 
 def no_constant(name):

@@ -73,17 +73,15 @@ def fitted(fit):
 
 def draw_turns(path, fit):
     kept = fit.scatter.inliers
-    return draw_turn_errors(
-        path,
-        compute_turn_errors(select_dwells(fit.dwells, kept),
-                            predict_left_out_rates(fit)[kept]), MIN_TURN_RATE)
+    return draw_turn_errors(path, compute_turn_errors(select_dwells(fit.dwells, kept),
+                                                      predict_left_out_rates(fit)[kept]),
+                            MIN_TURN_RATE)
 
 
 def draw_drive(path):
     time = np.linspace(0.0, 10.0, 50)
-    return draw_headings(path, time, np.sin(time), {
-        'pure integration': np.sin(time) + 0.01 * time,
-        'compensated': np.sin(time) + 0.001 * time})
+    return draw_headings(path, time, np.sin(time), {'pure integration': np.sin(time) + 0.01 * time,
+                                                    'compensated': np.sin(time) + 0.001 * time})
 
 
 def draw_encoder(path):
@@ -100,16 +98,14 @@ def draw_calibration_run(path):
 IN_GREY = {'turns': lambda path: draw_turns(path, warm()),
            'turns without temperature': lambda path: draw_turns(path, without_temperature())}
 PICTURES = {
-    **IN_GREY,
-    'surface': lambda path: draw_surface(path, warm(), fitted(warm())),
+    **IN_GREY, 'surface': lambda path: draw_surface(path, warm(), fitted(warm())),
     'surface without dwells': lambda path: draw_surface(path, warm()),
-    'surface without temperature': lambda path: draw_surface(
-        path, without_temperature(), fitted(without_temperature())),
+    'surface without temperature': lambda path: draw_surface(path, without_temperature(),
+                                                             fitted(without_temperature())),
     'residuals': lambda path: draw_residuals(path, warm()),
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
     'headings': draw_drive, 'encoder': draw_encoder, 'run': draw_calibration_run,
-    'motion': lambda path: draw_motion(path, CALIBRATION_MOTION, 1.0),
-}
+    'motion': lambda path: draw_motion(path, CALIBRATION_MOTION, 1.0)}
 each_picture = pytest.mark.parametrize('draw', PICTURES.values(), ids=PICTURES)
 
 

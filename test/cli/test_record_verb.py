@@ -172,8 +172,7 @@ def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
         notes, before = read(tmp_path / 'a.csv').notes, (tmp_path / 'a.csv').read_bytes()
         assert 'inverted: no' in notes and not any('sensitivity' in note for note in notes)
         code, _, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
-    assert (code == 2 and 'exists already' in error
-            and (tmp_path / 'a.csv').read_bytes() == before)
+    assert code == 2 and 'exists already' in error and (tmp_path / 'a.csv').read_bytes() == before
 
 
 @pytest.mark.parametrize(('words', 'sentence'), [
@@ -364,8 +363,8 @@ class Robot:
         """Publish one sample on all topics."""
         for topic, publisher in self._publishers.items():
             message = self.kinds[topic]()
-            message.header.stamp.sec, message.header.stamp.nanosec = (
-                1_700_000_000 + int(time), round(time % 1.0 * 1e9))
+            message.header.stamp.sec = 1_700_000_000 + int(time)
+            message.header.stamp.nanosec = round(time % 1.0 * 1e9)
             message.header.frame_id = 'gyro'
             if topic == 'imu/data_raw':
                 message.angular_velocity.z, message.linear_acceleration_covariance[0] = rate, -1.0
@@ -373,8 +372,8 @@ class Robot:
                 message.temperature = 25.0 + 0.01 * time
             else:
                 pose = message.pose.pose if topic == 'odom' else message.pose
-                pose.orientation.z, pose.orientation.w = (math.sin(heading / 2.0),
-                                                          math.cos(heading / 2.0))
+                pose.orientation.z = math.sin(heading / 2.0)
+                pose.orientation.w = math.cos(heading / 2.0)
             if topic == 'odom':
                 message.twist.twist.angular.z = rate
             publisher.publish(message)
@@ -396,8 +395,7 @@ def reliable(**how):
     return QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, **how)
 
 
-def test_a_log_and_a_recording_of_the_same_topics_hold_the_same(
-        ros, record, wait_until, tmp_path):
+def test_a_log_and_a_recording_of_the_same_topics_hold_the_same(ros, record, wait_until, tmp_path):
     robot = Robot(ros)
     robot.offer('imu/data_raw', 'imu/temperature', 'odom')
     both = [record('record', '--reference-topic', 'odom', '--out', tmp_path / name, '--json')
