@@ -96,8 +96,7 @@ class _Block:
         if previous is not None:
             self._lag_states, begin = previous.end_states(), previous._end_time
             self._last_values = previous._last_values | {
-                name: _edge_value(signal, -1) for name, signal in previous._signals.items()
-            }
+                name: _edge_value(signal, -1) for name, signal in previous._signals.items()}
         self._end_states: LagStates = {}
         self._interval = _differences(time, begin)
 

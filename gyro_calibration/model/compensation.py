@@ -86,9 +86,9 @@ def _compensate_sample(model: GyroModel, output: float, temperature: float,
         model.extrapolation_range, model.rate_range, model.rate_limit)
     used, seen = min(max(temperature, low), high), min(max(output, -limit), limit)
     coldest, hottest = model.valid_temperatures
-    modelled, unexplained = model.rate_from_channels(
-        Channels.instantaneous(seen, seen, used) if environment is
-        None else environment.with_rate(seen, seen))
+    modelled, unexplained = model.rate_from_channels(Channels.instantaneous(seen, seen, used)
+                                                     if environment is None
+                                                     else environment.with_rate(seen, seen))
     if not -_MAX_COMPUTABLE_RATE < modelled < _MAX_COMPUTABLE_RATE:
         modelled, unexplained = seen, True
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
@@ -106,15 +106,15 @@ def _compensate_array(model: GyroModel, output: Array, temperature: Number,
     # no masks are made where the extremes show that all samples are inside
     beyond = _mask_outside(output, max(slowest, -limit), min(fastest, limit))
     seen = output if beyond is False else np.clip(output, -limit, limit)
-    clipped, used, plausible = (_mask_outside(temperature,
-                                              *model.valid_temperatures), temperature, temperature)
+    clipped, used, plausible = (_mask_outside(temperature, *model.valid_temperatures), temperature,
+                                temperature)
     if clipped is not False:
         used, plausible = (clip(temperature, *ends)
                            for ends in (model.extrapolation_range, model.temperature_limits))
     with np.errstate(all='ignore'):
         modelled, unexplained = model.rate_from_channels(
-            Channels(seen, seen, used) if environment is
-            None else environment.with_rate(seen, seen))
+            Channels(seen, seen, used) if environment is None
+            else environment.with_rate(seen, seen))
         if not -_MAX_COMPUTABLE_RATE < modelled.sum() < _MAX_COMPUTABLE_RATE:
             # the model overflows there: these samples are not corrected
             computed = abs(modelled) < _MAX_COMPUTABLE_RATE
@@ -142,9 +142,8 @@ def _compensate_blocks(model: GyroModel, output: Array, temperature: Number) -> 
     rate = modelled if model.self_calibration is None else np.empty(len(output))
     for begin in range(0, len(output), CACHE_BLOCK_SAMPLES):
         block = slice(begin, begin + CACHE_BLOCK_SAMPLES)
-        part = _compensate_array(
-            model, output[block],
-            temperature[block] if isinstance(temperature, np.ndarray) else temperature)
+        part = _compensate_array(model, output[block], temperature[block]
+                                 if isinstance(temperature, np.ndarray) else temperature)
         modelled[block] = part.model_rate
         if part.temperature_clipped is not False:
             clipped[block] = part.temperature_clipped

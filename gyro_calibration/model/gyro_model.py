@@ -235,8 +235,8 @@ class GyroModel:
         """Return the plausible temperatures, degC: at least -100 to 200, and 3 times the range."""
         low, high = self.valid_temperatures
         reach = high - low if math.isfinite(sum(map(abs, self.temperature_range))) else 0.0
-        return (min(low - reach,
-                    _PLAUSIBLE_TEMPERATURES[0]), max(high + reach, _PLAUSIBLE_TEMPERATURES[1]))
+        return (min(low - reach, _PLAUSIBLE_TEMPERATURES[0]),
+                max(high + reach, _PLAUSIBLE_TEMPERATURES[1]))
 
     @cached_property
     def valid_temperatures(self) -> tuple[float, float]:
@@ -359,9 +359,9 @@ class GyroModel:
         """Return the output, rad/s, without noise, at the rate and surroundings of channels."""
         rate, (independent, dependent) = channels.rate, self._split_by_output
         given = rate + _sum_errors(independent, channels)
-        return (_iterate_secant(
+        return _iterate_secant(
             lambda output: given + _sum_errors(dependent, channels.with_rate(rate, output)),
-            rate)[0] if dependent else given)
+            rate)[0] if dependent else given
 
     def rate(self, output: Number, temperature: Number) -> Number:
         """
@@ -484,8 +484,8 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
     with np.errstate(all='ignore') if many else _NO_ERROR_STATE:
         # a single sample may leave the domain by at most 1 rad/s during the iteration
         rate, step = _iterate_secant(lambda x: output - error_at(x), start, low - 1.0, high + 1.0)
-        solved = ((low <= rate) & (rate <= high) & (abs(step) <= _STEP_TOLERANCE *
-                                                    (1.0 + abs(rate))))
+        solved = ((low <= rate) & (rate <= high)
+                  & (abs(step) <= _STEP_TOLERANCE * (1.0 + abs(rate))))
     if solved.all() if many else solved:
         return rate, False
     with np.errstate(all='ignore'):

@@ -101,16 +101,16 @@ def _parse_content(content: Any) -> GyroModel:
         return validate(name, top.get(name, {}), schema)
 
     return GyroModel(
-        terms, None if top.get('covariance') is None else _parse_covariance(
-            'covariance', top['covariance'], size), _parse_range('valid.rate', valid.get('rate')),
-        temperature_range,
+        terms, None if top.get('covariance') is None
+        else _parse_covariance('covariance', top['covariance'], size),
+        _parse_range('valid.rate', valid.get('rate')), temperature_range,
         parse_number('reference_temperature', top.get('reference_temperature', middle)),
-        Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_noise_figure))), {
-            name: parse_text(f'gyro.{name}', value)
-            for name, value in parse_section('gyro', None).items()
-        }, parse_section('origin', None), _parse_self_calibration(top.get('self_calibration')),
-        Tolerance(**parse_section(
-            'tolerance', dict.fromkeys(Tolerance.__dataclass_fields__, _parse_nonnegative))),
+        Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_noise_figure))),
+        {name: parse_text(f'gyro.{name}', value)
+         for name, value in parse_section('gyro', None).items()},
+        parse_section('origin', None), _parse_self_calibration(top.get('self_calibration')),
+        Tolerance(**parse_section('tolerance', dict.fromkeys(Tolerance.__dataclass_fields__,
+                                                             _parse_nonnegative))),
         parse_section('noise_bounds', dict.fromkeys(_NOISE_NAMES, _parse_range)))
 
 
@@ -209,16 +209,10 @@ def _parse_polynomial_matrix(key_path: str, rows: Any) -> tuple[Effect, tuple[fl
 
 _SELF_CALIBRATION_SCHEMA = {
     'scale_factor_error': lambda place, value: parse_number(place, value, low=-0.9),
-    'bias': parse_number,
-    'covariance': _parse_covariance,
-    'standard_deviations': {
-        'scale_factor_error': _parse_nonnegative,
-        'bias': _parse_nonnegative
-    },
-    'time': parse_text,
-    'temperature': lambda place, value: value if value is None else parse_number(place, value),
-    'method': parse_text
-}
+    'bias': parse_number, 'covariance': _parse_covariance,
+    'standard_deviations': {'scale_factor_error': _parse_nonnegative, 'bias': _parse_nonnegative},
+    'time': parse_text, 'temperature': lambda place, value: value if value is None
+    else parse_number(place, value), 'method': parse_text}
 
 
 def _parse_self_calibration(value: Any) -> SelfCalibration | None:
@@ -226,10 +220,8 @@ def _parse_self_calibration(value: Any) -> SelfCalibration | None:
     if value is None:
         return None
     place, needed = 'self_calibration', {'scale_factor_error': None, 'bias': None}
-    run = validate(place, {
-        **needed,
-        **value
-    } if isinstance(value, dict) else value, _SELF_CALIBRATION_SCHEMA)
+    run = validate(place, {**needed, **value} if isinstance(value, dict) else value,
+                   _SELF_CALIBRATION_SCHEMA)
     deviations, matrix = run.pop('standard_deviations', None), run.pop('covariance', None)
     if matrix is None and deviations is not None:
         place = f'{place}.standard_deviations'
@@ -254,8 +246,8 @@ def format_model(model: GyroModel) -> str:
     content: dict[str, Any] = {'format': FORMAT, 'version': VERSION}
     content['effects'] = effects = dict[str, Any]()
     for term in model.terms:
-        named: dict[str, Any] = {parameter.name: value for parameter, value in zip(
-            term.effect.parameters, term.values)}
+        named: dict[str, Any] = {parameter.name: value
+                                 for parameter, value in zip(term.effect.parameters, term.values)}
         if term.effect.name == POLYNOMIAL:
             temperature_order, rate_order = map(
                 int, term.effect.coefficients[-1].name[1:].split('w'))
@@ -264,8 +256,8 @@ def format_model(model: GyroModel) -> str:
     if model.covariance is not None:
         content['covariance'] = model.covariance.tolist()
     ranges = {'rate': model.rate_range, 'temperature': model.temperature_range}
-    content['valid'] = {name: list(values) for name, values in ranges.items()
-                        if all(map(math.isfinite, values))}
+    content['valid'] = {name: list(values)
+                        for name, values in ranges.items() if all(map(math.isfinite, values))}
     content['reference_temperature'] = model.reference_temperature
     content['noise'] = dict(vars(model.noise))
     if model.noise_bounds:

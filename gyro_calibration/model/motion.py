@@ -179,8 +179,8 @@ def read_motion(path: str | Path) -> Motion:
         header = [name.strip() for name in next(rows, [])]
         name = _find_motion_column(path, header)
         columns = {each: header.index(each) for each in ('time_s', name)}
-        time, values = (np.fromiter(_read_numbers(path, rows, columns),
-                                    dtype=float).reshape(-1, 2).T)
+        time, values = (
+            np.fromiter(_read_numbers(path, rows, columns), dtype=float).reshape(-1, 2).T)
     except MotionError:
         raise
     except (OSError, ValueError, csv.Error) as error:
@@ -190,8 +190,8 @@ def read_motion(path: str | Path) -> Motion:
     time, values = time[known], values[known] * _COLUMN_UNITS[name]
     if len(time) < 2 or not (np.diff(time) >= MIN_SAMPLE_INTERVAL).all():
         raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
-    return (motion_from_rates(time, values) if 'rate' in name else motion_from_headings(
-        time, values))
+    return (motion_from_rates(time, values) if 'rate' in name
+            else motion_from_headings(time, values))
 
 
 def _find_motion_column(path: str | Path, header: list[str]) -> str:

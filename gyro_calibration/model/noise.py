@@ -93,15 +93,14 @@ class Noise:
         The bias is estimated as its mean over the `CALIBRATED` s before.
 
         """
-        variance = (self.rate_random_walk ** 2 *
-                    (duration ** 3 + BIAS_AVERAGING_TIME * duration ** 2) / 3.0)
+        variance = (self.rate_random_walk ** 2
+                    * (duration ** 3 + BIAS_AVERAGING_TIME * duration ** 2) / 3.0)
         constants, of_each = self.flicker_processes()
         for constant in constants:
             within, shared = averaged_process_moments(constant)
             decayed = constant * (1.0 - np.exp(-duration / constant))
-            variance = variance + of_each * (2.0 * constant * (duration - decayed)
-                                             + duration ** 2 * within
-                                             - 2.0 * duration * decayed * shared)
+            variance = variance + of_each * (2.0 * constant * (duration - decayed) + duration ** 2
+                                             * within - 2.0 * duration * decayed * shared)
         return variance
 
     def heading_variance(self, duration: Number) -> Number:
@@ -162,8 +161,7 @@ class GaussMarkov:
         """Return the covariance of the angle, rad², as `Part.covariance` does."""
         ratio = np.abs(np.asarray(time, dtype=float)) / self.correlation_time
         # a series where ratio - 1 + exp(-ratio) would lose all digits
-        growth = np.where(ratio < 1e-4, ratio ** 2 * (0.5 - ratio / 6.0),
-                          ratio + np.expm1(-ratio))
+        growth = np.where(ratio < 1e-4, ratio ** 2 * (0.5 - ratio / 6.0), ratio + np.expm1(-ratio))
         return -(self.standard_deviation * self.correlation_time) ** 2 * growth
 
 

@@ -96,9 +96,8 @@ def validate(key_path: str, value: Any, schema: Any) -> Any:
     if schema is None:
         return value
     refuse_unknown_names(key_path, value, schema)
-    return ({
-        name: validate(f'{key_path}.{name}', each, schema[name]) for name, each in value.items()
-    })
+    return {name: validate(f'{key_path}.{name}', each, schema[name])
+            for name, each in value.items()}
 
 
 def refuse_unknown_names(key_path: str, given: Mapping[str, Any],
@@ -112,8 +111,7 @@ def refuse_unknown_names(key_path: str, given: Mapping[str, Any],
 def parse_number(key_path: str, value: Any, low: float = -MAX_MAGNITUDE,
                  high: float = MAX_MAGNITUDE) -> float:
     """Return a finite number within bounds, or raise `InvalidValue`."""
-    if (isinstance(value, bool) or not isinstance(value, (int, float))
-            or not low <= value <= high):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         least = '' if low == -MAX_MAGNITUDE else f' of at least {low:g}'
         wanted = (f'a finite number{least}' if high == MAX_MAGNITUDE
                   else f'a number from {low:g} to {high:g}')

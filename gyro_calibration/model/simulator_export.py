@@ -152,12 +152,12 @@ def _format_sdf(parameters: SimulatorParameters) -> tuple[str, set[str]]:
 
 def _format_isaac(parameters: SimulatorParameters) -> tuple[str, set[str]]:
     """Return the noise of an observation term of Isaac Lab, which draws the bias at each reset."""
-    return '\n'.join([
-        'from isaaclab.utils.noise import GaussianNoiseCfg, NoiseModelWithAdditiveBiasCfg', '',
-        'GYRO_NOISE = NoiseModelWithAdditiveBiasCfg(',
-        f'    noise_cfg=GaussianNoiseCfg(mean=0.0, std={parameters.white_noise:.9g}),',
-        f'    bias_noise_cfg=GaussianNoiseCfg(mean={parameters.bias:.9g}, '
-        f'std={parameters.bias_deviation:.9g}),', ')']), {'bias', 'angle_random_walk'}
+    return '\n'.join(
+        ['from isaaclab.utils.noise import GaussianNoiseCfg, NoiseModelWithAdditiveBiasCfg', '',
+         'GYRO_NOISE = NoiseModelWithAdditiveBiasCfg(',
+         f'    noise_cfg=GaussianNoiseCfg(mean=0.0, std={parameters.white_noise:.9g}),',
+         f'    bias_noise_cfg=GaussianNoiseCfg(mean={parameters.bias:.9g}, '
+         f'std={parameters.bias_deviation:.9g}),', ')']), {'bias', 'angle_random_walk'}
 
 
 def _format_mujoco(parameters: SimulatorParameters) -> tuple[str, set[str]]:
@@ -207,8 +207,8 @@ def export_model(parameters: SimulatorParameters, model: GyroModel,
         found['scale_factor_error'] = f'{run.scale_factor_error:.6g} by the self-calibration'
     if parameters.bias:
         found['bias'] = f'{parameters.bias:.6g} rad/s at rest'
-    found |= {name: f'{getattr(noise, name):.6g} {unit}' for name, unit in _NOISE_UNITS.items()
-              if getattr(noise, name)}
+    found |= {name: f'{getattr(noise, name):.6g} {unit}'
+              for name, unit in _NOISE_UNITS.items() if getattr(noise, name)}
     left_out = [f'{name}: {value}' for name, value in found.items() if name not in names]
     if simulator == 'mujoco' and parameters.white_noise:
         left_out.append('angle_random_walk: stored as noise; MuJoCo 3.1.4 and later add none')

@@ -45,9 +45,8 @@ def ramp_response(time, time_constant):
 @pytest.mark.parametrize('time', [np.arange(2000) * 0.1, UNEVEN - UNEVEN[0]],
                          ids=['even', 'uneven'])
 def test_a_ramp_is_answered_exactly_whatever_the_stamps(time, time_constant):
-    lagged = channels_from_log(Log(output=time, time=time + 7.0,
-                                   temperature=20.0 + 0.5 * time)).lagged(
-                                       'temperature', time_constant)
+    lagged = channels_from_log(Log(output=time, time=time + 7.0, temperature=20.0
+                                   + 0.5 * time)).lagged('temperature', time_constant)
     assert lagged == pytest.approx(20.0 + 0.5 * ramp_response(time, time_constant),
                                    rel=0.0, abs=1e-10)
 
@@ -73,8 +72,8 @@ def test_a_lag_starts_in_the_first_value_and_a_constant_stays():
 def test_vibration_is_the_mean_square_about_the_mean():
     time = np.arange(0.0, 3000.0, 0.01)
     force = 9.81 + 0.3 * np.random.default_rng(2).standard_normal(len(time))
-    vibration = channels_from_log(Log(output=time, time=time,
-                                      specific_force=force)).lagged('vibration', 1.0)[1000:]
+    vibration = channels_from_log(Log(output=time, time=time, specific_force=force)).lagged(
+        'vibration', 1.0)[1000:]
     kept = 1.0 - 0.01 / 2.0  # of a white deviation; the mean over 1 s takes the rest
     assert vibration.mean() == pytest.approx(0.09 * kept, rel=0.01)
 
@@ -84,8 +83,8 @@ def test_the_branch_turns_soon_after_the_temperature_does_and_not_by_noise(noise
     time = np.arange(0.0, 1800.0, 0.05)
     turned = np.abs((time / 300.0) % 2.0 - 1.0)
     temperature = 40.0 - 6.0 * turned + noise * np.random.default_rng(3).standard_normal(len(time))
-    branch = channels_from_log(Log(output=time, time=time,
-                                   temperature=temperature)).heating(10.0, 1e-3)
+    branch = channels_from_log(Log(output=time, time=time, temperature=temperature)).heating(
+        10.0, 1e-3)
     settled = (time % 300.0) > 20.0
     assert branch[settled].tolist() == np.where((time // 300.0) % 2.0, -1.0, 1.0)[settled].tolist()
 

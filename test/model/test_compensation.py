@@ -137,8 +137,8 @@ def with_values(model, change):
 @pytest.mark.parametrize('name', UNCERTAIN)
 def test_the_sensitivity_is_the_derivative_of_the_rate(name, calibration):
     model, step = replace(UNCERTAIN[name], self_calibration=calibration), 1e-6
-    rate, temperature = (np.array([-1.4, -0.3, 0.0, 0.7, 1.5]),
-                         np.array([22.0, 24.0, 25.0, 30.0, 31.0]))
+    rate = np.array([-1.4, -0.3, 0.0, 0.7, 1.5])
+    temperature = np.array([22.0, 24.0, 25.0, 30.0, 31.0])
     output = model.output(rate, temperature)
     base = compensate(model, output, temperature).rate
     differences = [(compensate(with_values(model, row), output, temperature).rate - base) / step
@@ -205,8 +205,7 @@ def test_the_standard_deviation_grows_outside_of_what_was_calibrated():
     assert faster[1] ** 2 - faster[0] ** 2 > 0.9 * 0.003 ** 2
     # a self-calibration finds bias and scale factor of this run, at its temperature
     known = replace(TOLERANT, self_calibration=replace(CALIBRATION, temperature=55.0))
-    assert deviation(known, 0.0, 55.0) == deviation(known, 0.0, 25.0) < deviation(
-        known, 0.0, 60.0)
+    assert deviation(known, 0.0, 55.0) == deviation(known, 0.0, 25.0) < deviation(known, 0.0, 60.0)
 
 
 def test_the_covariance_has_the_order_of_the_sensitivity():

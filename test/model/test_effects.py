@@ -109,20 +109,19 @@ def test_a_simulated_gyro_is_compensated_to_the_true_rate_as_a_log_and_sample_by
 
 def distorted(name, *values, rate_of=lambda time: np.sin(1.7 * time), generator=None):
     """Return model, time, true rate and output of a gyro with one effect, at 1 kHz over 10 s."""
-    model, time = (GyroModel((Term(CATALOGUE[name], values),), noise=Noise(1e-4)),
-                   np.arange(0.0, 10.0, 1e-3))
+    model = GyroModel((Term(CATALOGUE[name], values),), noise=Noise(1e-4))
+    time = np.arange(0.0, 10.0, 1e-3)
     rate = rate_of(time)
     return model, time, rate, simulate_gyro_output(
-        model, time,
-        ChannelHistory().update(time).with_rate(rate, rate), generator)
+        model, time, ChannelHistory().update(time).with_rate(rate, rate), generator)
 
 
-@pytest.mark.parametrize('values', [
-    {'time_offset': 0.02}, {'time_offset': -0.013}, {'clock_rate': 0.01},
-    {'time_offset': 0.5, 'clock_rate': 0.05}, {'clock_rate': 0.05, 'time_offset': 0.5}], ids=str)
+@pytest.mark.parametrize('values', [{'time_offset': 0.02}, {'time_offset': -0.013},
+                                    {'clock_rate': 0.01}, {'time_offset': 0.5, 'clock_rate': 0.05},
+                                    {'clock_rate': 0.05, 'time_offset': 0.5}], ids=str)
 def test_moving_the_stamps_undoes_a_delay_and_a_wrong_clock_in_the_order_of_the_model(values):
-    model, time = (GyroModel(tuple(Term(CATALOGUE[name], (value,))
-                                   for name, value in values.items())), np.arange(0.0, 10.0, 1e-3))
+    model = GyroModel(tuple(Term(CATALOGUE[name], (value,)) for name, value in values.items()))
+    time = np.arange(0.0, 10.0, 1e-3)
     output = model.distort('rate', np.sin(1.7 * time), time)
     assert np.abs(output - np.sin(1.7 * time)).max() > 0.01
     inside = (time > 1.0) & (time < 8.0)
@@ -152,8 +151,8 @@ def test_saturation_and_quantization_come_after_the_noise():
 def test_what_cannot_be_undone_is_passed_over():
     for name, effect in CATALOGUE.items():
         if effect.not_compensated:
-            model, _, _, output = distorted(name, *(
-                0.01 if each.default is None else each.default for each in effect.parameters))
+            model, _, _, output = distorted(name, *(0.01 if each.default is None else each.default
+                                                    for each in effect.parameters))
             assert model.rate(output, 25.0).tolist() == output.tolist(), name
             uncertain = replace(model, covariance=np.eye(1))
             assert not rate_sensitivity(uncertain, output, output, 25.0).any(), name
@@ -178,10 +177,8 @@ def test_an_effect_depends_on_no_other_channels_than_it_names():
     other = dict.fromkeys(base, 1.7) | {'lagged': lambda channel, time_constant: 3.0,
                                         'heating': lambda filter_time, threshold: -1.0}
     for effect in effects:
-        shapes = [
-            shape.default if shape.default is not None else 0.5
-            for shape in effect.nonlinear_parameters
-        ]
+        shapes = [shape.default if shape.default is not None else 0.5
+                  for shape in effect.nonlinear_parameters]
         for channel in base:
             here, there = (
                 np.array(effect.columns(Channels(**(base | {channel: of[channel]})), *shapes))
@@ -222,9 +219,9 @@ def test_a_centred_and_scaled_polynomial_is_written_out_as_eq_11():
         assert eq_12(matrix, output, degc) == pytest.approx(error / DEGREE, abs=1e-9)
 
 
-@pytest.mark.parametrize('matrix', [
-    [], [[]], 'abc', None, [[1, 2], [3]], [[math.nan]], [[math.inf, 1]], [1, 2], [[[1]]], [['a']],
-    [[10 ** 400]], [[1e308, 0, 0, 0]], {}])
+@pytest.mark.parametrize('matrix',
+                         [[], [[]], 'abc', None, [[1, 2], [3]], [[math.nan]], [[math.inf, 1]],
+                          [1, 2], [[[1]]], [['a']], [[10 ** 400]], [[1e308, 0, 0, 0]], {}])
 def test_what_is_no_matrix_of_eq_11_is_refused(matrix):
     with pytest.raises(ValueError, match='rows of finite numbers'):
         polynomial_from_matrix(matrix)

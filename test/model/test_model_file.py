@@ -34,8 +34,7 @@ FULL = GyroModel(TERMS, np.diag(np.arange(1.0, 8.0)) * 1e-8, (-1.7, 1.7), (20.0,
                  {'files': ['a.csv'], 'date': '2024-05-01'},
                  SelfCalibration(0.0373, 2e-4, ((1e-8, 1e-10), (1e-10, 4e-8)),
                                  '2024-05-01T10:00:00+00:00', 31.5, 'likelihood'),
-                 Tolerance(1e-5, 2e-4, 3e-5, 1e-4, 4e-3),
-                 {'bias_instability': (7e-5, 1.1e-4)})
+                 Tolerance(1e-5, 2e-4, 3e-5, 1e-4, 4e-3), {'bias_instability': (7e-5, 1.1e-4)})
 
 
 def read(folder, text):
@@ -155,9 +154,9 @@ def test_effects_with_a_past_are_written_by_hand(tmp_path):
 
 def test_every_effect_survives_its_file(tmp_path):
     for effect in CATALOGUE.values():
-        model = GyroModel((Term(effect, tuple(
-            float(np.clip(0.5 if each.default is None else each.default, *each.bounds))
-            for each in effect.parameters)),))
+        model = GyroModel(
+            (Term(effect, tuple(float(np.clip(0.5 if each.default is None else each.default,
+                                              *each.bounds)) for each in effect.parameters)),))
         write_model(tmp_path / 'model.yaml', model)
         assert read_model(tmp_path / 'model.yaml').terms == model.terms
 

@@ -37,8 +37,8 @@ def test_the_heading_is_the_integral_of_the_rate(name):
 
 
 def test_before_and_after_a_motion_stands():
-    assert (CALIBRATION_MOTION.rate_at(np.array(
-        [-1.0, CALIBRATION_MOTION.duration + 1.0])).tolist() == [0.0, 0.0])
+    assert CALIBRATION_MOTION.rate_at(
+        np.array([-1.0, CALIBRATION_MOTION.duration + 1.0])).tolist() == [0.0, 0.0]
     assert (ROBOT_MOTION.heading_at(np.array([-5.0, ROBOT_MOTION.duration + 5.0])).tolist()
             == [0.0, ROBOT_MOTION.heading[-1]])
 
@@ -58,8 +58,8 @@ def test_the_robot_drives_160_s_and_stands_for_half_of_them():
 
 
 def test_a_stretch_turns_rate_times_duration():
-    assert (constant_rate_motion([(1, 0), (4, 45),
-                                  (1, 0)]).heading[-1] == pytest.approx(4 * 45 * DEGREE))
+    assert (constant_rate_motion([(1, 0), (4, 45), (1, 0)]).heading[-1]
+            == pytest.approx(4 * 45 * DEGREE))
 
 
 def test_known_headings_are_met_and_joined_by_lines():

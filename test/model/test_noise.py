@@ -105,9 +105,9 @@ def test_the_configuration_of_the_xv3500_holds_its_figures():
     assert model.output(0.5, 25.0) == pytest.approx(XV3500.model.output(0.5, 25.0), rel=1e-6)
 
 
-@pytest.mark.parametrize('noise', [
-    Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-4)
-], ids=['angle random walk', 'bias instability', 'rate random walk'])
+@pytest.mark.parametrize('noise',
+                         [Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-4)],
+                         ids=['angle random walk', 'bias instability', 'rate random walk'])
 def test_the_heading_varies_as_predicted(noise):
     """Four processes a decade apart make flicker to 10 %; white noise has no mean before."""
     generator, runs, interval, ends = np.random.default_rng(3), 1500, 0.5, []

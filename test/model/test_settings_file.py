@@ -83,8 +83,8 @@ def test_a_value_is_what_a_person_takes_it_for(tmp_path, text, value):
 def test_texts_are_read_back_whatever_they_look_like(tmp_path):
     content = {'texts': ['1e4', '010', '09', '1.5e3', 'null', '', 'true', 'yes', '<<', '=', '*a',
                          '&a', '!!int', 'a\nb', '\x85', '\u2028', '😀', ' x ', '#', '1:30',
-                         '2026-11-21', "it's", '9' * 500], '010': 1e-7,
-               'yes': [[], {}, None, True, -1, 1e22]}
+                         '2026-11-21', "it's", '9' * 500],
+               '010': 1e-7, 'yes': [[], {}, None, True, -1, 1e22]}
     content['again'] = content['texts']
     assert read_settings(written(tmp_path, format_settings(content))) == content
 

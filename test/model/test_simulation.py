@@ -46,8 +46,8 @@ def test_the_temperature_is_the_one_given_or_the_models():
 
 
 def test_the_noise_is_that_of_the_model():
-    quiet, noisy = (simulate(GYRO, ROBOT_MOTION, 100.0),
-                    simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0)))
+    quiet = simulate(GYRO, ROBOT_MOTION, 100.0)
+    noisy = simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0))
     noise = noisy.output - quiet.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
 

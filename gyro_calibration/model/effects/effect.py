@@ -152,8 +152,8 @@ class Effect:
 
     def error_function(self, values: Sequence[float]) -> Callable[[Channels], Number]:
         """Return a function of channels: what the effect adds to the output, rad/s."""
-        shapes, coefficients = (values[:len(self.nonlinear_parameters)],
-                                values[len(self.nonlinear_parameters):])
+        shapes = values[:len(self.nonlinear_parameters)]
+        coefficients = values[len(self.nonlinear_parameters):]
         nested, columns = self.sum_columns, self.columns
         if nested is not None:
             return lambda channels: nested(channels, shapes, coefficients)
