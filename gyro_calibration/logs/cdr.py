@@ -111,9 +111,9 @@ def _append_nested_definitions(text: str) -> str:
 
 
 #: Message type -> definition as ROS 2 writes it, for recordings without definitions and recorders.
-DEFINITIONS: Mapping[str, str] = {kind: _append_nested_definitions('std_msgs/Header '
-                                                                   f'header\n{fields}\n')
-                                  for kind, fields in _MESSAGE_FIELDS.items()}
+DEFINITIONS: Mapping[str, str] = {
+    kind: _append_nested_definitions(f'std_msgs/Header header\n{fields}\n')
+    for kind, fields in _MESSAGE_FIELDS.items()}
 
 
 class MessageError(ValueError):
@@ -188,9 +188,8 @@ def _flatten_fields(parts: Mapping[str, Sequence[re.Match[str]]], part: str, pat
 
 
 #: Message type -> layout, with the rate about z.
-LAYOUTS: Mapping[str, MessageLayout] = ({
-    kind: parse_layout(text) for kind, text in DEFINITIONS.items()
-})
+LAYOUTS: Mapping[str, MessageLayout] = {kind: parse_layout(text)
+                                        for kind, text in DEFINITIONS.items()}
 
 
 @cache

@@ -177,8 +177,7 @@ def suggest_columns(header: Sequence[str]) -> str:
                  if any(each.endswith(':UNIT') for each in wanted) else '')
         return f'; perhaps --columns {shlex.quote(",".join(wanted))} is meant{units}'
     for name in header:
-        if name not in COLUMNS and (
-                close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
+        if name not in COLUMNS and (close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
             return f'; perhaps {close[0]} is meant by {_shorten(name)}'
     return ''
 

@@ -167,8 +167,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
                                      for quantity in QUANTITIES) + 10 * len(block.others))
         if numbers > _MAX_LOG_VALUES:
             raise LogError(f'{path}: has more than {_MAX_LOG_VALUES} numbers, which is above the '
-                           'limit of '
-                           'memory; split it')
+                           'limit of memory; split it')
         blocks.append(block)
     first = blocks[0]
     present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
@@ -239,9 +238,9 @@ def _convert_read_errors(path: str | Path) -> Iterator[None]:
         yield
     except UnicodeDecodeError as error:
         code = 'UTF-16' if error.object[:1] in (b'\xff', b'\xfe') else 'WINDOWS-1252'
-        raise LogError(f'{path}: cannot be read as a log, since it is not text in UTF-8; if it is '
-                       f'text, convert it, as by iconv -f {code} -t UTF-8 {path} > log.csv'
-                       ) from error
+        raise LogError(
+            f'{path}: cannot be read as a log, since it is not text in UTF-8; if it is '
+            f'text, convert it, as by iconv -f {code} -t UTF-8 {path} > log.csv') from error
     except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise LogError(f'{path}: cannot be read as a log ({describe_error(error)}); '
                        'wanted a CSV file, .csv or .csv.gz') from error
@@ -383,10 +382,8 @@ def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterat
     if table.delimiter != ',':
         for index, _, _ in table.columns.values():
             texts[index] = tuple(text.replace(',', '.') for text in texts[index])
-    arrays = {
-        quantity: _parse_numbers(path, places, header[index], texts[index], quantity) * factor
-        + offset for quantity, (index, factor, offset) in table.columns.items()
-    }
+    arrays = {quantity: _parse_numbers(path, places, header[index], texts[index], quantity)
+              * factor + offset for quantity, (index, factor, offset) in table.columns.items()}
     return places, arrays, {name: texts[index] for name, index in table.other_columns.items()}
 
 
@@ -406,8 +403,7 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
                   if quantity == 'time' else 'leave the cell empty if the value is lost'
                   if quantity in _NULLABLE_QUANTITIES else 'correct or remove the row')
         raise LogError(f'{path}: line {line_numbers[row]}, column {column}: '
-                       f'{reprlib.repr(texts[row])} '
-                       f'is not a number; {remedy}') from None
+                       f'{reprlib.repr(texts[row])} is not a number; {remedy}') from None
     wrong = _mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -442,10 +438,8 @@ def _refuse_unordered_time(path: str | Path, line_numbers: Sequence[int], time: 
     if late.any():
         row = int(np.argmax(late))
         raise LogError(f'{path}: line {line_numbers[row]}, column time_s: {time[row]:g} s is not '
-                       'later '
-                       f'than {time[row - 1] if row else previous_time:g} s; sort the rows, or '
-                       'give '
-                       'the sample rate with --rate')
+                       f'later than {time[row - 1] if row else previous_time:g} s; sort the rows, '
+                       'or give the sample rate with --rate')
     return float(time[-1])
 
 
@@ -467,9 +461,8 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     header = [str(name) for name in table]
     try:
         found = find_columns(header, columns, axis)
-        arrays: dict[str, Any] = {
-            quantity: np.asarray(table[list(table)[index]], float) * factor + offset
-            for quantity, (index, factor, offset) in found.items()}
+        arrays: dict[str, Any] = {quantity: np.asarray(table[list(table)[index]], float) * factor
+                                  + offset for quantity, (index, factor, offset) in found.items()}
     except (TypeError, ValueError) as error:
         raise LogError(f'the table is no log: {describe_error(error)}') from None
     shapes = {values.shape for values in arrays.values()}
@@ -553,17 +546,15 @@ def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = Non
     write_log_blocks(path, [(log, more or {})])
 
 
-def write_log_blocks(path: str | Path,
-                     blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
+def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
     """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
     with (open_replacement(path) as file,
           # without a time, so that the same log gives the same file
           gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
           if str(path).endswith('.gz') else nullcontext(file) as data):
         for number, (log, more) in enumerate(blocks):
-            data.write(
-                _format_rows(log, more,
-                             with_header=number == 0).encode('utf-8', 'backslashreplace'))
+            data.write(_format_rows(log, more,
+                                    with_header=number == 0).encode('utf-8', 'backslashreplace'))
 
 
 def _format_rows(log: Log, extra_columns: Mapping[str, Array], with_header: bool) -> str:
@@ -572,9 +563,8 @@ def _format_rows(log: Log, extra_columns: Mapping[str, Array], with_header: bool
         values = getattr(log, quantity)
         if factor == 1.0 and values is not None:
             columns[name] = values.tolist()
-    columns.update({
-        name: list(map(_normalize_newlines, texts)) for name, texts in log.others.items()
-    })
+    columns.update(
+        {name: list(map(_normalize_newlines, texts)) for name, texts in log.others.items()})
     columns.update({name: np.asarray(values, dtype=float).tolist()
                     for name, values in extra_columns.items()})
     text = io.StringIO()

@@ -42,8 +42,8 @@ def white_noise_deviation(values: Array, order: int = 3) -> float:
     off = np.abs(np.diff(values, order))
     off = off[np.isfinite(off)]
     # A high quantile, since most differences of a coarsely quantized output are zero.
-    return (float(np.quantile(off, 0.9)) / -float(ndtri(0.05)) / math.sqrt(math.comb(
-        2 * order, order)) if off.size else math.inf)
+    return (float(np.quantile(off, 0.9)) / -float(ndtri(0.05))
+            / math.sqrt(math.comb(2 * order, order)) if off.size else math.inf)
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,9 @@ def find_codes(values: Array) -> QuantizationCodes:
     if not gaps.size:
         return codes
     # where many codes do not occur, few gaps are as small as the step
-    for start in sorted({float(gap) for gap in np.quantile(
-            gaps, (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5))}, reverse=True):
+    for start in sorted(
+            {float(gap) for gap in np.quantile(gaps, (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5))},
+            reverse=True):
         step, aligned, deviation = _refine_step(codes, start)
         if aligned > _MIN_ALIGNMENT:
             return QuantizationCodes(codes.values, codes.counts, step, aligned, deviation)
@@ -147,8 +148,8 @@ def mask_outliers(values: Array, limit: float) -> Mask:
         return np.zeros(len(values), dtype=bool)
     # The median of six neighbours resists two outliers among them.
     edged = np.pad(values, 3, mode='reflect')
-    alone = values - np.median([edged[place:place + len(values)]
-                                for place in (0, 1, 2, 4, 5, 6)], axis=0)
+    alone = values - np.median([edged[place:place + len(values)] for place in (0, 1, 2, 4, 5, 6)],
+                               axis=0)
     # A coarsely quantized output mostly equals its neighbours; then the limit is in steps.
     least = max(quantization_step(values), 1e-9)
     return np.logical_and(*(np.abs(off) > limit * max(robust_deviation(off), least)
@@ -194,10 +195,9 @@ def refuse_saturated(output: Array) -> None:
         return
     for end, neighbour in ((-1, -2), (0, 1)):
         if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
-            raise DataRefused(
-                f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of the samples '
-                f'are at its limit of {values[end] / DEGREE:.4g} deg/s; turn slower, or set a '
-                'wider range')
+            raise DataRefused(f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of '
+                              f'the samples are at its limit of {values[end] / DEGREE:.4g} deg/s; '
+                              'turn slower, or set a wider range')
 
 
 def _is_noise_resolved(output: Array) -> bool:

@@ -235,10 +235,8 @@ class _LogBuilder:
             log = replace(log,
                           temperature=self._interpolate_temperature(times, gyro.stamps[0], time))
         if reference is not None:
-            log = replace(
-                log,
-                **self._interpolate_reference(reference.with_times(use_stamps), gyro, time,
-                                              log.output))
+            log = replace(log, **self._interpolate_reference(reference.with_times(use_stamps),
+                                                             gyro, time, log.output))
         if rate is not None:
             log = replace(log, time=np.arange(len(gyro)) / rate)
         return replace(log, notes=(*self._notes, *self._contents.notes))
@@ -284,8 +282,8 @@ class _LogBuilder:
         return self._topic_series(near)
 
     def _find_topic(self, wanted: str, role: str) -> str:
-        topic = next((topic for topic in self._contents.topics
-                      if _is_same_topic(topic, wanted)), None)
+        topic = next((topic for topic in self._contents.topics if _is_same_topic(topic, wanted)),
+                     None)
         if topic is None:
             raise LogError(f'{self._path}: no topic {wanted}{self._list_topics()}; '
                            f'name one of them by {_ROLES[role][0]}')
@@ -311,8 +309,7 @@ class _LogBuilder:
         series = self._series[topic]
         if series.damaged_count:
             self._notes.append(f'{series.damaged_count} messages of {topic} could not be read and '
-                               'were '
-                               'left out')
+                               'were left out')
         return series.sort_by_arrival()
 
     # The gyro
@@ -332,11 +329,10 @@ class _LogBuilder:
             return gyro
         if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
             place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
-            raise LogError(
-                f'{self._path}: the stamps of {gyro.topic} step back by '
-                f'{_format_seconds(back[place])} s '
-                f'at sample {place + 1}, as after setting a clock; split the recording there, or '
-                'give the sample rate with --rate')
+            raise LogError(f'{self._path}: the stamps of {gyro.topic} step back by '
+                           f'{_format_seconds(back[place])} s at sample {place + 1}, as after '
+                           'setting a clock; split the recording there, or give the sample rate '
+                           'with --rate')
         self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were sorted')
         return gyro.select(np.argsort(gyro.stamps, kind='stable'))
 
@@ -418,9 +414,8 @@ class _LogBuilder:
             for name, values in (('reference_heading', heading), ('reference_rate', rate))
             if values is not None and np.isfinite(values).sum() > 1}
         if not any(np.isfinite(values).any() for values in found.values()):
-            raise LogError(f'{self._path}: {series.topic} has no heading and no rate at the '
-                           'times of the gyro; name another reference, or check that both '
-                           'clocks agree')
+            raise LogError(f'{self._path}: {series.topic} has no heading and no rate at the times '
+                           'of the gyro; name another reference, or check that both clocks agree')
         lost = np.isnan(next(iter(found.values()))).mean()
         self._notes.append(f'reference: {series.topic} ({series.kind}), {len(at)} values, '
                            f'lost for {100 * lost:.1f} % of the samples')
@@ -460,8 +455,8 @@ def interpolate_with_gaps(time: Array, known_time: Array, values: Array) -> Arra
     longest = max(5.0 * float(np.median(np.diff(known_time))), 0.1)
     place = np.clip(np.searchsorted(known_time, time, 'right') - 1, 0, len(known_time) - 2)
     inside = (time >= known_time[0]) & (time <= known_time[-1])
-    close = ((known_time[place + 1] - known_time[place] <= longest) | (time == known_time[place]) |
-             (time == known_time[place + 1]))
+    close = ((known_time[place + 1] - known_time[place] <= longest) | (time == known_time[place])
+             | (time == known_time[place + 1]))
     return np.where(inside & close, np.interp(time, known_time, values), np.nan)
 
 

@@ -140,8 +140,8 @@ def list_recording_files(path: str | Path) -> list[Path]:
     if not found:
         raise LogError(f'{path}: a folder without an .mcap or .db3 file; '
                        'name the folder of a ROS 2 recording, or a log file')
-    return sorted(found, key=lambda file: [
-        int(part) if part.isdigit() else part for part in re.split(r'(\d+)', file.name)])
+    return sorted(found, key=lambda file: [int(part) if part.isdigit() else part
+                                           for part in re.split(r'(\d+)', file.name)])
 
 
 def read_messages(path: str | Path, contents: Contents,
@@ -205,17 +205,16 @@ class _ExpansionBudget:
     """The number of bytes to which the content of a compressed file may expand."""
 
     def __init__(self, path: Path):
-        self._path, self._remaining = (path, MIN_EXPANSION_BYTES
-                                       + MAX_EXPANSION_RATIO * path.stat().st_size)
+        self._path = path
+        self._remaining = MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * path.stat().st_size
 
     def spend(self, size: int) -> None:
         """Count bytes, and raise `LogError` beyond the limit."""
         self._remaining -= size
         if self._remaining < 0:
             raise LogError(f'{self._path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
-                           'its size, '
-                           'which is the limit; record again, or decompress it first if this is '
-                           'intended')
+                           'its size, which is the limit; record again, or decompress it first if '
+                           'this is intended')
 
 
 def _decompress_zstd(packed: BinaryIO) -> Iterator[bytes]:
@@ -243,10 +242,8 @@ def _import_library(name: str) -> Any:
 # MCAP
 
 _RecordCode = IntEnum('_RecordCode', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_INDEX '
-                                     'CHUNK_INDEX '
-                      'ATTACHMENT ATTACHMENT_INDEX STATISTICS METADATA METADATA_INDEX '
-                      'SUMMARY_OFFSET '
-                      'DATA_END')
+                      'CHUNK_INDEX ATTACHMENT ATTACHMENT_INDEX STATISTICS METADATA '
+                      'METADATA_INDEX SUMMARY_OFFSET DATA_END')
 _USED_RECORDS = (_RecordCode.SCHEMA, _RecordCode.CHANNEL, _RecordCode.MESSAGE, _RecordCode.CHUNK,
                  _RecordCode.METADATA)
 #: Closing part of an MCAP file without index and checksum: end of data, and a footer of zeros.
@@ -403,8 +400,8 @@ def _decompress_lz4(data: bytes) -> Iterator[bytes]:
         piece = decompressor.decompress(data, max_length=_READ_BYTES)
         while piece:
             yield piece
-            piece = (b'' if decompressor.eof else decompressor.decompress(
-                b'', max_length=_READ_BYTES))
+            piece = (b'' if decompressor.eof
+                     else decompressor.decompress(b'', max_length=_READ_BYTES))
     except (RuntimeError, EOFError) as error:
         raise _DamagedPart from error
 
@@ -462,8 +459,7 @@ class McapWriter:
     def add(self, topic: str, kind: str, definition: str, received: int, data: bytes) -> None:
         """Add a message, in CDR, to the next chunk; the time is in ns."""
         if kind not in self._schemas:
-            schema = _pack_record(_RecordCode.SCHEMA, struct.pack('<H',
-                                                                  len(self._schemas) + 1),
+            schema = _pack_record(_RecordCode.SCHEMA, struct.pack('<H', len(self._schemas) + 1),
                                   _pack_sized(kind), _pack_sized('ros2msg'),
                                   _pack_sized(definition))
             self._schemas[kind] = len(self._schemas) + 1, schema
@@ -585,8 +581,7 @@ def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connectio
                 yield database, tables
                 return
     raise LogError(f'{path}: cannot be read as a ROS 2 recording '
-                   f'({_describe_database_error(reason)}); '
-                   'name a recording, or record again')
+                   f'({_describe_database_error(reason)}); name a recording, or record again')
 
 
 def _describe_database_error(error: Exception | None) -> str:
@@ -607,9 +602,9 @@ def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
         database.execute('PRAGMA trusted_schema = OFF')
         tables = {name for name, in database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table'")}
-        stored = {name for name in sorted(tables & _KNOWN_TABLES)
-                  if not any(hidden for *_, hidden
-                             in database.execute(f'PRAGMA table_xinfo({name})'))}
+        stored = {
+            name for name in sorted(tables & _KNOWN_TABLES)
+            if not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
         database.set_authorizer(_authorize)
         return database, stored
     except BaseException:
@@ -655,6 +650,5 @@ def _read_topics(database: sqlite3.Connection, tables: set[str], path: Path,
                 channels[number] = topic, kind
     except _DATABASE_ERRORS as error:
         raise LogError(f'{path}: its list of topics cannot be read '
-                       f'({_describe_database_error(error)}); '
-                       'record again') from error
+                       f'({_describe_database_error(error)}); record again') from error
     return channels

@@ -58,8 +58,7 @@ class StampGrid:
         if not (self.has_bursts and self.max_deviation):
             return []
         return [f'The stamps come in bursts or with jitter, up to {self.max_deviation:.3g} s off '
-                'an even '
-                f'interval of {1000 * self.interval:.5g} ms, which is used.']
+                f'an even interval of {1000 * self.interval:.5g} ms, which is used.']
 
     @property
     def loss_remarks(self) -> list[str]:
@@ -88,9 +87,8 @@ def fit_stamp_grid(time: Array) -> StampGrid:
     uneven = not bursts and float(
         (np.abs(steps / usual - np.round(steps / usual)) > 0.4).mean()) > 0.2
     if uneven or wander > 0.05 * len(time) * interval:
-        raise DataRefused(f'the stamps have no even interval (about {usual:g} s; up to '
-                          f'{wander:g} s off); if the samples are even, give the sample rate '
-                          'with --rate')
+        raise DataRefused(f'the stamps have no even interval (about {usual:g} s; up to {wander:g} '
+                          's off); if the samples are even, give the sample rate with --rate')
     return StampGrid(time, lost, _number_samples(np.minimum(lost, _max_kept_gap(time))), interval,
                      wander, bursts)
 
@@ -126,10 +124,9 @@ def _typical_interval(time: Array, steps: Array) -> float:
     usual = float(np.median(steps))
     alike = 0.8 < interval / usual < 1.25
     if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > 0.9:
-        raise DataRefused(
-            f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
-            f'{100 * interval:.4g} s: either most samples are lost, or they come in long bursts; '
-            'give the sample rate with --rate, or record again')
+        raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
+                          f'{100 * interval:.4g} s: either most samples are lost, or they come in '
+                          'long bursts; give the sample rate with --rate, or record again')
     whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < 0.3
     # nine of ten steps are whole multiples of the median one: samples are lost
     return (float(steps[whole & (steps < 1.5 * usual)].mean())

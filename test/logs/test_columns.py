@@ -47,8 +47,7 @@ def written(folder, text):
 def test_a_column_is_converted_from_the_unit_that_the_user_names(tmp_path, column, attribute,
                                                                  value):
     name, _, text = column.partition('=')
-    log = read_log(written(tmp_path, 'wz,x\n1,1\n2,2\n'),
-                   columns={name: text, 'gyro': 'wz:deg/s'})
+    log = read_log(written(tmp_path, 'wz,x\n1,1\n2,2\n'), columns={name: text, 'gyro': 'wz:deg/s'})
     assert getattr(log, attribute)[1] == pytest.approx(value, rel=1e-12)
     np.testing.assert_allclose(log.output, [DEGREE, 2.0 * DEGREE])
 
@@ -117,8 +116,8 @@ def test_the_suggestion_is_one_that_works(run, tmp_path):
 
 def test_a_part_of_a_log_is_taken(run, tmp_path):
     """The verb allan takes one in test_allan.py."""
-    path = written(tmp_path, 'time_s,gyro_dps\n' + ''.join(
-        f'{100 + 0.01 * row:.2f},1.0\n' for row in range(3000)))
+    path = written(tmp_path, 'time_s,gyro_dps\n' + ''.join(f'{100 + 0.01 * row:.2f},1.0\n'
+                                                           for row in range(3000)))
     (tmp_path / 'm.yaml').write_text('effects: {bias: {bias: 0.0}}')
     words = 'compensate', path, '--model', tmp_path / 'm.yaml', '--out', tmp_path / 'o.csv'
     assert run(*words, '--from', 5, '--to', 20)[0] == 0

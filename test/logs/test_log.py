@@ -34,15 +34,15 @@ def written(folder, text, name='log.csv'):
     return path
 
 
-@pytest.mark.parametrize('column, attribute, factor', [
-    ('gyro_dps', 'output', DEGREE), ('gyro_rad_s', 'output', 1.0), ('gyro_counts', 'counts', 1.0),
-    ('temperature_degc', 'temperature', 1.0),
-    ('reference_rate_dps', 'reference_rate', DEGREE),
-    ('reference_rate_rad_s', 'reference_rate', 1.0),
-    ('reference_heading_deg', 'reference_heading', DEGREE),
-    ('reference_heading_rad', 'reference_heading', 1.0),
-    ('acceleration_mps2', 'specific_force', 1.0), ('supply_v', 'supply', 1.0),
-    ('moving', 'moving', 1.0)])
+@pytest.mark.parametrize(
+    'column, attribute, factor',
+    [('gyro_dps', 'output', DEGREE), ('gyro_rad_s', 'output', 1.0), ('gyro_counts', 'counts', 1.0),
+     ('temperature_degc', 'temperature', 1.0), ('reference_rate_dps', 'reference_rate', DEGREE),
+     ('reference_rate_rad_s', 'reference_rate', 1.0),
+     ('reference_heading_deg', 'reference_heading', DEGREE),
+     ('reference_heading_rad', 'reference_heading', 1.0),
+     ('acceleration_mps2', 'specific_force', 1.0), ('supply_v', 'supply', 1.0),
+     ('moving', 'moving', 1.0)])
 def test_every_column_is_converted_to_si(tmp_path, column, attribute, factor):
     gyro = '' if 'gyro' in column else 'gyro_rad_s,'
     rows = ''.join(f'{"0," if gyro else ""}{value},{second}\n'
@@ -153,8 +153,8 @@ def test_a_broken_compressed_file_is_refused(tmp_path, cut):
 
 
 def test_a_lost_value_is_nan_or_an_empty_cell(tmp_path):
-    log = read_log(written(
-        tmp_path, 'gyro_dps,reference_rate_dps,reference_heading_deg\n1,nan,\n,180,NaN\n'))
+    log = read_log(
+        written(tmp_path, 'gyro_dps,reference_rate_dps,reference_heading_deg\n1,nan,\n,180,NaN\n'))
     assert np.isnan(log.output).tolist() == [False, True]
     assert (np.isnan(log.reference_rate).tolist() == [True, False]
             and np.isnan(log.reference_heading).all())
@@ -240,8 +240,8 @@ def test_numbers_are_the_same_with_and_without_other_columns(tmp_path):
     texts = ['1', '-0.1', '1e-7', ' 2.5 ', '+3', 'nan', '0.1000000000000000055511151231257827',
              '12345678901234567890', '.5', '5.', '1_0']
     alone = read_log(written(tmp_path, 'gyro_rad_s\n' + ''.join(f'{text}\n' for text in texts)))
-    with_others = read_log(written(
-        tmp_path, 'gyro_rad_s,lap\n' + ''.join(f'{text},a\n' for text in texts)))
+    with_others = read_log(written(tmp_path,
+                                   'gyro_rad_s,lap\n' + ''.join(f'{text},a\n' for text in texts)))
     assert np.array_equal(alone.output, with_others.output, equal_nan=True)
     assert np.array_equal(alone.output, [float(text) for text in texts], equal_nan=True)
 

@@ -159,16 +159,18 @@ float64 z
 def test_a_message_of_any_kind_is_parsed_by_its_definition(make, little):
     pytest.importorskip('rosbags')
     from rosbags.typesys import get_types_from_msg
-    make.store.register({kind: fields for kind, fields in get_types_from_msg(
-        CUSTOM, 'my_msgs/msg/Gyro').items() if kind.startswith('my_msgs')})
+    make.store.register(
+        {kind: fields for kind, fields in get_types_from_msg(CUSTOM, 'my_msgs/msg/Gyro').items()
+         if kind.startswith('my_msgs')})
     custom, part = (make.store.types[f'my_msgs/msg/{name}'] for name in ('Gyro', 'Part'))
     for frame, history in (('', []), ('gyro', [1.0, 2.0, 3.0])):
         message = custom(make.header(12.5, frame), True, np.array(history, np.float32), 'a name',
                          [part(1, 2), part(3, 4)], np.array(history), make.vector(0.25), 31,
                          ['x'], 7.0)
         layout = parse_layout(CUSTOM)
-        stamp, numbers = parse(bytes(make.store.serialize_cdr(
-            message, 'my_msgs/msg/Gyro', little_endian=little)), layout)
+        stamp, numbers = parse(
+            bytes(make.store.serialize_cdr(message, 'my_msgs/msg/Gyro', little_endian=little)),
+            layout)
         assert (stamp, {name: numbers[place] for name, place in layout.quantities.items()}) == (
             BEGIN + 12_500_000_000, {'rate': 0.25, 'temperature': 31})
 
@@ -367,8 +369,8 @@ def test_a_sentence_shows_no_text_of_a_file_that_a_terminal_would_obey(make, tmp
 def test_a_compressed_recording_says_which_package_it_needs(make, tmp_path, monkeypatch):
     time = np.arange(300) / RATE
     topics = {'imu': gyro(make, time, time)}
-    plain, packed = (write(tmp_path / 'plain', topics, storage='MCAP'),
-                     write(tmp_path / 'packed', topics, **KINDS['mcap-chunks']))
+    plain = write(tmp_path / 'plain', topics, storage='MCAP')
+    packed = write(tmp_path / 'packed', topics, **KINDS['mcap-chunks'])
     monkeypatch.setitem(sys.modules, 'zstandard', None)
     assert len(read_recording(plain)) == 300
     with pytest.raises(LogError,
@@ -649,9 +651,8 @@ def test_a_verb_answers_alike_for_a_recording_and_for_its_log(run, recorded, tmp
     assert (code, again[0]) == (0, 0), again
     assert 'gyro: imu/data_raw' in again[2]
     # the log has a reference, which a diagnosis looks at
-    first, second = (numbers_of({key: value for key, value in json.loads(text).items()
-                                 if key not in ('gates', 'reference')})
-                     for text in (answer, again[1]))
+    first, second = (numbers_of({key: value for key, value in json.loads(text).items() if key
+                                 not in ('gates', 'reference')}) for text in (answer, again[1]))
     # Stamps are whole nanoseconds, and a heading went through a quaternion.
     np.testing.assert_allclose(second, first, rtol=1e-5, atol=1e-9)
     for one in outputs:
