@@ -278,16 +278,11 @@ class Connection:
 
     """
 
-    def __init__(
-        self,
-        port: str,
-        protocol: str = AUTO,
-        baud: int = 0,
-        settings: Settings | None = None,
-        on_change: Callable[[ConnectionState], None] = lambda state: None,
-        clock: Callable[[], float] = read_steady_clock,
-        make_port: Callable[[str, int], SerialPort] = SerialPort,
-    ):
+    def __init__(self, port: str, protocol: str = AUTO, baud: int = 0,
+                 settings: Settings | None = None,
+                 on_change: Callable[[ConnectionState], None] = lambda state: None,
+                 clock: Callable[[], float] = read_steady_clock,
+                 make_port: Callable[[str, int], SerialPort] = SerialPort):
         self._pattern, self._settings = port, settings or Settings()
         self._bauds = (baud,) if baud else BAUDS
         self._on_change, self._read_clock, self._make_port = on_change, clock, make_port
@@ -421,8 +416,8 @@ class Connection:
         decoder, clock = self._decoder, self.clock
         if decoder is None or clock is None:  # stopped while listening
             return
-        silence, counts = (_SilenceTimer(clock.period,
-                                         self._read_clock()), self._unusable_counts(decoder))
+        silence = _SilenceTimer(clock.period, self._read_clock())
+        counts = self._unusable_counts(decoder)
         while not stop.is_set():
             data = port.read()
             arrival = self._read_clock()

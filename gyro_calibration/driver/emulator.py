@@ -69,15 +69,9 @@ class Emulator:
     #: s; samples due within this time are written together, since waits are not shorter
     _BATCH_DURATION = 0.0005
 
-    def __init__(
-        self,
-        protocol: Protocol,
-        samples: Iterable[Sample],
-        settings: Settings | None = None,
-        speed: float = 1.0,
-        link: str | Path | None = None,
-        wait_for_reader: bool = False,
-    ):
+    def __init__(self, protocol: Protocol, samples: Iterable[Sample],
+                 settings: Settings | None = None, speed: float = 1.0,
+                 link: str | Path | None = None, wait_for_reader: bool = False):
         if not speed > 0.0:
             raise ValueError(f'speed is {speed}, but must be above 0; 1 is real time')
         self._settings = settings or Settings()

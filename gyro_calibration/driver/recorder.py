@@ -144,10 +144,10 @@ class McapRecorder(_Recorder):
                     if force is None else cdr.z_axis_covariance(ASSUMED_FORCE_NOISE ** 2))
         messages = [] if temperature is None else [
             ('/imu/temperature', cdr.TEMPERATURE, [temperature, 0.0])]
-        messages.append(('/imu/data_raw', cdr.IMU, [
-            0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE,
-            0.0, 0.0, sample.output, *cdr.z_axis_covariance(self.variance),
-            0.0, 0.0, force or 0.0, *of_force]))
+        messages.append(
+            ('/imu/data_raw', cdr.IMU,
+             [0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE, 0.0, 0.0, sample.output,
+              *cdr.z_axis_covariance(self.variance), 0.0, 0.0, force or 0.0, *of_force]))
         for topic, kind, numbers in messages:
             data = cdr.serialize(stamp, 'gyro', numbers)
             self.add_message(Message(topic, kind, stamp, data), cdr.DEFINITIONS[kind])

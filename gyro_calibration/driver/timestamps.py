@@ -301,8 +301,8 @@ class _LatenessTest:
         needed = (math.log(_FALSE_LOSS_PROBABILITY)
                   / math.log1p(-min(max(self._on_time_share, 0.02), 0.99)))
         lasts = arrival - self.late_since
-        before = (0.0 if lasts > _LONG_LATE_DURATION else max(
-            0.0, min(self._min_on_time_lateness, self._min_previous_lateness)))
+        before = (0.0 if lasts > _LONG_LATE_DURATION
+                  else max(0.0, min(self._min_on_time_lateness, self._min_previous_lateness)))
         self.late_step = self._min_lateness - before
         is_slip = self._sweep_share > _MIN_SWEEP_SHARE and self._min_lateness < 1.5 * bound
         return (lasts >= _MIN_LATE_DURATION and self._late_count >= needed
@@ -455,8 +455,8 @@ class SampleClock:
         late = self._lateness
         lost = ambiguity * math.floor(late.late_step / (ambiguity * self.period) + 0.25)
         assert late.late_since is not None
-        since, is_no_loss = (late.late_since,
-                             late.is_loss_excluded(number, arrival, self._line.slope))
+        since = late.late_since
+        is_no_loss = late.is_loss_excluded(number, arrival, self._line.slope)
         late.reset()
         if is_no_loss:
             self._restart_line()
@@ -643,8 +643,8 @@ class HostTimeConverter:
         interval = stamp - self._offset - previous_time
         unshown = [step for step in self._recent_steps if not step.is_applied]
         found = min(unshown, key=lambda step: abs(interval - step.size), default=None)
-        if (found is None or not abs(interval - found.size) < 0.5 * abs(interval) or
-                abs(interval - arrival_interval) < abs(interval - arrival_interval - found.size)):
+        if found is None or not abs(interval - found.size) < 0.5 * abs(interval) or abs(
+                interval - arrival_interval) < abs(interval - arrival_interval - found.size):
             return stamp - self._offset
         found.is_applied = True
         left = interval - found.size

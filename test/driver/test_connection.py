@@ -136,8 +136,8 @@ def test_listening_and_waiting_end_on_request(protocol, state):
 
 def test_a_gyro_is_found_again_under_another_name(tmp_path):
     """As in /dev/serial/by-id, where the name holds the serial number of the adapter."""
-    world, names = (World(30.0),
-                    [tmp_path / f'usb-FTDI_A9003XYZ-if0{number}' for number in range(2)])
+    world = World(30.0)
+    names = [tmp_path / f'usb-FTDI_A9003XYZ-if0{number}' for number in range(2)]
     names[0].touch()
     world.gyro('csv', outputs=itertools.chain(itertools.repeat(0.1, 1500), itertools.repeat(0.2)))
 
@@ -295,8 +295,8 @@ def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps()
     world = World(8.0)
     world.send(iter(sent), rate=1000.0)
     reading = Reading(world, 'kvh_1750')
-    counts, numbers = (reading.connection.counts(),
-                       np.round([1e4 * sample.output for sample in reading.samples]))
+    counts = reading.connection.counts()
+    numbers = np.round([1e4 * sample.output for sample in reading.samples])
     assert counts.lost_samples == numbers[-1] - numbers[0] + 1 - counts.samples > 100
     assert reading.steps[5000:] == pytest.approx(1e-3 * np.diff(numbers)[5000:], abs=1e-6)
 

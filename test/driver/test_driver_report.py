@@ -26,11 +26,10 @@ from gyro_calibration.ros.driver_node import PARAMETERS, SampleMessages, setting
 from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import parameter_values
 
-KEYS = {
-    'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
-    'device_faults', 'discarded_bytes', 'longest_gap_s', 'clock_steps', 'last_event', 'port',
-    'device', 'state', 'protocol', 'baud', 'detected', 'reopened', 'waiting_s', 'waited_s',
-    'last_error', 'period_ms', 'nominal_period_ms', 'jitter_before_ms', 'jitter_after_ms'}
+KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
+        'device_faults', 'discarded_bytes', 'longest_gap_s', 'clock_steps', 'last_event', 'port',
+        'device', 'state', 'protocol', 'baud', 'detected', 'reopened', 'waiting_s', 'waited_s',
+        'last_error', 'period_ms', 'nominal_period_ms', 'jitter_before_ms', 'jitter_after_ms'}
 
 
 # Parameters

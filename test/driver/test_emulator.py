@@ -32,8 +32,8 @@ def samples(count=None, rate=100.0):
 
 def read_all(path, protocol, enough=None, settings=None, until=lambda received: True):
     """Read until the gyro is unplugged, or enough samples are there and a condition holds."""
-    port, decoder, received = (SerialPort(str(path),
-                                          115200), find_protocol(protocol).decoder(settings), [])
+    port, decoder, received = (SerialPort(str(path), 115200),
+                               find_protocol(protocol).decoder(settings), [])
     port.open()
     try:
         while enough is None or len(received) < enough or not until(received):
@@ -52,8 +52,8 @@ def test_a_reader_gets_every_sample(name, tmp_path):
                         link=tmp_path / 'gyro', wait_for_reader=True)
     with emulator:
         received = read_all(emulator.path, name, 200, settings)
-    resolution = (1e-6 if name in ('csv', 'kvh_1750',
-                                   'fizoptika') else find_protocol(name).sensitivity)
+    resolution = (1e-6 if name in ('csv', 'kvh_1750', 'fizoptika')
+                  else find_protocol(name).sensitivity)
     assert [sample.output for sample in received] == pytest.approx(
         [sample.output for sample in samples(200)], abs=resolution)
 

@@ -33,8 +33,7 @@ def frames(name, count, rate=MOTIONS['rest'], force=None):
     encode = find_protocol(name).encoder(SETTINGS[name])
     return [
         find_protocol(name).preamble,
-        *(encode(Sample(rate(k), 20.0 + 0.01 * k, 0.01 * k, k, 0, force)) for k in range(count))
-    ]
+        *(encode(Sample(rate(k), 20.0 + 0.01 * k, 0.01 * k, k, 0, force)) for k in range(count))]
 
 
 def received(data, ratio, idle=0):
@@ -144,8 +143,8 @@ def test_one_byte_again_and_again_is_no_format():
 
 
 def test_few_bytes_or_none_are_reported_as_such():
-    assert (recognize_protocol(b'').summary ==
-            'nothing came: check the power and the wires of the gyro')
+    assert (recognize_protocol(b'').summary
+            == 'nothing came: check the power and the wires of the gyro')
     recognition = recognize_protocol(frames('kvh_1750', 1)[1])
     assert (recognition.protocol is None and recognition.frames == 1
             and 'listen longer' in recognition.summary)

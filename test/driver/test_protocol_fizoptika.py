@@ -46,9 +46,9 @@ def test_the_temperature_comes_in_two_frames(raw, degrees):
     assert first is None and second == pytest.approx(degrees, abs=0.01)
 
 
-@pytest.mark.parametrize('number, name, raw, value', [
-    (2, 'supply_v', 16384, 5.0), (4, 'source_current_a', 13107, 0.1),
-    (6, 'diagnostic_v', 13107, 1.0), (2, 'supply_v', -16384, -5.0)])
+@pytest.mark.parametrize('number, name, raw, value',
+                         [(2, 'supply_v', 16384, 5.0), (4, 'source_current_a', 13107, 0.1),
+                          (6, 'diagnostic_v', 13107, 1.0), (2, 'supply_v', -16384, -5.0)])
 def test_each_other_value_comes_in_two_frames(number, name, raw, value):
     high, low = raw.to_bytes(2, 'big', signed=True)
     (_, first), (temperature, second) = values(frame(1, number, high), frame(2, number + 1, low))

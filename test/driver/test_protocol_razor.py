@@ -43,11 +43,10 @@ def test_a_line_is_written_as_the_firmware_prints_it():
             == b'#YPRAG=0.00,0.00,0.00,0.00,0.00,256.00,0.00,0.00,0.25\r\n')
 
 
-@pytest.mark.parametrize('line', [
-    b'#YPRAG=1,2,3,4,5,6,7,8', b'#YPRAG=1,2,3,4,5,6,7,8,9,10', b'#YPRAG=1,2,3,4,5,6,7,8,nan',
-    b'#YPRAG=1,2,3,4,5,6,7,8,', b'YPRAG=1,2,3,4,5,6,7,8,9',
-    b'#YPRAGM=1,2,3,4,5,6,7,8,9,10,11,12', b'#YPRAG=1,2,3,4,5,6,7,8,0x9', b'#A-C=1,2,3',
-])
+@pytest.mark.parametrize(
+    'line', [b'#YPRAG=1,2,3,4,5,6,7,8', b'#YPRAG=1,2,3,4,5,6,7,8,9,10',
+             b'#YPRAG=1,2,3,4,5,6,7,8,nan', b'#YPRAG=1,2,3,4,5,6,7,8,', b'YPRAG=1,2,3,4,5,6,7,8,9',
+             b'#YPRAGM=1,2,3,4,5,6,7,8,9,10,11,12', b'#YPRAG=1,2,3,4,5,6,7,8,0x9', b'#A-C=1,2,3'])
 def test_other_lines_are_discarded(line):
     decoder = PROTOCOL.decoder()
     assert decoder.feed(line + b'\r\n') == [] and decoder.discarded_bytes == len(line)

@@ -61,9 +61,8 @@ def stream(name, count=20, seed=1):
     """Return samples and the bytes that a device sends for them."""
     generator = random.Random(seed)
     timed = name == 'csv'
-    samples = [Sample(generator.uniform(-1.0, 1.0),
-                      generator.uniform(-40.0, 85.0) if timed else None,
-                      0.01 * k if timed else None) for k in range(count)]
+    samples = [Sample(generator.uniform(-1.0, 1.0), generator.uniform(-40.0, 85.0) if timed
+                      else None, 0.01 * k if timed else None) for k in range(count)]
     protocol = find_protocol(name)
     return samples, protocol.preamble + b''.join(map(protocol.encoder(SETTINGS[name]), samples))
 
@@ -271,10 +270,8 @@ def test_a_rate_that_the_device_cannot_mean_is_refused(name, data, settings):
 
 def test_the_axis_chooses_among_three():
     line = b'!ANG:0.10,-0.20,90.00,AN:100,200,300,4,5,250,7,8,9\r\n'
-    rates = [
-        find_protocol('minimu9').decoder(Settings(axis=axis)).feed(line)[0].output
-        for axis in 'xyz'
-    ]
+    rates = [find_protocol('minimu9').decoder(Settings(axis=axis)).feed(line)[0].output
+             for axis in 'xyz']
     assert rates == pytest.approx([7.0 * DPS, 14.0 * DPS, 21.0 * DPS])
 
 

@@ -77,9 +77,9 @@ def test_rosbags_reads_what_is_recorded(tmp_path):
     with rosbag2.Reader(tmp_path / 'a.mcap') as reader:
         for connection in reader.connections:
             store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
-        found = [store.deserialize_cdr(data, connection.msgtype)
-                 for connection, _, data in reader.messages()
-                 if connection.topic == '/imu/data_raw']
+        found = [
+            store.deserialize_cdr(data, connection.msgtype)
+            for connection, _, data in reader.messages() if connection.topic == '/imu/data_raw']
         assert reader.message_count == 600
     assert [message.angular_velocity.z for message in found] == [
         sample.output for _, sample in samples()]

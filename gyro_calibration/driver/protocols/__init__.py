@@ -31,8 +31,8 @@ from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample
 from gyro_calibration.driver.protocols.razor import RAZOR
 from gyro_calibration.driver.protocols.witmotion import WITMOTION
 
-PROTOCOLS = {protocol.name: protocol for protocol in (
-    KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA, MINIMU9, WITMOTION, RAZOR, CSV)}
+PROTOCOLS = {protocol.name: protocol for protocol in (KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA,
+                                                      MINIMU9, WITMOTION, RAZOR, CSV)}
 
 __all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find_protocol']
 

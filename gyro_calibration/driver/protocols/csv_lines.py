@@ -85,16 +85,7 @@ def _write(reading: WrittenReading, settings: Settings) -> bytes:
     return b','.join(fields.get(name, b'0') for name in settings.columns) + b'\r\n'
 
 
-CSV = Protocol(
-    name='csv',
-    description='numbers separated by commas, columns named by a parameter',
-    baud=115200,
-    rate=100.0,
-    sensitivity=1.0,
-    splitter=partial(LineSplitter, 1024),
-    parser=stateless(_parse),
-    writer=stateless(_write),
-    full_scale=math.radians(2000.0),
-    preamble=b'\r\n',
-    check_settings=_check_settings,
-)
+CSV = Protocol(name='csv', description='numbers separated by commas, columns named by a parameter',
+               baud=115200, rate=100.0, sensitivity=1.0, splitter=partial(LineSplitter, 1024),
+               parser=stateless(_parse), writer=stateless(_write), full_scale=math.radians(2000.0),
+               preamble=b'\r\n', check_settings=_check_settings)

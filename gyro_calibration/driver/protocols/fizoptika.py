@@ -91,17 +91,9 @@ class _Writer:
 
 
 FIZOPTIKA = Protocol(
-    name='fizoptika',
-    description='Fizoptika fibre-optic gyros, binary with raw counts',
-    baud=921600,
-    rate=1000.0,
-    sensitivity=1.0,
-    splitter=partial(FrameSplitter, rb'\xdd.{7}', 8,
-                     lambda frame: _checksum(frame) == frame[6:]),
-    parser=_Parser,
-    writer=_Writer,
-    largest_count=0x800000,
-    normal_ranges={'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15),
-                   'diagnostic_v': (0.95, 1.05)},
-    check_settings=require_sensitivity,
-)
+    name='fizoptika', description='Fizoptika fibre-optic gyros, binary with raw counts',
+    baud=921600, rate=1000.0, sensitivity=1.0,
+    splitter=partial(FrameSplitter, rb'\xdd.{7}', 8, lambda frame: _checksum(frame) == frame[6:]),
+    parser=_Parser, writer=_Writer, largest_count=0x800000, normal_ranges={
+        'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15), 'diagnostic_v': (0.95, 1.05)},
+    check_settings=require_sensitivity)

@@ -64,13 +64,9 @@ def _parse(frame: bytes, settings: Settings) -> Reading:
     axis = 'xyz'.index(settings.axis)
     _, *values, status, sequence, temperature = _FRAME.unpack_from(frame)
     has_force = status >> 4 + axis & 1 and math.isfinite(values[3 + axis])
-    return Reading(
-        value=values[axis],
-        valid=bool(status >> axis & 1),
-        temperature=float(temperature),
-        sequence=sequence,
-        specific_force=values[3 + axis] * STANDARD_GRAVITY if has_force else None,
-    )
+    return Reading(value=values[axis], valid=bool(status >> axis & 1),
+                   temperature=float(temperature), sequence=sequence,
+                   specific_force=values[3 + axis] * STANDARD_GRAVITY if has_force else None)
 
 
 def _write(reading: WrittenReading, settings: Settings) -> bytes:

@@ -53,14 +53,10 @@ def _write(reading: WrittenReading, settings: Settings) -> bytes:
 
 KVH_ECORE = Protocol(
     name='kvh_ecore',
-    description='KVH E-Core 2000 fibre-optic gyro (also RD2100, not verified), binary',
-    baud=9600,
-    rate=10.0,
-    sensitivity=_RATE_PER_COUNT,
+    description='KVH E-Core 2000 fibre-optic gyro (also RD2100, not verified), binary', baud=9600,
+    rate=10.0, sensitivity=_RATE_PER_COUNT,
     splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8,
                      lambda frame: sum(_unpack_content(frame)) % 256 == 0),
     parser=lambda settings: lambda frame: Reading(
         int.from_bytes(_unpack_content(frame)[5:], 'big', signed=True)),
-    writer=stateless(_write),
-    largest_count=0x8000,
-)
+    writer=stateless(_write), largest_count=0x8000)

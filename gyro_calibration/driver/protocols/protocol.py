@@ -169,8 +169,8 @@ InputT = TypeVar('InputT')
 OutputT = TypeVar('OutputT')
 
 
-def stateless(convert: Callable[[InputT, Settings], OutputT]
-              ) -> Callable[[Settings], Callable[[InputT], OutputT]]:
+def stateless(convert: Callable[[InputT, Settings], OutputT]) -> Callable[
+        [Settings], Callable[[InputT], OutputT]]:
     """Return the `Protocol.parser` or `writer` of a format with independent frames."""
     return lambda settings: lambda given: convert(given, settings)
 
@@ -292,9 +292,8 @@ class Protocol:
             # a log has nan where a sensor failed
             temperature, force = (each if each is not None and math.isfinite(each) else None
                                   for each in (sample.temperature, sample.specific_force))
-            return write(
-                WrittenReading(value, valid, temperature, sample.time, sample.sequence or 0, force,
-                               sample.health))
+            return write(WrittenReading(value, valid, temperature, sample.time,
+                                        sample.sequence or 0, force, sample.health))
 
         return encode
 
@@ -362,8 +361,8 @@ class Decoder:
         self._splitter = protocol.splitter()
         self._parser = partial(protocol.parser, settings)
         self._parse = self._parser()
-        self._factor, self._limit = (protocol.unit_scale(settings),
-                                     protocol.effective_full_scale(settings))
+        self._factor = protocol.unit_scale(settings)
+        self._limit = protocol.effective_full_scale(settings)
         self._refused_bytes, self._has_sample = 0, False
         self._skipped_bytes, self._refused_frames, self._mean_frame_length = 0, 0, 0.0
         self.device_faults = self.refused_samples = self.refused_temperatures = 0
@@ -403,8 +402,8 @@ class Decoder:
             return None
         # number of frames that were discarded or skipped before this one; 0 for the first
         length = len(frame.data)
-        self._mean_frame_length += ((_LENGTH_SMOOTHING if self._mean_frame_length else 1.0) *
-                                    (length - self._mean_frame_length))
+        self._mean_frame_length += (_LENGTH_SMOOTHING if self._mean_frame_length else 1.0) * (
+            length - self._mean_frame_length)
         missing = (self._refused_frames + round(self._skipped_bytes / self._mean_frame_length)
                    if self._has_sample else 0)
         self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, True

@@ -78,15 +78,8 @@ def _frame(kind: int, value: float, temperature: float, axis: str) -> bytes:
     return frame + bytes([sum(frame) & 0xFF])
 
 
-WITMOTION = Protocol(
-    name='witmotion',
-    description='WitMotion modules, binary',
-    baud=9600,
-    rate=10.0,
-    sensitivity=_RATE_PER_COUNT,
-    splitter=partial(FrameSplitter, rb'\x55[\x50-\x5f].{9}', 11,
-                     lambda frame: sum(frame[:10]) & 0xFF == frame[10]),
-    parser=_Parser,
-    writer=stateless(_write),
-    largest_count=0x8000,
-)
+WITMOTION = Protocol(name='witmotion', description='WitMotion modules, binary', baud=9600,
+                     rate=10.0, sensitivity=_RATE_PER_COUNT,
+                     splitter=partial(FrameSplitter, rb'\x55[\x50-\x5f].{9}', 11,
+                                      lambda frame: sum(frame[:10]) & 0xFF == frame[10]),
+                     parser=_Parser, writer=stateless(_write), largest_count=0x8000)
