@@ -37,10 +37,8 @@ from gyro_calibration.allan.deviation import (
 from gyro_calibration.allan.noise_fit import fit_noise, NoiseFigure, NoiseFit
 from gyro_calibration.model.noise import NOISE_TERMS, NoiseTerm
 
-__all__ = [
-    'NOISE_TERMS', 'AllanChart', 'NoiseFigure', 'Floor', 'NoiseFit', 'NoiseTerm', 'RestRecord',
-    'allan_deviation', 'averaging_sizes', 'build_rest_record', 'fit_noise'
-]
+__all__ = ['NOISE_TERMS', 'AllanChart', 'NoiseFigure', 'Floor', 'NoiseFit', 'NoiseTerm',
+           'RestRecord', 'allan_deviation', 'averaging_sizes', 'build_rest_record', 'fit_noise']
 
 
 class _CallableModule(ModuleType):

@@ -100,8 +100,7 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     rate[stamps.grid_index[known]] = output[known]
     remarks = [*stamps.burst_remarks,
                *(f'{remark} Windows with more than {100 * _MAX_LOST_PER_WINDOW:g} % lost are not '
-                 'used.'
-                 for remark in stamps.loss_remarks)]
+                 'used.' for remark in stamps.loss_remarks)]
     left_out = int(np.count_nonzero(~known))
     if left_out:
         remarks.append(f'{left_out} samples without output, or moving, are left out.')
@@ -118,8 +117,7 @@ def build_rest_record(time: Array, output: Array, moving: Array | None = None,
     if share > _MAX_LOST_SHARE:
         raise DataRefused(f'{100 * share:.0f} % of the samples are lost or without output; wanted '
                           f'at most {100 * _MAX_LOST_SHARE:.0f} %: record again, or give --rate '
-                          'where '
-                          'the stamps are wrong')
+                          'where the stamps are wrong')
     return RestRecord(rate, stamps.interval, tuple(remarks))
 
 
@@ -127,8 +125,7 @@ def _refuse_few(count: int, samples: str = 'samples') -> None:
     """Refuse fewer samples than a noise figure needs."""
     if count < MIN_ALLAN_SAMPLES:
         raise DataRefused(f'{count} {samples}; an Allan deviation needs at least '
-                          f'{MIN_ALLAN_SAMPLES}: '
-                          'record longer')
+                          f'{MIN_ALLAN_SAMPLES}: record longer')
 
 
 def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
@@ -211,14 +208,13 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
     if not moved.any():
         return
     rests = max(find_runs(~moved), key=lambda rest: rest.stop - rest.start, default=None)
-    longest = ('at rest nowhere' if rests is None else
-               f'at rest longest from {stamps.time_at(rests.start):.1f} '
+    longest = ('at rest nowhere' if rests is None
+               else f'at rest longest from {stamps.time_at(rests.start):.1f} '
                f'to {stamps.time_at(rests.stop - 1):.1f} s')
-    raise DataRefused(
-        'the gyro was moved, or its output jumped: from '
-        f'{stamps.time_at(int(np.argmax(moved))):.2f} s '
-        f'on means over {over * stamps.interval:.3g} s change up to {worst:.0f} standard '
-        f'deviations; it is {longest}: use that part, or record again')
+    raise DataRefused('the gyro was moved, or its output jumped: from '
+                      f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
+                      f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard '
+                      f'deviations; it is {longest}: use that part, or record again')
 
 
 # lost samples
@@ -273,8 +269,8 @@ _LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
 #: Indices of quantization and ramp among the terms, and of terms whose second differences are
 #: independent over longer times.
 _QUANTIZATION_INDEX, _RAMP_INDEX = NOISE_TERMS.index(QUANTIZATION), NOISE_TERMS.index(RATE_RAMP)
-_SHORT_MEMORY_INDICES = [place for place, part in enumerate(NOISE_TERMS)
-                         if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
+_SHORT_MEMORY_INDICES = [
+    place for place, part in enumerate(NOISE_TERMS) if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
 
 
 @dataclass(frozen=True)
@@ -339,8 +335,8 @@ class AllanChart:
 def averaging_sizes(samples: int, per_decade: int = 10) -> Integers:
     """Return averaging times in samples, evenly spaced in log, up to a third of the record."""
     decades = math.log10(max(samples // 3, 1))
-    return np.unique(np.round(
-        np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
+    return np.unique(
+        np.round(np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
 
 
 def allan_deviation(rate: Array, interval: float,
@@ -427,10 +423,10 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
         # the covariance of quantization is nonzero at single lags only
         stride = 1 if part is QUANTIZATION else max(1, size // _LAGS_PER_WINDOW)
         lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
-        squares = (_lag_covariance(part.angle_covariance, size, size, lags) ** 2 *
-                   (count - lags) * stride)
-        freedom.append(max(1.0, float(squares[0]) * count / stride
-                           / float(2.0 * squares.sum() - squares[0])))
+        squares = (_lag_covariance(part.angle_covariance, size, size, lags) ** 2 * (count - lags)
+                   * stride)
+        freedom.append(
+            max(1.0, float(squares[0]) * count / stride / float(2.0 * squares.sum() - squares[0])))
     return np.array(freedom)
 
 
@@ -442,8 +438,8 @@ def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
     Quantization is assumed at the short end only; a steep slope elsewhere is chance.
 
     """
-    low, high = (np.searchsorted(sizes, sizes / 2.0),
-                 np.searchsorted(sizes, 2.0 * sizes, side='right') - 1)
+    low = np.searchsorted(sizes, sizes / 2.0)
+    high = np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
     rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))
     slopes = np.where(
         high > low, rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)
@@ -479,8 +475,8 @@ def covariance_form(samples: int, first: int, second: int,
     1.
 
     """
-    counts, area = ((samples + 1 - 2 * first, samples + 1 - 2 * second),
-                    float(first) ** 2 * float(second) ** 2)
+    counts = (samples + 1 - 2 * first, samples + 1 - 2 * second)
+    area = float(first) ** 2 * float(second) ** 2
     angles = [part.angle_covariance for part in NOISE_TERMS]
     if process is not None:
         angles.append(process.angle_covariance)

@@ -57,11 +57,10 @@ _MIN_OCTAVES = 4
 #: filter: at times beyond its memory it has the slope of quantization, with a negative sign.
 _N, _B, _K, _Q, _R, _PROCESS, _FILTER_BEND = range(len(NOISE_TERMS) + 2)
 #: Combinations of terms, without and with quantization, and with the bend of a filter.
-_COMBINATIONS = [
-    combination for count in range(len(NOISE_TERMS))
-    for places in itertools.combinations((_N, _B, _K, _R), count)
-    for combination in (places, (*places, _Q), (*places, _FILTER_BEND) if _N in places else ())
-    if combination]
+_COMBINATIONS = [combination for count in range(len(NOISE_TERMS))
+                 for places in itertools.combinations((_N, _B, _K, _R), count) for combination in (
+                     places, (*places, _Q), (*places, _FILTER_BEND) if _N in places else ())
+                 if combination]
 
 
 @dataclass(frozen=True)
@@ -92,10 +91,9 @@ class OctaveVariances:
 
     @classmethod
     def from_chart(cls, chart: AllanChart) -> OctaveVariances:
-        columns = np.column_stack([
-            *(part.allan_variance(chart.size) for part in NOISE_TERMS),
-            np.zeros(len(chart.size)), -QUANTIZATION.allan_variance(chart.size)
-        ])
+        columns = np.column_stack([*(part.allan_variance(chart.size) for part in NOISE_TERMS),
+                                   np.zeros(len(chart.size)),
+                                   -QUANTIZATION.allan_variance(chart.size)])
         scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.difference_count)
         forms = (_octave_covariance_forms(chart.samples, tuple(chart.size.tolist()))
                  * np.outer(scarcity, scarcity)[:, :, None, None])
@@ -104,8 +102,8 @@ class OctaveVariances:
     def drop_shortest(self, start: int) -> OctaveVariances:
         """Return the octaves without the shortest averaging times."""
         return OctaveVariances(self.samples, self.size[start:], self.loss_factor[start:],
-                               self.variance[start:], self.columns[start:], self.forms[start:,
-                                                                                       start:])
+                               self.variance[start:], self.columns[start:],
+                               self.forms[start:, start:])
 
     def process_columns(self, process: GaussMarkov) -> Array:
         """Return the columns with that of a process of 1 rad/s, its times in samples."""
@@ -116,9 +114,8 @@ class OctaveVariances:
     def with_process(self, process: GaussMarkov) -> OctaveVariances:
         """Add a process of 1 rad/s, and its part of the covariance."""
         forms = _octave_covariance_forms(self.samples, tuple(self.size.tolist()), process)
-        return replace(
-            self, columns=self.process_columns(process), process=process,
-            forms=forms * np.outer(self.loss_factor, self.loss_factor)[:, :, None, None])
+        return replace(self, columns=self.process_columns(process), process=process, forms=forms
+                       * np.outer(self.loss_factor, self.loss_factor)[:, :, None, None])
 
     def covariance(self, squares: Array) -> Array:
         """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
@@ -170,8 +167,8 @@ class CombinationFit:
         The cube root of a mean square is nearly Gaussian (Wilson and Hilferty, 1931).
 
         """
-        model, deviation = (self.octaves.model_variance(self.squares),
-                            np.sqrt((self.cholesky_factor ** 2).sum(axis=1)))
+        model = self.octaves.model_variance(self.squares)
+        deviation = np.sqrt((self.cholesky_factor ** 2).sum(axis=1))
         ninth = (deviation / model) ** 2 / 9.0
         normal = (np.cbrt(self.octaves.variance / model) - 1.0 + ninth) / np.sqrt(ninth)
         half = self.cholesky_factor / deviation[:, None]
@@ -193,9 +190,9 @@ class CombinationFit:
         Gauss-Markov process counts as two terms.
 
         """
-        return (self.deviance + _TERM_PENALTY *
-                (len(self.active_terms) +
-                 (_PROCESS in self.active_terms)) + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
+        return (self.deviance
+                + _TERM_PENALTY * (len(self.active_terms) + (_PROCESS in self.active_terms))
+                + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
 
     def is_likely(self) -> bool:
         """Return whether the residuals are within chance."""
@@ -242,8 +239,8 @@ def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: 
         white = np.linalg.solve(half, both)
         size = np.linalg.norm(white[:, :-1], axis=0)
         found = nnls(white[:, :-1] / size, white[:, -1])[0] / size
-        if not (found.any() or fixed_square) or (number and np.allclose(
-                squares[list(indices)], found, rtol=1e-4, atol=0.0)):
+        if not (found.any() or fixed_square) or (
+                number and np.allclose(squares[list(indices)], found, rtol=1e-4, atol=0.0)):
             break
         squares[list(indices)] = found
         model, covariance = octaves.model_variance(squares), octaves.covariance(squares)
@@ -300,9 +297,10 @@ class Ranking:
 
         """
         best = self.best
-        return any(index not in each.active_terms and (
-            each.deviance - best.deviance if index == _K else each.penalized_deviance()
-            - best.penalized_deviance()) < _CHI_SQUARED_95 for each in self.process_fits)
+        return any(index not in each.active_terms
+                   and (each.deviance - best.deviance if index == _K
+                        else each.penalized_deviance() - best.penalized_deviance())
+                   < _CHI_SQUARED_95 for each in self.process_fits)
 
     @property
     def detected_terms(self) -> list[int]:
@@ -314,22 +312,17 @@ class Ranking:
     def alternatives(self) -> list[CombinationFit]:
         """Return the combinations of other terms, not more of them, that are nearly as likely."""
         best = self.best
-        return [
-            each for each in self.fits if each.deviance < best.deviance
-            + _ALTERNATIVE_LIMIT and len(each.active_terms) <= len(best.active_terms)
-            and not set(each.active_terms) - {_FILTER_BEND, _Q} <= set(best.active_terms)
-        ]
+        return [each for each in self.fits if each.deviance < best.deviance + _ALTERNATIVE_LIMIT
+                and len(each.active_terms) <= len(best.active_terms)
+                and not set(each.active_terms) - {_FILTER_BEND, _Q} <= set(best.active_terms)]
 
     @cached_property
     def plausible_fits(self) -> list[CombinationFit]:
         """Return the best, likelier ones with more terms, and those joined with alternatives."""
         best = self.best
         both = [{*best.active_terms, *other.active_terms} for other in self.alternatives]
-        return [
-            best,
-            *(each for each in self.fits
-              if each.deviance < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)
-        ]
+        return [best, *(each for each in self.fits if each.deviance
+                        < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
 
 
 def rank_combinations(octaves: OctaveVariances) -> Ranking:
@@ -351,9 +344,8 @@ def rank_combinations(octaves: OctaveVariances) -> Ranking:
                 or (ranking.best_process is not None and ranking.best_process.is_likely())):
             return _rank_from_octave(octaves, start + 1, misfit) if 0 < start < last else ranking
     raise DataRefused(f'the Allan deviations are more than {100 * _MISFIT_SHARES[-1]:.0f} % off '
-                      'any sum '
-                      'of the five noise terms: the record contains something else, such as a '
-                      'swing or a vibration; record again at rest')
+                      'any sum of the five noise terms: the record contains something else, such '
+                      'as a swing or a vibration; record again at rest')
 
 
 def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ranking:
@@ -364,8 +356,8 @@ def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ra
     best = descriptions[0]
     kept = {tuple(place for place in best.active_terms if place not in replaced)
             for replaced in ((_B, _K), (_K,)) if set(replaced) & set(best.active_terms)}
-    return Ranking(start, misfit, descriptions, tuple(filter(None, (
-        _fit_with_process(best, each, misfit) for each in kept))))
+    return Ranking(start, misfit, descriptions,
+                   tuple(filter(None, (_fit_with_process(best, each, misfit) for each in kept))))
 
 
 def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
@@ -386,8 +378,7 @@ def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
         columns, squares, half = (octaves.process_columns(process), np.zeros(_FILTER_BEND + 1),
                                   best.cholesky_factor)
         for _ in range(2):
-            white = np.linalg.solve(half, np.column_stack(
-                [columns[:, places], octaves.variance]))
+            white = np.linalg.solve(half, np.column_stack([columns[:, places], octaves.variance]))
             size = np.linalg.norm(white[:, :-1], axis=0)
             squares[list(places)] = nnls(white[:, :-1] / size, white[:, -1])[0] / size
             model = np.maximum(columns @ squares, 1e-3 * octaves.variance)
@@ -498,25 +489,23 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
     DataRefused : too few samples, or no sum of terms fits them
 
     """
-    chart = allan_deviation(rate, interval, 2.0 ** np.arange(
-        max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
+    chart = allan_deviation(
+        rate, interval,
+        2.0 ** np.arange(max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
     if len(chart.size) < _MIN_OCTAVES or not chart.deviation.all():
         raise DataRefused(f'{len(chart.size)} octaves of averaging times without a gap, the '
-                          'lowest Allan deviation '
-                          f'{chart.deviation.min(initial=math.inf):g} rad/s; wanted '
-                          f'{_MIN_OCTAVES} octaves, all above 0: record longer and without '
-                          'losses')
+                          f'lowest Allan deviation {chart.deviation.min(initial=math.inf):g} '
+                          f'rad/s; wanted {_MIN_OCTAVES} octaves, all above 0: record longer and '
+                          'without losses')
     ranking = rank_combinations(OctaveVariances.from_chart(chart))
     figures = {part.symbol: _build_figure(ranking, place, interval)
                for place, part in enumerate(NOISE_TERMS)}
-    return NoiseFit(
-        figures, chart, float(chart.time[ranking.first_octave]), float(chart.time[-1]),
-        ranking.misfit,
-        tuple(
-            sorted({
-                ''.join(NOISE_TERMS[place].symbol for place in each.active_terms
-                        if place != _FILTER_BEND) for each in ranking.alternatives
-            })), _select_process(ranking, interval))
+    return NoiseFit(figures, chart, float(chart.time[ranking.first_octave]), float(chart.time[-1]),
+                    ranking.misfit,
+                    tuple(sorted({''.join(NOISE_TERMS[place].symbol
+                                          for place in each.active_terms if place != _FILTER_BEND)
+                                  for each in ranking.alternatives})),
+                    _select_process(ranking, interval))
 
 
 def _select_process(ranking: Ranking, interval: float) -> GaussMarkov | None:

@@ -96,9 +96,8 @@ def figures(noise, runs, seed, samples=20_000, quantization=0.0, ramp=0.0):
     for _ in range(runs):
         rate = (simulate_noise(noise, samples, INTERVAL, generator)
                 + ramp * INTERVAL * np.arange(samples))
-        fits.append(fit_noise(
-            rate + np.diff(generator.standard_normal(samples + 1)) * quantization / INTERVAL,
-            INTERVAL).figures)
+        fits.append(fit_noise(rate + np.diff(generator.standard_normal(samples + 1)) * quantization
+                              / INTERVAL, INTERVAL).figures)
     return {part.symbol: [fit[part.symbol] for fit in fits] for part in NOISE_TERMS}
 
 
@@ -178,8 +177,9 @@ def test_white_noise_alone_shows_nothing_else():
     assert all(figure.value > 0.0 for figure in found['N'])
 
 
-@pytest.mark.parametrize('numerator, denominator', [
-    ([0.25, 0.5, 0.25], [1.0]), ([0.3], [1.0, -0.7])], ids=['mean of three', 'lag'])
+@pytest.mark.parametrize('numerator, denominator',
+                         [([0.25, 0.5, 0.25], [1.0]), ([0.3], [1.0, -0.7])],
+                         ids=['mean of three', 'lag'])
 def test_a_filter_of_the_output_does_not_bias_the_angle_random_walk(numerator, denominator):
     generator = np.random.default_rng(7)
     fits = [fit_noise(lfilter(numerator, denominator,
@@ -215,8 +215,8 @@ def stamps(count):
 
 def test_lost_samples_are_counted_and_do_not_change_the_figures():
     generator = np.random.default_rng(10)
-    rate, kept = (simulate_noise(WHITE, 100_000, INTERVAL, generator),
-                  generator.random(100_000) > 0.001)
+    rate = simulate_noise(WHITE, 100_000, INTERVAL, generator)
+    kept = generator.random(100_000) > 0.001
     kept[[0, -1]] = True
     kept[50_000:50_500] = False
     record = build_rest_record(
@@ -236,8 +236,8 @@ def test_lost_samples_are_counted_and_do_not_change_the_figures():
 @pytest.mark.parametrize('share', [0.02, 0.05, 0.1, 0.19])
 def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
     generator = np.random.default_rng(int(1000 * share))
-    rate, kept = (simulate_noise(WHITE, 60_000, INTERVAL, generator),
-                  generator.random(60_000) > share)
+    rate = simulate_noise(WHITE, 60_000, INTERVAL, generator)
+    kept = generator.random(60_000) > share
     kept[[0, -1]] = True
     record = build_rest_record(
         (stamps(60_000) + jitter * INTERVAL * generator.standard_normal(60_000))[kept], rate[kept])
@@ -284,8 +284,8 @@ def bursts(count):
 
 
 def test_stamps_in_bursts_give_the_interval_of_the_gyro():
-    time, rate = (np.sort(bursts(50_000)),
-                  simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(13)))
+    time = np.sort(bursts(50_000))
+    rate = simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(13))
     record = build_rest_record(time, rate)
     assert record.interval == pytest.approx(INTERVAL, rel=1e-4) and 'bursts' in record.remarks[0]
     np.testing.assert_array_equal(record.rate, rate)
@@ -294,8 +294,8 @@ def test_stamps_in_bursts_give_the_interval_of_the_gyro():
 
 
 def moved(kind):
-    rate, generator = (simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(14)),
-                       np.random.default_rng(15))
+    rate = simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(14))
+    generator = np.random.default_rng(15)
     time = stamps(50_000)
     return {'turn': (time, rate + 0.02 * ((time > 200.0) & (time < 230.0))),
             'jolt': (time, rate + 0.2 * np.sin(40.0 * time) * ((time > 200.0) & (time < 200.5))),
@@ -309,13 +309,13 @@ def moved(kind):
                                  + 0.05 * np.sin(time / 80.0) ** 2), rate)}[kind]
 
 
-@pytest.mark.parametrize('kind, said', [
-    ('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest longest from 2[23]\d.*to 500'),
-    ('jolt', r'moved.*from (199|200)\.\d+ s on'), ('swing', 'the record contains something'),
-    ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
-    ('tatters', r'10 ms apart.*--rate'),
-    ('few', '99 samples.*at least 100'), ('lost', '40 % of the samples are lost'),
-    ('uneven', 'no even interval.*--rate')])
+@pytest.mark.parametrize(
+    'kind, said',
+    [('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest longest from 2[23]\d.*to 500'),
+     ('jolt', r'moved.*from (199|200)\.\d+ s on'), ('swing', 'the record contains something'),
+     ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
+     ('tatters', r'10 ms apart.*--rate'), ('few', '99 samples.*at least 100'),
+     ('lost', '40 % of the samples are lost'), ('uneven', 'no even interval.*--rate')])
 def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
         record = build_rest_record(*moved(kind))
@@ -393,8 +393,9 @@ def test_a_recording_in_bursts_is_taken_by_the_gyros_clock(data):
 @pytest.fixture
 def log(tmp_path):
     path = tmp_path / 'rest.csv'
-    write_log(path, Log(time=stamps(20_000), output=simulate_noise(
-        FLICKER, 20_000, INTERVAL, np.random.default_rng(18))))
+    write_log(path,
+              Log(time=stamps(20_000),
+                  output=simulate_noise(FLICKER, 20_000, INTERVAL, np.random.default_rng(18))))
     return path
 
 
@@ -455,8 +456,7 @@ def test_text_data_picture_and_model_have_one_bias_instability(tmp_path, run):
     assert read_model(out).noise.bias_instability == value < answer['floor']['deviation'] / 0.664
     text = f'{value / DEGREE * 3600.0:.4g} deg/h'
     assert f'Bias instability B: {text},' in run('allan', path)[1]
-    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in figure_labels(
-        fit_noise(rate, INTERVAL))['B']
+    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in figure_labels(fit_noise(rate, INTERVAL))['B']
 
 
 def test_what_comes_before_and_after_is_left_out(tmp_path, run):
