@@ -126,8 +126,7 @@ class CalibrationRun:
             return ''
         if math.isinf(self.duration) and self.elapsed > FINISH_TIMEOUT:
             return (f'finish_calibration was not called within {FINISH_TIMEOUT:g} s: call it when '
-                    'the '
-                    'robot stands on the mark again')
+                    'the robot stands on the mark again')
         return None
 
     @property
@@ -259,17 +258,15 @@ class Drive:
         return float(self._motion.rate_at(np.array(elapsed)))
 
     _no_receiver_message = ('no other node receives cmd_vel: start what moves the robot, remap '
-                            'cmd_vel '
-                            'to its topic, or change cmd_vel_stamped')
+                            'cmd_vel to its topic, or change cmd_vel_stamped')
 
     def describe_lateness(self, limits: RunLimits) -> str:
         """Return a sentence on the lateness of commands and samples beyond the residual limit."""
         late = max(self.command_lateness, self.sample_lateness)
         if late * _max_rate(self._motion) <= limits.max_stretch_residual:
             return ''
-        return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s '
-                f'late and samples up to {self.sample_lateness:.2f} s; reduce its load and '
-                'run again')
+        return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s late '
+                f'and samples up to {self.sample_lateness:.2f} s; reduce its load and run again')
 
 
 def _max_rate(motion: Motion) -> float:
@@ -278,8 +275,7 @@ def _max_rate(motion: Motion) -> float:
 
 
 ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '
-                   'or '
-                   'set use_sim_time to false')
+                   'or set use_sim_time to false')
 
 
 class CalibrationSession:
@@ -339,13 +335,12 @@ class CalibrationSession:
 
         """
         if self.run:
-            return ('a calibration is in progress; wait for its end, or call '
-                    'cancel_calibration')
+            return 'a calibration is in progress; wait for its end, or call ' 'cancel_calibration'
         if self._store.problem:
             return self._store.problem
         motion, drives = None, kind == PROFILE and values.calibration_drive
-        duration = {ODOMETRY: values.calibration_duration,
-                    REST: _REST_DURATION}.get(kind, math.inf)
+        duration = {ODOMETRY: values.calibration_duration, REST: _REST_DURATION}.get(
+            kind, math.inf)
         if kind == PROFILE:
             try:
                 file = values.calibration_profile_file
@@ -459,9 +454,8 @@ class CalibrationSession:
         if node_time(self._clock) - self._start_time > 2.0 * run.max_duration + SAMPLE_TIMEOUT:
             self.end('the stamps on imu/data_raw advance too slowly: check the clock of the '
                      'driver, and use_sim_time')
-        suspected, self._silence_suspected = (self._silence_suspected,
-                                              self._clock.steady() - run.last_received
-                                              > SAMPLE_TIMEOUT)
+        suspected = self._silence_suspected
+        self._silence_suspected = self._clock.steady() - run.last_received > SAMPLE_TIMEOUT
         if suspected and self._silence_suspected:
             self.end(f'no sample came for {SAMPLE_TIMEOUT:g} s: check the gyro and its driver')
 
@@ -614,8 +608,8 @@ def _odometry_motion(run: CalibrationRun) -> tuple[float, Motion]:
     time, heading, rate = rows.T
     heading = np.unwrap(heading)
     turned = np.ptp(heading) > _MIN_TURN_ANGLE
-    motion = (motion_from_headings(time, heading) if turned else motion_from_rates(
-        time - time[0], rate))
+    motion = (motion_from_headings(time, heading) if turned
+              else motion_from_rates(time - time[0], rate))
     return float(time[0]), motion
 
 

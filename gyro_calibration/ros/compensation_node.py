@@ -157,8 +157,8 @@ class CompensationNode(Node):
 
     def _offer_service(self, name: str,
                        fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
-        allow_deferred_response(self.create_service(
-            Trigger, f'~/{name}', lambda _, response: fill(response)))
+        allow_deferred_response(
+            self.create_service(Trigger, f'~/{name}', lambda _, response: fill(response)))
 
     def _use_parameters(self, values: SimpleNamespace) -> None:
         self._values = values
@@ -242,9 +242,8 @@ class CompensationNode(Node):
         names = [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
                  for each in self.get_publishers_info_by_topic(self._samples.topic_name)]
         self._pipeline.update_publishers(names)
-        self._has_subscribers = ({
-            each: each.get_subscription_count() > 0 for each in self._has_subscribers
-        })
+        self._has_subscribers = {each: each.get_subscription_count() > 0
+                                 for each in self._has_subscribers}
         self._count_receivers()
         if not self._pipeline.session.is_driving:  # else `_drive` does
             self._pipeline.poll(self._receivers)

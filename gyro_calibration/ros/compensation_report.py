@@ -83,25 +83,23 @@ class CompensationReport:
                   monitor.noise_alarm, estimator.calibration_message, store.table_hint)
         low, high = estimator.model.valid_temperatures
         event = pipeline.journal.event
-        counted = {
-            'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
-            'refused_temperatures': event,
-            'lost_samples': 'samples are lost: check the cable, the baud rate and the load of '
-                            'the computer; the heading is integrated over the gaps, and its '
-                            'variance includes them',
-            'beyond_range': 'the rate is beyond the calibrated range; the correction is '
-                            'extrapolated',
-            'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
-                                   f'{high:g} degC; the correction is extrapolated, and its '
-                                   'variance increases'}
+        counted = {'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
+                   'refused_temperatures': event,
+                   'lost_samples': 'samples are lost: check the cable, the baud rate and the load '
+                   'of the computer; the heading is integrated over the gaps, and '
+                   'its variance includes them',
+                   'beyond_range': 'the rate is beyond the calibrated range; the correction is '
+                   'extrapolated',
+                   'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
+                   f'{high:g} degC; the correction is extrapolated, and its '
+                   'variance increases'}
         temperature = ''
         if estimator.temperature is None and estimator.model.uses_channel('temperature'):
             temperature = ('no temperature comes; the model is used at its reference temperature '
                            f'of {estimator.model.reference_temperature:g} degC')
         elif estimator.temperature is not None and estimator.is_temperature_lost:
             temperature = (f'the temperature is missing; {estimator.temperature:.1f} degC, the '
-                           'last one, is held, and the standard deviation of the bias '
-                           'increases')
+                           'last one, is held, and the standard deviation of the bias increases')
         warnings = [*(text for name, text in counted.items() if name in growing),
                     *filter(None, (temperature, *missing, *others))]
         if warnings:
@@ -121,32 +119,27 @@ class CompensationReport:
         needed = estimator.model.uses_channel('temperature')
         calibration = estimator.model.self_calibration
         age = f'{estimator.age(date) / 3600.0:.2f}' if calibration else ''
-        written = ('' if store.table_written_time is None else
-                   f'{(date - store.table_written_time) / 60.0:.1f}')
+        written = ('' if store.table_written_time is None
+                   else f'{(date - store.table_written_time) / 60.0:.1f}')
         commands, samples = pipeline.session.max_lateness
-        return {
-            **journal.counts, 'rate_hz': f'{rate:.1f}',
-            'longest_gap_s': f'{estimator.tracker.intervals.longest_gap:.3f}',
-            'clock_steps': journal.clock_steps,
-            'heading_deg': f'{tracker.heading / DEGREE:.3f}',
-            'heading_standard_deviation_deg': f'{heading_deviation:.3f}',
-            'deleted_heading_deg': f'{tracker.deleted_heading / DEGREE:.3f}',
-            **self._rest_values(),
-            **(calibration.to_dict() if calibration else {}), 'calibration_age_h': age,
-            'calibration_now': estimator.calibration_message,
-            'temperature_degc': ''
-            if estimator.temperature is None else f'{estimator.temperature:.2f}',
-            'temperature_range_degc': f'{low:g} to {high:g}' if needed else '',
-            'command_lateness_s': f'{commands:.3f}',
-            'sample_lateness_s': f'{samples:.3f}',
-            'refused_calibrations': journal.refused_calibrations,
-            'refusals': ' | '.join(journal.refusal_reasons),
-            'bias_table_entries': len(estimator.table.entries),
-            'bias_table_held_back': estimator.table.held_back_count,
-            'bias_table_written_min': written,
-            'bias_table': store.table_hint,
-            **_monitor_values(pipeline.monitor), 'last_event': journal.event
-        }
+        return {**journal.counts, 'rate_hz': f'{rate:.1f}',
+                'longest_gap_s': f'{estimator.tracker.intervals.longest_gap:.3f}',
+                'clock_steps': journal.clock_steps,
+                'heading_deg': f'{tracker.heading / DEGREE:.3f}',
+                'heading_standard_deviation_deg': f'{heading_deviation:.3f}',
+                'deleted_heading_deg': f'{tracker.deleted_heading / DEGREE:.3f}',
+                **self._rest_values(), **(calibration.to_dict() if calibration else {}),
+                'calibration_age_h': age, 'calibration_now': estimator.calibration_message,
+                'temperature_degc': '' if estimator.temperature is None
+                else f'{estimator.temperature:.2f}',
+                'temperature_range_degc': f'{low:g} to {high:g}' if needed else '',
+                'command_lateness_s': f'{commands:.3f}', 'sample_lateness_s': f'{samples:.3f}',
+                'refused_calibrations': journal.refused_calibrations,
+                'refusals': ' | '.join(journal.refusal_reasons),
+                'bias_table_entries': len(estimator.table.entries),
+                'bias_table_held_back': estimator.table.held_back_count,
+                'bias_table_written_min': written, 'bias_table': store.table_hint,
+                **_monitor_values(pipeline.monitor), 'last_event': journal.event}
 
     def _rest_values(self) -> dict[str, object]:
         pipeline, now = self._pipeline, self._clock.steady()
@@ -159,16 +152,14 @@ class CompensationReport:
             method = ('threshold, since the model has no angle random walk: measure it with '
                       'allan for the method rest')
         unseen = moving is None and not math.isnan(slowest)
-        return {
-            'stationary_method': method, 'resting': tracker.is_resting,
-            'bias_deg_s': f'{bias / DEGREE:.5f}',
-            'bias_standard_deviation_deg_s': f'{deviation / DEGREE:.5f}',
-            'slowest_noticed_turn_deg_s': f'{slowest:.4f}',
-            'slow_turns': 'without wheels or commands, slower turns cannot be distinguished from '
-                          'drift'
-            if unseen else '',
-            'wheels': {True: 'moving', False: 'standing', None: 'unknown'}[moving],
-            'wheels_age_s': f'{age:.2f}' if math.isfinite(age) else ''}
+        return {'stationary_method': method, 'resting': tracker.is_resting,
+                'bias_deg_s': f'{bias / DEGREE:.5f}',
+                'bias_standard_deviation_deg_s': f'{deviation / DEGREE:.5f}',
+                'slowest_noticed_turn_deg_s': f'{slowest:.4f}',
+                'slow_turns': 'without wheels or commands, slower turns cannot be '
+                'distinguished from drift' if unseen else '',
+                'wheels': {True: 'moving', False: 'standing', None: 'unknown'}[moving],
+                'wheels_age_s': f'{age:.2f}' if math.isfinite(age) else ''}
 
 
 def _monitor_values(monitor: HealthMonitor) -> dict[str, object]:
@@ -182,8 +173,8 @@ def _monitor_values(monitor: HealthMonitor) -> dict[str, object]:
             'noise_alarm': monitor.noise_alarm, 'bias_alarm': monitor.bias_alarm}
 
 
-def calibration_status(store: StateStore, run: CalibrationRun | None
-                       ) -> tuple[bytes, str, Mapping[str, object]]:
+def calibration_status(store: StateStore, run: CalibrationRun | None) -> tuple[
+        bytes, str, Mapping[str, object]]:
     """Return level, message and values of the latched state of the calibration."""
     calibration = store.model.self_calibration
     values: dict[str, object] = {'calibrated': calibration is not None, 'running': run is not None}

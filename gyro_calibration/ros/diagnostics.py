@@ -55,6 +55,5 @@ class Diagnostics:
         """Make and publish a report; may be called from any thread."""
         with self._lock:
             report = self._report()
-            self._publisher.publish(
-                status_array(self._node, self._name, report, self._hardware))
+            self._publisher.publish(status_array(self._node, self._name, report, self._hardware))
             self.level = report[0]

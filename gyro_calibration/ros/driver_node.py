@@ -226,8 +226,8 @@ class SampleMessages:
         imu.linear_acceleration.z = force or 0.0
         if (force is not None) is not self._has_force:
             self._has_force = force is not None
-            imu.linear_acceleration_covariance[:] = (z_axis_covariance(ASSUMED_FORCE_NOISE ** 2) if
-                                                     self._has_force else NOT_REPORTED_COVARIANCE)
+            imu.linear_acceleration_covariance[:] = z_axis_covariance(
+                ASSUMED_FORCE_NOISE ** 2) if self._has_force else NOT_REPORTED_COVARIANCE
 
 
 def settings_from_parameters(values: SimpleNamespace) -> Settings:

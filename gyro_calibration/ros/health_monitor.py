@@ -273,10 +273,9 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
                 < level)
     too_little = (not hidden
                   and chdtr(count, count * measured * _MAX_NOISE_REDUCTION ** 2 / claimed) < level)
-    return RestResult(
-        float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
-        *_test_bias(time, rate, largest * size * interval, noise, level, bias_variance, age,
-                    0.5 * step if hidden else 0.0), is_announced)
+    return RestResult(float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
+                      *_test_bias(time, rate, largest * size * interval, noise, level,
+                                  bias_variance, age, 0.5 * step if hidden else 0.0), is_announced)
 
 
 def _test_bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,

@@ -18,9 +18,8 @@ import math
 import reprlib
 from types import SimpleNamespace
 
-_TYPE_NAMES: dict[type, str] = {
-    bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text',
-    list: 'a list of strings'}
+_TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number',
+                                str: 'text', list: 'a list of strings'}
 
 
 @dataclass(frozen=True)
@@ -76,14 +75,12 @@ class Parameter:
         return value
 
     def _refuse(self, value: object, wanted: str) -> None:
-        raise ValueError(
-            f'parameter {self.name} is {reprlib.repr(value)}, but must be {wanted}')
+        raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be {wanted}')
 
 
 def parameter_values(table: Sequence[Parameter],
                      given: Mapping[str, object] | None = None) -> SimpleNamespace:
     """Return the values of a table by attribute: checked given values, else defaults."""
     given = given or {}
-    return SimpleNamespace(**{
-        each.attribute: each.check(given[each.name]) if each.name in given else each.default
-        for each in table})
+    return SimpleNamespace(**{each.attribute: each.check(given[each.name]) if each.name in given
+                              else each.default for each in table})

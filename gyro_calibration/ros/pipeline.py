@@ -245,8 +245,8 @@ class Pipeline:
     def _message_time(self, stamp: int) -> float:
         """Return the time of a message other than a sample, s."""
         since = self._since_epoch(stamp)
-        return (since if self._last_time == -math.inf else self._host_time.convert_message(
-            since, self._last_time))
+        return (since if self._last_time == -math.inf
+                else self._host_time.convert_message(since, self._last_time))
 
     def _sample_time(self, stamp: int, silence: float) -> float:
         """Return the time of a sample, s, after a silence, s."""
@@ -403,8 +403,8 @@ class Pipeline:
         sources = _WHEEL_SOURCES[self.values.wheels]
         moving = self.wheels.is_moving(now, sources) if sources else None
         (interval, silence), received = since, self.journal.last_received
-        lost, unseen = (estimator.tracker.intervals.lost_samples,
-                        not 0.0 < interval <= DRIVE_SAMPLE_TIMEOUT)
+        lost = estimator.tracker.intervals.lost_samples
+        unseen = not 0.0 < interval <= DRIVE_SAMPLE_TIMEOUT
         if unseen and not moving and not self.wheels.has_stood(received, now, sources):
             moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
@@ -439,10 +439,9 @@ class Pipeline:
                   if known and self._usual_interval < math.inf else self.values.assumed_bias ** 2)
         # After a reset the variance is that of one sample; zero would state an exact heading.
         least = tracker.rate_variance * min(self._usual_interval, 1.0) ** 2
-        found = CorrectedSample(
-            stamp + self._stamp_offset, tracker.heading,
-            max(tracker.variance, least) if known else UNMEASURED_VARIANCE, estimator.rate,
-            tracker.rate_variance + spread)
+        found = CorrectedSample(stamp + self._stamp_offset, tracker.heading,
+                                max(tracker.variance, least) if known else UNMEASURED_VARIANCE,
+                                estimator.rate, tracker.rate_variance + spread)
         if not math.isfinite(found.heading + found.heading_variance + found.rate
                              + found.rate_variance):
             return None
@@ -518,10 +517,10 @@ class Pipeline:
         caught up.
 
         """
-        usual, interval = (NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval,
-                           stamp - self._last_stamp)
-        behind, begins = (self._backlog, self._clock.steady() - self._last_arrival
-                          > DRIVE_SAMPLE_TIMEOUT)
+        usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
+        interval = stamp - self._last_stamp
+        behind = self._backlog
+        begins = self._clock.steady() - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
         self._backlog = 0.0 if begins else min(max(behind + interval - usual, 0.0),
                                                NSEC_PER_SEC * DRIVE_SAMPLE_TIMEOUT)
         if self._have_same_name:
@@ -568,16 +567,16 @@ class Pipeline:
         self.ros_time.poll(self._clock)
         # A drive ends where several publishers exist, before their samples mix.
         conflict = self.conflict or (self.publisher_conflict if self.session.is_driving else '')
-        self.session.poll(self.values, receivers, self.ros_time.paused_duration
-                          > DRIVE_SAMPLE_TIMEOUT, conflict)
+        self.session.poll(self.values, receivers,
+                          self.ros_time.paused_duration > DRIVE_SAMPLE_TIMEOUT, conflict)
 
     def run_periodic_tasks(self, is_final: bool = False) -> None:
         """Update bias table and files; to be called once per second, and at the end."""
         if self._clock.simulated() is None:
             self._update_host_clock()
         # Two faults in a row: delayed samples come in a burst, and are late until then.
-        before, self._suspected_clock_fault = (self._suspected_clock_fault,
-                                               self._stamp_delay.find_fault())
+        before = self._suspected_clock_fault
+        self._suspected_clock_fault = self._stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
         if self.clock_fault:
             self._add_unknown_turn(math.tau)

@@ -113,10 +113,9 @@ class RecorderNode(Node):
         # By the steady clock, so that times of receipt do not jump when the clock is set.
         def take(data: bytes) -> None:
             self.message_count += 1
-            self._on_message(
-                Message(topic,
-                        kind, self._clock_offset + round(read_steady_clock() * NSEC_PER_SEC),
-                        bytes(data)), definition)
+            self._on_message(Message(topic, kind, self._clock_offset
+                                     + round(read_steady_clock() * NSEC_PER_SEC), bytes(data)),
+                             definition)
         self._subscriptions_of[topic] = offered, self.create_subscription(
             load_message_class(kind), topic, take, qos, raw=True)
 
@@ -164,8 +163,8 @@ def _build_definition(kind: str) -> str:
     kinds, parts = [kind], []
     for each in kinds:
         fields = load_message_class(each).get_fields_and_field_types()
-        head = ('' if each == kind else
-                f'{DEFINITION_SEPARATOR}\nMSG: {each.replace("/msg/", "/")}\n')
+        head = ('' if each == kind
+                else f'{DEFINITION_SEPARATOR}\nMSG: {each.replace("/msg/", "/")}\n')
         parts.append(head + ''.join(f'{_format_field_type(text)} {name}\n'
                                     for name, text in fields.items()))
         inner = [re.sub(r'^sequence<|[,>\[].*$', '', text).replace('/', '/msg/')
@@ -184,9 +183,9 @@ def _format_field_type(text: str) -> str:
     return _TYPE_ALIASES.get(word, word) + bracket + length
 
 
-def take_messages(topics: Sequence[str], all_topics: bool, on_message: Callable[[Message, str],
-                                                                                None],
-                  tick: Callable[[RecorderNode], None], stop: threading.Event) -> None:
+def take_messages(topics: Sequence[str], all_topics: bool,
+                  on_message: Callable[[Message, str], None], tick: Callable[[RecorderNode], None],
+                  stop: threading.Event) -> None:
     """
     Receive the messages of topics until stopped.
 

@@ -76,9 +76,9 @@ class Wheels:
 
     def has_stood(self, since: float, now: float, sources: Collection[str]) -> bool:
         """Tell whether one of these sources has shown standstill since a time, s."""
-        return self.is_moving(now, sources) is False and any(self._standing_since[source] <= since
-                                                             for source in sources
-                                                             if source in self._standing_since)
+        return self.is_moving(now, sources) is False and any(
+            self._standing_since[source] <= since
+            for source in sources if source in self._standing_since)
 
     def turn_rate(self, now: float) -> float:
         """Return the rate about z by odometry, rad/s; 0 without recent data."""

@@ -109,8 +109,9 @@ def faults():
     }
 
 
-@pytest.mark.parametrize('fault, ros', [(fault, ros) for fault in faults() for ros in (
-    None, 1000.0) if ros or 'ROS time' not in fault])
+@pytest.mark.parametrize('fault, ros',
+                         [(fault, ros) for fault in faults()
+                          for ros in (None, 1000.0) if ros or 'ROS time' not in fault])
 def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault, ros):
     rig = rested(tmp_path, calibration_drive=True, ros=ros)
     rig.drive_to()
@@ -521,8 +522,7 @@ def test_a_jump_of_the_stamps_ends_a_run_and_the_reason_names_it(tmp_path):
 def test_an_error_in_the_fit_changes_nothing_and_the_next_run_works(tmp_path, monkeypatch):
     rig = rested(tmp_path, calibration_drive=True)
     with monkeypatch.context() as patched:
-        patched.setattr('gyro_calibration.ros.calibration_session.fit_run',
-                        lambda *_: 1 / 0)
+        patched.setattr('gyro_calibration.ros.calibration_session.fit_run', lambda *_: 1 / 0)
         success, message = rig.calibrate()
     assert not success and 'nothing was changed' in message and 'ZeroDivisionError' in message
     assert rig.calibrate()[0]
@@ -586,8 +586,7 @@ def test_odometry_may_be_finished_early(tmp_path):
 
 def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
     rig = rested(tmp_path, calibration_reference=TURNS, calibration_turns=2)
-    assert rig.session.finish() == (False,
-                                    'no calibration by turns or by odometry is in progress')
+    assert rig.session.finish() == (False, 'no calibration by turns or by odometry is in progress')
     rig.begin(TURNS)
     assert 'no sample has come since' in rig.session.finish()[1]
     rig.go(3.0)

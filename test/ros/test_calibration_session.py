@@ -70,8 +70,8 @@ def test_a_run_is_complete_after_its_motion_and_the_rest(kind, motion, duration,
     run, answer = ran(kind, motion, rules(), duration)
     assert answer == '' and run.elapsed == pytest.approx(takes, abs=0.1) and run.progress > 0.99
     calibration, said = fit_run(run, rules(), Noise(), '2026-01-01')
-    assert ((calibration.scale_factor_error, calibration.bias) == (
-        pytest.approx(S, abs=2e-3), pytest.approx(B, abs=1e-4)) and said)
+    assert ((calibration.scale_factor_error, calibration.bias)
+            == (pytest.approx(S, abs=2e-3), pytest.approx(B, abs=1e-4)) and said)
     assert calibration.temperature == 25.0 and calibration.time == '2026-01-01'
 
 
@@ -98,13 +98,13 @@ def test_a_run_of_known_length_may_be_longer_than_one_that_waits_for_a_call(kind
 def test_odometry_without_a_yaw_is_taken_by_its_rates():
     run, _ = ran(ODOMETRY, CALIBRATION_MOTION, rules(), 20.0)
     run.odometry = [(time, 0.0, rate) for time, _, rate in run.odometry]
-    assert fit_run(run, rules(), Noise(), '')[0].scale_factor_error == pytest.approx(
-        S, abs=5e-3)
+    assert fit_run(run, rules(), Noise(), '')[0].scale_factor_error == pytest.approx(S, abs=5e-3)
 
 
-@pytest.mark.parametrize('spoil, reason', [
-    (lambda given: [], '0 messages came on odom'), (lambda given: given[:20], '20 messages came'),
-    (lambda given: given[::-1], 'increasing stamps')], ids=['none', 'too few', 'out of order'])
+@pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
+                                           (lambda given: given[:20], '20 messages came'),
+                                           (lambda given: given[::-1], 'increasing stamps')],
+                         ids=['none', 'too few', 'out of order'])
 def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
     run, _ = ran(ODOMETRY, CALIBRATION_MOTION, rules(), 20.0)
     run.odometry = spoil(run.odometry)

@@ -72,8 +72,8 @@ def test_driver_and_compensation_go_on_together_where_the_clock_is_set(
         start_node('driver_node', {'port': gyro.path})
         wait_until(lambda: len(heading) > 200, 90.0, 'headings')
         for hours in (3.0, 1.0):
-            later, begin = (heading[-1].header.stamp.sec + (HOUR if hours == 3.0 else -2.0 * HOUR),
-                            len(heading))
+            later = heading[-1].header.stamp.sec + (HOUR if hours == 3.0 else -2.0 * HOUR)
+            begin = len(heading)
             set_clock(hours * HOUR)
             wait_until(lambda: abs(heading[-1].header.stamp.sec - later) < 100.0  # noqa: B023
                        and len(heading) > begin + 200,  # noqa: B023

@@ -106,8 +106,7 @@ def start(start_node, ros, wait_until, tmp_path):
     (tmp_path / 'model.yaml').write_text(MODEL)
 
     def start():
-        parameters = {'calibration_file': tmp_path / 'calibration.yaml',
-                      'stationary.threshold': 0}
+        parameters = {'calibration_file': tmp_path / 'calibration.yaml', 'stationary.threshold': 0}
         return start_node('compensation_node', parameters), FakeGyro(ros, wait_until)
     return start
 
@@ -142,8 +141,8 @@ def sample(number, rate):
     """Return a message of a gyro of 100 Hz."""
     message = Imu()
     message.header.frame_id, message.angular_velocity.z = 'gyro', rate
-    message.header.stamp.sec, message.header.stamp.nanosec = (
-        1_700_000_000 + number // 100, number % 100 * 10 ** 7)
+    message.header.stamp.sec = 1_700_000_000 + number // 100
+    message.header.stamp.nanosec = number % 100 * 10 ** 7
     return message
 
 
@@ -218,8 +217,8 @@ def test_samples_that_come_while_the_node_is_not_let_run_are_all_used(start):
 def test_parameters_are_checked_described_and_taken_on_at_once(hold):
     held = hold(stationary__threshold=0)
     names = held.node.get_parameters_by_prefix('')
-    own = [name for name in names if not name.startswith('qos_overrides') and name not in (
-        'use_sim_time', 'start_type_description_service')]
+    own = [name for name in names if not name.startswith('qos_overrides')
+           and name not in ('use_sim_time', 'start_type_description_service')]
     assert len(own) == 18, own
     described = held.node.describe_parameters(own)
     assert all(each.description.endswith('.') for each in described)
@@ -262,8 +261,8 @@ def test_services_answer_when_they_are_done_and_the_result_outlives_the_node(
     assert read_model(tmp_path / 'calibration.yaml').self_calibration.bias == pytest.approx(
         0.02, abs=4e-4)
     assert node.stop() == 0
-    start_node('compensation_node', parameters={
-        'calibration_file': tmp_path / 'calibration.yaml', 'stationary.threshold': 0})
+    start_node('compensation_node', parameters={'calibration_file': tmp_path / 'calibration.yaml',
+                                                'stationary.threshold': 0})
     gyro.meet()
     assert 'bias 1.14' in gyro.status[-1].status[0].message
     gyro.play(np.full(20, 0.32))

@@ -41,10 +41,11 @@ def test_a_report_has_the_full_name_the_level_and_all_values_as_text(ros, heard,
     assert heard[-1].header.stamp.sec > 0
 
 
-@pytest.mark.parametrize('node_class, name, parameters, words', [
-    (DriverNode, 'driver_node: gyro', {'port': '/nonexistent/gyro'}, 'does not exist'),
-    (CompensationNode, 'compensation_node: heading', {'use_sim_time': 'true'},
-     'ROS time stands still')], ids=['driver', 'compensation'])
+@pytest.mark.parametrize('node_class, name, parameters, words',
+                         [(DriverNode, 'driver_node: gyro', {'port': '/nonexistent/gyro'},
+                           'does not exist'), (CompensationNode, 'compensation_node: heading',
+                                               {'use_sim_time': 'true'}, 'ROS time stands still')],
+                         ids=['driver', 'compensation'])
 def test_a_node_reports_in_its_namespace_also_without_gyro_samples_and_clock(
         hold_node, wait_until, tmp_path, node_class, name, parameters, words):
     if node_class is CompensationNode:

@@ -57,9 +57,8 @@ class Disk:
 
     def __init__(self, folder):
         self.folder, self.process = folder, None
-        self.is_mounted = subprocess.run(
-            ['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs', folder],
-            capture_output=True).returncode == 0
+        self.is_mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs',
+                                          folder], capture_output=True).returncode == 0
 
     def fill(self):
         """Leave no room."""

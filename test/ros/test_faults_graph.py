@@ -46,8 +46,8 @@ class Turning:
     """An emulated gyro whose rate is the number of the sample; it begins when its port opens."""
 
     def __init__(self, link, protocol='csv', **how):
-        self.begin, settings = (
-            math.nan, SETTINGS if protocol == 'csv' else Settings(sample_rate=RATE))
+        self.begin = math.nan
+        settings = SETTINGS if protocol == 'csv' else Settings(sample_rate=RATE)
         self.emulator = Emulator(find_protocol(protocol), self._samples(), settings, link=link,
                                  wait_for_reader=True, **how)
 
@@ -97,9 +97,8 @@ class Heard:
 
     def latency(self, turning, first, last=None):
         """Return the median of how late rates were, from a place of the lists to another, s."""
-        return float(
-            np.median([arrival - turning.begin - number / RATE for number, arrival in zip(
-                self.numbers[first:last], self.arrivals[first:last])]))
+        return float(np.median([arrival - turning.begin - number / RATE for number, arrival in zip(
+            self.numbers[first:last], self.arrivals[first:last])]))
 
     def says(self, words):
         """Wait until a report of the node has the words in its message or values."""
@@ -131,8 +130,8 @@ def test_two_compensation_nodes_go_on_through_any_order_of_starting_and_a_driver
     node, first = compensation()
     _, second = compensation('second', maximum_gap=20.0)
     first.says('is the driver running?')
-    driver, turning = (start_node('driver_node', DRIVER | {'port': tmp_path / 'gyro'}),
-                       Turning(tmp_path / 'gyro'))
+    driver = start_node('driver_node', DRIVER | {'port': tmp_path / 'gyro'})
+    turning = Turning(tmp_path / 'gyro')
     with turning.emulator:
         for heard in (first, second):
             heard.more(200)

@@ -46,13 +46,12 @@ def stretches(noise, hours, generator, scale=1.0):
 
 def examined(outputs, noise, false_alarms, step=0.0):
     """Examine each stretch alone, at the level of a health monitor, and return the results."""
-    time, level = (np.arange(outputs.shape[1]) * INTERVAL,
-                   0.25 * false_alarms * STRETCH_DURATION / 3600.0)
+    time = np.arange(outputs.shape[1]) * INTERVAL
+    level = 0.25 * false_alarms * STRETCH_DURATION / 3600.0
     variance = noise.angle_random_walk ** 2 / STRETCH_DURATION
-    return [
-        examine_stretch(time, output, output, noise, level, step, variance,
-                        600.0 + STRETCH_DURATION * number) for number, output in enumerate(outputs)
-    ]
+    return [examine_stretch(time, output, output, noise, level, step, variance,
+                            600.0 + STRETCH_DURATION * number)
+            for number, output in enumerate(outputs)]
 
 
 @pytest.mark.parametrize('runs', [30, pytest.param(100, marks=pytest.mark.evidence)])
@@ -62,8 +61,7 @@ def test_single_stretches_give_false_alarms_no_more_often_than_stated(noise, run
     stated, minutes, generator = 40.0, 6.0, np.random.default_rng(11)
     records = [stretches(noise, minutes / 60.0, generator) for _ in range(runs)]
     for step in (0.0, 1e-4, 3e-3):  # of the output
-        coarse = [(np.round(each / step + 0.3) - 0.3) * step if step else each
-                  for each in records]
+        coarse = [(np.round(each / step + 0.3) - 0.3) * step if step else each for each in records]
         rests = [examined(outputs, noise, stated, step) for outputs in coarse]
         alarms = [sum(not rest.is_noise_normal or not rest.is_bias_normal
                       for rest in run if rest is not None) for run in rests]
@@ -141,8 +139,8 @@ def test_a_measured_gyro_is_silent_for_hours_and_not_by_a_model_of_half_its_nois
     """10 000 s of an ADIS16405 at rest; the model has its noise and the bias of its first 15 s."""
     log = read_log(data / 'mems_static' / 'adis16405_1.csv.gz', rate=100.0)
     record = build_rest_record(log.time, log.output)
-    noise, rate = (fit_noise(record.rate, record.interval).noise,
-                   log.output - log.output[:1500].mean())
+    noise = fit_noise(record.rate, record.interval).noise
+    rate = log.output - log.output[:1500].mean()
     half = replace(noise, angle_random_walk=0.5 * noise.angle_random_walk)
     for claimed, length in ((noise, len(rate)), (half, 4000)):
         check, alarmed = HealthMonitor(claimed, 0.001, 0.3 * DEGREE), 0
@@ -193,10 +191,9 @@ def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():
                                  second.bias + wander * generator.normal(), covariance)
         alarms += bool(describe_change(first, second, MEMS, age, level))
     assert fewest(2000, level) <= alarms <= most(2000, level)
-    moved = describe_change(
-        first,
-        SelfCalibration(first.scale_factor_error + 0.02, first.bias + 1.0 * DEGREE, covariance),
-        MEMS, age, 1e-3)
+    moved = describe_change(first, SelfCalibration(first.scale_factor_error + 0.02,
+                                                   first.bias + 1.0 * DEGREE, covariance),
+                            MEMS, age, 1e-3)
     assert 'the scale factor error changed by 2.000 % (' in moved
     assert 'the bias changed by 1.0000 deg/s (' in moved
     assert not describe_change(SelfCalibration(), second, MEMS, age,

@@ -28,11 +28,10 @@ CONFIG = Path(__file__).parents[2] / 'config'
 FOXGLOVE = json.loads((CONFIG / 'foxglove.json').read_text())
 PLOTJUGGLER = ElementTree.parse(CONFIG / 'plotjuggler.xml').getroot()
 SCRIPT = FOXGLOVE['userNodes']['heading_band']['sourceCode']
-TOPICS = {
-    '/imu/data_raw': Imu, '/imu/temperature': Temperature, '/imu/data': Imu,
-    '/heading': PoseWithCovarianceStamped, '/yaw_rate': TwistWithCovarianceStamped,
-    '/compensation_node/calibration_status': DiagnosticArray, '/diagnostics': DiagnosticArray,
-}
+TOPICS = {'/imu/data_raw': Imu, '/imu/temperature': Temperature, '/imu/data': Imu,
+          '/heading': PoseWithCovarianceStamped, '/yaw_rate': TwistWithCovarianceStamped,
+          '/compensation_node/calibration_status': DiagnosticArray,
+          '/diagnostics': DiagnosticArray}
 STATUSES = {'/driver_node: gyro', '/compensation_node: heading'}
 FUNCTIONS = {'degrees', 'sqrt'}  # of the message paths of Foxglove
 

@@ -217,9 +217,9 @@ def test_a_gyro_that_repeats_one_value_is_an_error_and_the_heading_claims_nothin
     assert reported(rig)[0] != ERROR
 
 
-@pytest.mark.parametrize('output', [
-    np.zeros(3000), np.round(noisy(120.0) / 0.02) * 0.02, np.repeat(noisy(30.0), 4)],
-    ids=['zero', 'coarse steps', 'each sample four times'])
+@pytest.mark.parametrize('output', [np.zeros(3000), np.round(noisy(120.0) / 0.02) * 0.02,
+                                    np.repeat(noisy(30.0), 4)],
+                         ids=['zero', 'coarse steps', 'each sample four times'])
 def test_gyros_that_repeat_values_by_themselves_are_no_error(tmp_path, output):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(noisy(10.0), SLOW)
@@ -508,14 +508,14 @@ def test_a_temperature_of_the_future_is_one_of_now(tmp_path):
     assert rig.pipeline.estimator.is_temperature_lost
 
 
-TEMPERATURE_MODEL = yaml.safe_dump({
-    'effects': {'rate_temperature_polynomial': {'orders': [0, 1], 't0w0': 0.0, 't1w0': 0.001}},
-    'valid': {'temperature': [20.0, 40.0], 'rate': [-1.0, 1.0]}})
+TEMPERATURE_MODEL = yaml.safe_dump(
+    {'effects': {'rate_temperature_polynomial': {'orders': [0, 1], 't0w0': 0.0, 't1w0': 0.001}},
+     'valid': {'temperature': [20.0, 40.0], 'rate': [-1.0, 1.0]}})
 
 
-@pytest.mark.parametrize('temperature, used, counted', [
-    (25.0, 25.0, 0), (55.0, 55.0, 200), (90.0, 60.0, 200), (None, 30.0, 0)],
-    ids=['inside', 'outside', 'far outside', 'none'])
+@pytest.mark.parametrize('temperature, used, counted',
+                         [(25.0, 25.0, 0), (55.0, 55.0, 200), (90.0, 60.0, 200), (None, 30.0, 0)],
+                         ids=['inside', 'outside', 'far outside', 'none'])
 def test_the_temperature_is_used_extrapolated_held_or_replaced(tmp_path, temperature, used,
                                                                counted):
     rig = Rig(tmp_path, model=TEMPERATURE_MODEL, stationary_threshold=0.0)
@@ -637,9 +637,9 @@ def monitored(tmp_path, outputs, **parameters):
     return rig
 
 
-@pytest.mark.parametrize('moved, parameters', [
-    (0.15 * DEGREE, {}), (1.0 * DEGREE, {}), (0.15 * DEGREE, {'stationary_threshold': 0.0})],
-    ids=['below the threshold', 'above the threshold', 'without a threshold'])
+@pytest.mark.parametrize('moved, parameters', [(0.15 * DEGREE, {}), (1.0 * DEGREE, {}),
+                                               (0.15 * DEGREE, {'stationary_threshold': 0.0})],
+                         ids=['below the threshold', 'above the threshold', 'without a threshold'])
 def test_a_bias_that_moved_raises_an_alarm(tmp_path, moved, parameters):
     rig = monitored(tmp_path, noisy(42.0, bias=0.01 + moved), **parameters)
     monitor = rig.pipeline.monitor
@@ -686,8 +686,7 @@ def test_effects_with_a_past_gain_in_a_drive_what_they_promise(tmp_path):
     truth = integrate(seconds, rate)
     log = Log(output=rate, time=seconds, temperature=heated, reference_rate=rate,
               reference_heading=truth)
-    output = simulate_gyro_output(full, seconds,
-                                  channels_from_log(log).with_rate(rate, rate),
+    output = simulate_gyro_output(full, seconds, channels_from_log(log).with_rate(rate, rate),
                                   np.random.default_rng(4))
     log = Log(output=output, time=seconds, temperature=heated, reference_rate=rate,
               reference_heading=truth)
@@ -696,8 +695,8 @@ def test_effects_with_a_past_gain_in_a_drive_what_they_promise(tmp_path):
         rig = Rig(tmp_path, model=model(effects), stationary_method='none',
                   calibration_file=tmp_path / 'none.yaml')
         found = headings(rig.feed(output, 0.1, temperature=heated))
-        promised = integrate(seconds, LogCompensation(
-            read_model(tmp_path / 'model.yaml')).add(log)[0].rate)
+        promised = integrate(seconds,
+                             LogCompensation(read_model(tmp_path / 'model.yaml')).add(log)[0].rate)
         error = found - found[0] - truth
         np.testing.assert_allclose(found - found[0], promised, rtol=0.0, atol=0.01)
         rms[name] = float(np.sqrt(np.mean(error ** 2)))

@@ -47,9 +47,8 @@ class Stage:
         self.ros, self.wait_until, self._start_node, self._folder = (
             ros, wait_until, start_node, folder)
         self.samples, self.reports = ros.collect(Imu, 'imu/data'), []
-        ros.node.create_subscription(
-            DiagnosticArray, '/diagnostics',
-            lambda array: self.reports.append(array.status[0]), 10)
+        ros.node.create_subscription(DiagnosticArray, '/diagnostics',
+                                     lambda array: self.reports.append(array.status[0]), 10)
         self.closing = []
 
     def robot(self, **how):
@@ -120,8 +119,7 @@ def stage(ros, wait_until, start_node, tmp_path):
         close()
 
 
-def test_without_a_clock_of_the_simulation_nothing_drives_and_where_it_stops_the_robot_does(
-        stage):
+def test_without_a_clock_of_the_simulation_nothing_drives_and_where_it_stops_the_robot_does(stage):
     robot = stage.robot(speed=1.0)
     robot.clock_absent = True
     stage.node(use_sim_time='true')
@@ -171,8 +169,8 @@ def test_a_second_commander_is_obeyed_at_once(stage):
         stage.wait_until(answer.done, 30.0, 'the answer')
         assert any(each in answer.result().message
                    for each in ('another node sent a command', *HELD_UP)), answer.result().message
-        own = [when for when, each in list(robot.commands)
-               if each not in (0.0, rate) and when > begin]
+        own = [when
+               for when, each in list(robot.commands) if each not in (0.0, rate) and when > begin]
         assert max(own, default=begin) - begin < 2.0
         stage.wait_until(lambda: abs(robot.robot.rate - rate) < 0.01,  # noqa: B023
                          10.0, 'the other one has it')

@@ -37,9 +37,9 @@ def test_nothing_received_shows_nothing(wheels):
     assert wheels.turn_rate(10.0) == 0.0
 
 
-@pytest.mark.parametrize('given, moving', [
-    (velocity(), False), (velocity(0.0009, 0.0001), False), (velocity(-0.01), True),
-    (velocity(0.0, -9e-4), True)], ids=['zero', 'below the limits', 'back', '0.05 deg/s'])
+@pytest.mark.parametrize('given, moving', [(velocity(), False), (velocity(0.0009, 0.0001), False),
+                                           (velocity(-0.01), True), (velocity(0.0, -9e-4), True)],
+                         ids=['zero', 'below the limits', 'back', '0.05 deg/s'])
 def test_a_velocity_beyond_small_limits_is_motion(wheels, given, moving):
     wheels.add(ODOMETRY, given, 10.0)
     assert wheels.is_moving(10.5) is moving and wheels.age(10.5) == 0.5
