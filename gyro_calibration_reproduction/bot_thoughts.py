@@ -57,13 +57,11 @@ ENCODER_STEP, SAMPLE_RATE = 2.0 * DEGREE, 50.0
 #: Of the data sheet: 0.03 deg/s/sqrt(Hz), a one-sided density, which is sqrt(2) N.
 NOISE = Noise(0.03 * DEGREE / math.sqrt(2.0))
 #: Turns by hand at varying rates.
-HAND_MOTION = constant_rate_motion([(5, 0), (8, 60), (8, -120), (8, 200), (5, 0), (8, -200),
-                                    (8, 120), (8, -60), (5, 0)], 1.0)
-ASSUMED = (
-    'The log of the encoder turntable is not published; 63 s of turning by hand up to 200 deg/s '
-    'are simulated, with the noise of the L3G4200D (0.03 deg/s/sqrt(Hz)), an encoder of 2 deg '
-    'that begins anywhere in a step, 50 Hz, and a known scale.',
-)
+HAND_MOTION = constant_rate_motion(
+    [(5, 0), (8, 60), (8, -120), (8, 200), (5, 0), (8, -200), (8, 120), (8, -60), (5, 0)], 1.0)
+ASSUMED = ('The log of the encoder turntable is not published; 63 s of turning by hand up to 200 '
+           'deg/s are simulated, with the noise of the L3G4200D (0.03 deg/s/sqrt(Hz)), an encoder '
+           'of 2 deg that begins anywhere in a step, 50 Hz, and a known scale.',)
 
 
 def reproduce(generator: np.random.Generator, runs: int = 200,
@@ -172,19 +170,18 @@ def _code_contradictions() -> list[Contradiction]:
 
 
 def _strobe_contradiction() -> Contradiction:
-    off, (first, second) = (100.0 *
-                            (1.0 - MEASURED_STROBE_FREQUENCY / STROBE_FREQUENCY), segment_slopes())
+    off, (first, second) = (100.0 * (1.0 - MEASURED_STROBE_FREQUENCY / STROBE_FREQUENCY),
+                            segment_slopes())
     corrected = SCALE_FACTOR * STROBE_FREQUENCY / MEASURED_STROBE_FREQUENCY
     numbers = {'off': off, 'slopes': 100.0 * (second / first - 1.0), 'corrected': corrected,
                'crystal': 100.0 * 80e-6, 'left': 100.0 * (1.0 - corrected / SOLVED_SCALE),
                'nominal': 100.0 * (-SENSITIVITY * first - 1.0)}
-    return Contradiction(numbers,
-                         'Part 1: a strobe at 59.8 Hz has an error of {off:.2f} %, as much as '
-                         'the slopes differ ({slopes:.2f} %); the tolerance of the crystal is '
-                         '{crystal:.3f} %. A scale error of the reference and one of the gyro '
-                         'are not distinguishable: if the strobe was slow, SF is '
-                         '{corrected:.3f}, and the solver differs by {left:.2f} %; the first '
-                         'slope alone agrees with the data sheet to {nominal:.3f} %.')
+    return Contradiction(
+        numbers, 'Part 1: a strobe at 59.8 Hz has an error of {off:.2f} %, as much as the slopes '
+        'differ ({slopes:.2f} %); the tolerance of the crystal is {crystal:.3f} %. A scale '
+        'error of the reference and one of the gyro are not distinguishable: if the strobe '
+        'was slow, SF is {corrected:.3f}, and the solver differs by {left:.2f} %; the first '
+        'slope alone agrees with the data sheet to {nominal:.3f} %.')
 
 
 # an encoder of 2 deg

@@ -61,9 +61,8 @@ class Comparison:
         if self.published.startswith('~'):
             return (self.ours * self.published_value > 0.0
                     and round(math.log10(self.ours / self.published_value)) == 0)
-        return (abs(self.ours - self.published_value)
-                <= 0.5 * 10.0 ** -_count_decimals(self.published) *
-                (1.0 + 1e-9) + self.uncertainty)
+        return (abs(self.ours - self.published_value) <= 0.5
+                * 10.0 ** -_count_decimals(self.published) * (1.0 + 1e-9) + self.uncertainty)
 
     @property
     def verdict(self) -> str:
@@ -81,11 +80,8 @@ class Comparison:
     def cells(self) -> tuple[str, ...]:
         """Return quantity, unit, place, published, ours and verdict as words for people."""
         ours = _format_rounded(self.ours, self.uncertainty, self.published)
-        verdict = '; '.join(
-            filter(None, [
-                ': '.join(filter(None, [self.verdict, '' if self.is_reproduced else self.why])),
-                self.note
-            ]))
+        verdict = '; '.join(filter(None, [': '.join(
+            filter(None, [self.verdict, '' if self.is_reproduced else self.why])), self.note]))
         return self.quantity, self.unit, self.place, self.published or '-', ours, verdict
 
 

@@ -66,12 +66,11 @@ def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
     """Reproduce the numbers of the paper."""
     errors = np.array([drive_errors(generator) for _ in progress(range(runs))])
-    return Reproduction(
-        TITLE, ASSUMED,
-        (*_compare_self_calibration(), *_compare_own_figures(), *_compare_table_1(errors)),
-        (_rectangle_rule(), _short_move(), _exchanged_columns(),
-         _efficiency(generator, runs, progress), _bias_unit(), _percentages(), _half_an_hour(),
-         _noise_over_threshold(errors), _slow_turns()))
+    return Reproduction(TITLE, ASSUMED, (*_compare_self_calibration(), *_compare_own_figures(),
+                                         *_compare_table_1(errors)),
+                        (_rectangle_rule(), _short_move(), _exchanged_columns(),
+                         _efficiency(generator, runs, progress), _bias_unit(), _percentages(),
+                         _half_an_hour(), _noise_over_threshold(errors), _slow_turns()))
 
 
 # figures 6 and 7
@@ -126,8 +125,8 @@ def published_motion() -> Motion:
 
     """
     durations = np.arange(60, 120) / REFERENCE_SAMPLE_RATE
-    duration = min(durations, key=lambda length: abs(
-        errors_by_rectangles(one_turn(1.0, length))[0] + 4.8))
+    duration = min(durations,
+                   key=lambda length: abs(errors_by_rectangles(one_turn(1.0, length))[0] + 4.8))
     return one_turn(20.26 / -errors_by_rectangles(one_turn(1.0, duration))[1], duration)
 
 
@@ -135,24 +134,20 @@ def _compare_self_calibration() -> list[Comparison]:
     motion = published_motion()
     time, rate = noiseless_output(motion)
     by_rate, likely = fit_rate(time, rate, motion), fit_likelihood(time, rate, motion)
-    estimators = (('heading reference, rectangle rule of eq. 4', errors_by_rectangles(motion),
-                   ('4.8', '20.26'), 'fig. 6', 'by a turn made to fit'),
-                  ('heading reference, trapezoid rule', errors_by_trapezoids(motion), ('', ''), '',
-                   ''), ('rate reference', _percent_errors(by_rate.scale_factor_error,
-                                                           by_rate.bias), ('0', '0'), 'fig. 7',
-                         ''), ('likelihood', _percent_errors(likely.scale_factor_error,
-                                                             likely.bias), ('', ''), '', ''))
-    rows = [
-        Comparison(f'error of {name}, {estimator}', '%', abs(error), published, place, note=note)
-        for estimator, errors, texts, place, note in estimators
-        for name, error, published in zip('sb', errors, texts)
-    ]
-    return [
-        Comparison('s_bar for s = -10 %', '1', 1.0 / (1.0 + TRUE_SCALE_ERROR), '1.111',
-                   'section 3.1'),
-        Comparison('b_bar for b = 0.1 rad/s', 'rad/s', -TRUE_BIAS / (1.0 + TRUE_SCALE_ERROR),
-                   '-0.111', 'section 3.1'), *rows
-    ]
+    estimators = (
+        ('heading reference, rectangle rule of eq. 4', errors_by_rectangles(motion),
+         ('4.8', '20.26'), 'fig. 6', 'by a turn made to fit'),
+        ('heading reference, trapezoid rule', errors_by_trapezoids(motion), ('', ''), '', ''),
+        ('rate reference', _percent_errors(by_rate.scale_factor_error, by_rate.bias), ('0', '0'),
+         'fig. 7', ''),
+        ('likelihood', _percent_errors(likely.scale_factor_error, likely.bias), ('', ''), '', ''))
+    rows = [Comparison(f'error of {name}, {estimator}', '%', abs(error), published, place,
+                       note=note) for estimator, errors, texts, place, note in estimators
+            for name, error, published in zip('sb', errors, texts)]
+    return [Comparison('s_bar for s = -10 %', '1', 1.0 / (1.0 + TRUE_SCALE_ERROR), '1.111',
+                       'section 3.1'),
+            Comparison('b_bar for b = 0.1 rad/s', 'rad/s', -TRUE_BIAS / (1.0 + TRUE_SCALE_ERROR),
+                       '-0.111', 'section 3.1'), *rows]
 
 
 def equation_8(motion: Motion, as_printed: bool) -> Array:
@@ -198,8 +193,8 @@ def _short_move() -> Contradiction:
 
 
 def _exchanged_columns() -> Contradiction:
-    printed, exchanged = (equation_8(CALIBRATION_MOTION,
-                                     True), equation_8(CALIBRATION_MOTION, False))
+    printed = equation_8(CALIBRATION_MOTION, True)
+    exchanged = equation_8(CALIBRATION_MOTION, False)
     return Contradiction({'first': printed[0], 'second': printed[1], 'right_first': exchanged[0],
                           'right_second': exchanged[1]},
                          'Eq. 8: the columns of the matrix are exchanged. The printed form gives'
@@ -400,9 +395,8 @@ def _efficiency(generator: np.random.Generator, runs: int, progress: Progress) -
     bound = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns))
                     * white.rate_variance(1.0 / GYRO_SAMPLE_RATE))
     ratios = np.std(found, axis=0, ddof=1).reshape(2, 2) / bound
-    return Contradiction({'s': ratios[0, 0], 'b': ratios[0, 1], 'likely_s': ratios[1, 0],
-                          'likely_b': ratios[1, 1]},
-                         'Eq. 7: least squares on headings treats a random walk as independent '
-                         'errors. Its standard deviations are {s:.2f} (s) and {b:.2f} (b) times '
-                         'the Cramer-Rao bound, those of the likelihood {likely_s:.2f} and '
-                         '{likely_b:.2f}.')
+    return Contradiction(
+        {'s': ratios[0, 0], 'b': ratios[0, 1], 'likely_s': ratios[1, 0], 'likely_b': ratios[1, 1]},
+        'Eq. 7: least squares on headings treats a random walk as independent errors. Its '
+        'standard deviations are {s:.2f} (s) and {b:.2f} (b) times the Cramer-Rao bound, those of '
+        'the likelihood {likely_s:.2f} and {likely_b:.2f}.')

@@ -91,12 +91,11 @@ def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
     """Reproduce the numbers of the paper."""
     found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
-    return Reproduction(
-        TITLE, ASSUMED,
-        (*_compare_own_figures(), *_compare_instrument(), *_compare_results(found)),
-        (_index(), _data_sets(), _condition(), _regressor(generator),
-         _sine(generator, len(found),
-               progress), _order_of_magnitude(found), _percent(found), _full_turn(), _earth()))
+    return Reproduction(TITLE, ASSUMED, (*_compare_own_figures(), *_compare_instrument(),
+                                         *_compare_results(found)),
+                        (_index(), _data_sets(), _condition(), _regressor(generator),
+                         _sine(generator, len(found), progress), _order_of_magnitude(found),
+                         _percent(found), _full_turn(), _earth()))
 
 
 # a rate table
@@ -170,9 +169,8 @@ def simulate_turn_errors(gyro: GyroModel, models: Sequence[GyroModel], rates: Ar
     output = gyro.output(rate, temperature) + simulate_noise(
         gyro.noise, len(rate), 1.0 / OUTPUT_RATE, generator)
     begins = np.cumsum(lengths) - lengths
-    means = np.array([
-        np.add.reduceat(model.rate(output, temperature) - rate, begins) / lengths
-        for model in models])
+    means = np.array([np.add.reduceat(model.rate(output, temperature) - rate, begins) / lengths
+                      for model in models])
     return (means[:, 1::2] - means[:, 0::2]) * turning / OUTPUT_RATE, turning / OUTPUT_RATE
 
 
@@ -218,15 +216,13 @@ def _compare_instrument() -> list[Comparison]:
 
 
 def _compare_results(found: Array) -> list[Comparison]:
-    means, uncertainties = (found.mean(axis=0),
-                            3.0 * found.std(axis=0, ddof=1) / math.sqrt(len(found)))
+    means = found.mean(axis=0)
+    uncertainties = 3.0 * found.std(axis=0, ddof=1) / math.sqrt(len(found))
     percent = 100.0 / (2.0 * math.pi)
-    rows = [
-        Comparison('rms error of the rate, static bias only', 'deg/s', means[0, 0] / DEGREE,
-                   uncertainty=uncertainties[0, 0] / DEGREE),
-        Comparison('largest error of a full turn, static bias only', '%', percent * means[0, 1],
-                   uncertainty=percent * uncertainties[0, 1]),
-    ]
+    rows = [Comparison('rms error of the rate, static bias only', 'deg/s', means[0, 0] / DEGREE,
+                       uncertainty=uncertainties[0, 0] / DEGREE),
+            Comparison('largest error of a full turn, static bias only', '%',
+                       percent * means[0, 1], uncertainty=percent * uncertainties[0, 1])]
     for number, (rates, temperatures) in enumerate(CAMPAIGNS, 1):
         ratio = found[:, 0, 0] / found[:, number, 0]
         name = f'n = {rates * temperatures}'
@@ -254,15 +250,14 @@ def _order_of_magnitude(found: Array) -> Contradiction:
 def _percent(found: Array) -> Contradiction:
     before, after = (float(100.0 * found[:, number, 1].mean() / (2.0 * math.pi))
                      for number in (0, -1))
-    return Contradiction({'specified': NONLINEARITY + SCALE_OVER_TEMPERATURE / 2.0,
-                          'before': before, 'after': after,
-                          'left': 100.0 * float((found[:, -1, 0] / found[:, 0, 0]).mean())},
-                         'Section 5: "less than 2 %" does not state of which quantity. As a '
-                         'share of the rate, Table I allows {specified:.1f} % before any '
-                         'calibration (0.5 % and half of 2 %), and the synthetic gyro has '
-                         '{before:.2f} % of a turn before and {after:.2f} % after. As a share of'
-                         ' the error, one order of magnitude is 10 %; {left:.1f} % of the error '
-                         'of the synthetic gyro remains.')
+    return Contradiction(
+        {'specified': NONLINEARITY + SCALE_OVER_TEMPERATURE / 2.0, 'before': before,
+         'after': after, 'left': 100.0 * float((found[:, -1, 0] / found[:, 0, 0]).mean())},
+        'Section 5: "less than 2 %" does not state of which quantity. As a share of the rate, '
+        'Table I allows {specified:.1f} % before any calibration (0.5 % and half of 2 %), and the '
+        'synthetic gyro has {before:.2f} % of a turn before and {after:.2f} % after. As a share '
+        'of the error, one order of magnitude is 10 %; {left:.1f} % of the error of the synthetic '
+        'gyro remains.')
 
 
 # misprints, and properties of the method
@@ -302,25 +297,23 @@ def condition_numbers() -> tuple[float, float]:
     """Return the condition numbers for deg/s and degC, raw, and centred and scaled to +-1."""
     rates, temperatures = rate_temperature_grid(
         full_range_rates(21) / DEGREE, np.linspace(MIN_TEMPERATURE, MAX_TEMPERATURE, 11))
-    middle, half = ((MIN_TEMPERATURE + MAX_TEMPERATURE) / 2.0,
-                    (MAX_TEMPERATURE - MIN_TEMPERATURE) / 2.0)
-    raw, scaled = (
-        np.linalg.cond(np.column_stack([rate ** i * temperature ** j
-                                        for j in range(TEMPERATURE_ORDER + 1)
-                                        for i in range(RATE_ORDER + 1)]))
-        for rate, temperature in ((rates, temperatures),
-                                  (rates / FULL_SCALE, (temperatures - middle) / half)))
+    middle = (MIN_TEMPERATURE + MAX_TEMPERATURE) / 2.0
+    half = (MAX_TEMPERATURE - MIN_TEMPERATURE) / 2.0
+    raw, scaled = (np.linalg.cond(np.column_stack([rate ** i * temperature ** j
+                                                   for j in range(TEMPERATURE_ORDER + 1)
+                                                   for i in range(RATE_ORDER + 1)]))
+                   for rate, temperature in ((rates, temperatures),
+                                             (rates / FULL_SCALE, (temperatures - middle) / half)))
     return float(raw), float(scaled)
 
 
 def _condition() -> Contradiction:
     raw, scaled = condition_numbers()
-    return Contradiction({'raw': raw, 'scaled': scaled, 'digits': math.log10(raw),
-                          'normal': 2.0 * math.log10(raw)},
-                         'Eq. 10: raw powers of deg/s and degC have the condition number '
-                         '{raw:.1e}, centred and scaled ones {scaled:.0f}. The raw powers lose '
-                         '{digits:.0f} of 16 digits, and by normal equations {normal:.0f}, which'
-                         ' is all.')
+    return Contradiction(
+        {'raw': raw, 'scaled': scaled, 'digits': math.log10(raw), 'normal': 2.0 * math.log10(raw)},
+        'Eq. 10: raw powers of deg/s and degC have the condition number {raw:.1e}, centred and '
+        'scaled ones {scaled:.0f}. The raw powers lose {digits:.0f} of 16 digits, and by normal '
+        'equations {normal:.0f}, which is all.')
 
 
 def regressor_error(deviation: float, averaged: int, generator: np.random.Generator,
@@ -378,9 +371,8 @@ def extrapolation_errors(sine_constant: float,
 
 
 def _sine(generator: np.random.Generator, runs: int, progress: Progress) -> Contradiction:
-    found = [[
-        extrapolation_errors(sagnac, generator) for sagnac in (SINE_CONSTANT, STRONG_SINE_CONSTANT)
-    ] for _ in progress(range(runs))]
+    found = [[extrapolation_errors(sagnac, generator)
+              for sagnac in (SINE_CONSTANT, STRONG_SINE_CONSTANT)] for _ in progress(range(runs))]
     (weak, weak_sine), (strong, strong_sine) = np.mean(found, axis=0) / DEGREE
     return Contradiction(
         {
