@@ -181,12 +181,8 @@ class _Increments:
 MAX_BLOCK_DURATION = 0.5
 #: Prior standard deviations: of the error of the present delay, s, and of the lag, s².
 DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
-
-
 #: Two offsets fit equally well if the ratio of their misfits is below this.
 _MAX_MISFIT_RATIO = 1.5
-
-
 #: Rate and acceleration are differences over this time, s, or an interval if longer, to either
 #: side: over less, noise dominates them.
 _MIN_SMOOTHING_TIME = 0.01

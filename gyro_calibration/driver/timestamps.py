@@ -176,7 +176,7 @@ class _SampleCounter:
         self.reset()
 
     def reset(self) -> None:
-        self.mean_advance, self.ambiguity, self._unevenness, self._is_sequence_stuck = (
+        self.mean_advance, self.ambiguity, self._unevenness, self._is_sequence_frozen = (
             1.0, 1, 0.0, False)
         self._odd_advances, self._odd_lost = list[float](), 0
         self._sequence: int | None = None
@@ -188,7 +188,7 @@ class _SampleCounter:
         Return the advance to this sample, and the number of samples lost before it.
 
         A time of the device beyond `max_advance` is wrong: the sample came too early. A repeated
-        sequence is stuck, unless a whole cycle of it fits into the time.
+        sequence is frozen, unless a whole cycle of it fits into the time.
 
         """
         if self.modulus and sample.sequence is not None:
@@ -200,13 +200,13 @@ class _SampleCounter:
         return advance, sample.missing
 
     def _advance_by_sequence(self, sequence: int, missing: int, may_wrap: bool) -> tuple[int, int]:
-        last, self._sequence, stood = self._sequence, sequence, self._is_sequence_stuck
-        self._is_sequence_stuck = sequence == last and (stood or not may_wrap)
-        self.ambiguity = 1 if self._is_sequence_stuck else self.modulus
+        last, self._sequence, was_frozen = self._sequence, sequence, self._is_sequence_frozen
+        self._is_sequence_frozen = sequence == last and (was_frozen or not may_wrap)
+        self.ambiguity = 1 if self._is_sequence_frozen else self.modulus
         if last is None:
             return 1, 0
-        # after it was stuck, it counts from the next sample on
-        if self._is_sequence_stuck or stood:
+        # after it was frozen, it counts from the next sample on
+        if self._is_sequence_frozen or was_frozen:
             return 1 + missing, missing
         advance = (sequence - last) % self.modulus or self.modulus
         # The number of missing samples by damaged bytes gives the number of wraps.

@@ -187,8 +187,8 @@ def _find_separator(line: str) -> str:
 
 def _resolve_log_path(path: str, log: str) -> str:
     """Return the path of a log in a table: relative to the table, or to the working folder."""
-    beside_table = Path(path).parent / log
-    return str(beside_table) if beside_table.exists() or not Path(log).exists() else log
+    relative = Path(path).parent / log
+    return str(relative) if relative.exists() or not Path(log).exists() else log
 
 
 def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:

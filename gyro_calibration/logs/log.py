@@ -76,8 +76,6 @@ _MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 20, 1 <<
 _MAX_LOG_VALUES = 1 << 29
 
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading')
-
-
 #: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
 #: as text.
 _ParsedRows = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]

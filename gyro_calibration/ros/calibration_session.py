@@ -198,7 +198,7 @@ class Drive:
             run, run.motion, clock, sample_timeout)
         self._start_time = self._last_poll = clock.steady()
         self._has_receiver = self._silence_suspected = False
-        self._had_callers = self._callers_gone = False
+        self._had_callers = self._lost_callers = False
         self._next_command_time = -math.inf
         self._stamp_delay = StampDelay(clock, DRIVE_SAMPLE_TIMEOUT, _DRIVE_COMPARISON_TIME)
         self.command_lateness = self.sample_lateness = 0.0
@@ -235,10 +235,10 @@ class Drive:
                 'and its driver') if before and self._silence_suspected else ''
 
     def is_abandoned(self, callers: int) -> bool:
-        """Tell whether the callers of the service are gone at two polls in a row."""
+        """Tell whether the service has lost its callers at two polls in a row."""
         self._had_callers = self._had_callers or callers > 0
-        before, self._callers_gone = self._callers_gone, self._had_callers and not callers
-        return before and self._callers_gone
+        before, self._lost_callers = self._lost_callers, self._had_callers and not callers
+        return before and self._lost_callers
 
     def next_command(self) -> float | None:
         """Return the rate to command now, rad/s; None if no command is due."""

@@ -49,7 +49,7 @@ from gyro_calibration.ros.compensation_report import calibration_status, Compens
 from gyro_calibration.ros.diagnostics import Diagnostics, OK, status_array
 from gyro_calibration.ros.pipeline import CorrectedSample, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
-    allow_deferred_response,
+    allow_future_response,
     call_every,
     declare_parameters,
     LATCHED_QOS,
@@ -157,7 +157,7 @@ class CompensationNode(Node):
 
     def _offer_service(self, name: str,
                        fill: Callable[[Trigger.Response], Trigger.Response | Future]) -> None:
-        allow_deferred_response(
+        allow_future_response(
             self.create_service(Trigger, f'~/{name}', lambda _, response: fill(response)))
 
     def _use_parameters(self, values: SimpleNamespace) -> None:

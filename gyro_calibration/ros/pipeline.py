@@ -225,7 +225,7 @@ class Pipeline:
         self._backlog = 0.0  # delay of the last samples, ns
         self._trusted_heading = 0.0, 0.0
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
-        self._stuck_stamp: tuple[float, float] | None = None
+        self._frozen_stamp: tuple[float, float] | None = None
         self.repeat_fault, self._repeat_detector = '', RepeatedOutputDetector(noise)
         self.clock_fault, self._suspected_clock_fault, self._stamp_delay = '', '', StampDelay(
             clock, _INTERLEAVING_WINDOW, _CLOCK_COMPARISON_TIME)
@@ -366,12 +366,12 @@ class Pipeline:
         time = self._sample_time(stamp, silence)
         if time == self._last_time:
             counts['repeated_stamps'] += 1
-            first, fastest = self._stuck_stamp or (now, 0.0)
-            self._stuck_stamp = first, max(fastest, abs(output))
+            first, fastest = self._frozen_stamp or (now, 0.0)
+            self._frozen_stamp = first, max(fastest, abs(output))
             journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
             return None
-        if self._stuck_stamp is not None:
-            (first, fastest), self._stuck_stamp = self._stuck_stamp, None
+        if self._frozen_stamp is not None:
+            (first, fastest), self._frozen_stamp = self._frozen_stamp, None
             if now - first > DRIVE_SAMPLE_TIMEOUT:  # add the possible turn meanwhile
                 self._add_unknown_turn(min(fastest * (now - first), math.tau))
                 journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '

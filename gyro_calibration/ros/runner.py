@@ -208,7 +208,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
             signal.signal(number, signal.SIG_IGN)
 
 
-def allow_deferred_response(service: Service) -> None:
+def allow_future_response(service: Service) -> None:
     """
     Allow the callback of a service to return a `Future`; its response is sent when it is done.
 

@@ -569,8 +569,8 @@ def test_a_reference_at_its_own_times_lies_on_the_line_between_its_values(make, 
 def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path, turning, sign):
     time, rate, heading = turning
     lost = (time > 5.0) & (time < 12.0)  # more than two turns
-    poses = [(at, make.pose(at, np.nan if gone else h))
-             for at, h, gone in zip(time, heading, lost)]
+    poses = [(at, make.pose(at, np.nan if is_lost else h))
+             for at, h, is_lost in zip(time, heading, lost)]
     imu = gyro(make, time, sign * (rate + 0.3))  # a bias, and perhaps upside down
     log = read_recording(write(tmp_path / 'bag', {'imu': imu, 'pose': poses}),
                          Topics(reference='pose'))

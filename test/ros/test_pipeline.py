@@ -141,7 +141,7 @@ def test_over_a_gap_that_is_not_integrated_the_variance_holds_what_may_have_been
     ('none', 0.0, False), ('odom', 0.0, True), ('odom', 0.8, False), ('odom', None, False)],
     ids=['without wheels', 'wheels that stand', 'wheels that turn', 'without odometry'])
 def test_a_turn_while_the_gyro_is_unplugged_is_in_the_variance(tmp_path, wheels, odometry, known):
-    """It rests before and after, so that the rates beside the gap say nothing of the turn."""
+    """It rests before and after, so that the rates around the gap do not show the turn."""
     rig = Rig(tmp_path, model=KNOWN, wheels=wheels)
     before = rig.feed(noisy(5.0), SLOW, moving=0.0)[-1]
     for _ in range(60):
@@ -227,25 +227,25 @@ def test_gyros_that_repeat_values_by_themselves_are_no_error(tmp_path, output):
     assert rig.pipeline.repeat_fault == ''
 
 
-@pytest.mark.parametrize('acceleration, stuck', [(5.0, False), (100.0, True)])
+@pytest.mark.parametrize('acceleration, is_repeated', [(5.0, False), (100.0, True)])
 def test_zeros_are_those_of_a_dead_gyro_where_no_robot_stops_so_fast(
-        tmp_path, acceleration, stuck):
+        tmp_path, acceleration, is_repeated):
     rig = Rig(tmp_path, model=KNOWN)
     rig.feed(noisy(10.0, 0.9), SLOW)
     stop = np.maximum(0.9 - acceleration * SLOW * np.arange(1.0, 60.0), 0.0)
     rig.feed(np.where(stop > 0.0, noisy(59 * SLOW, stop), 0.0), SLOW)
-    assert bool(rig.pipeline.repeat_fault) == stuck
+    assert bool(rig.pipeline.repeat_fault) == is_repeated
 
 
-@pytest.mark.parametrize('step, stuck', [(0.002, True), (0.02, False)])
+@pytest.mark.parametrize('step, is_repeated', [(0.002, True), (0.02, False)])
 def test_a_saturated_gyro_of_coarse_steps_is_an_error_as_soon_as_chance_is_ruled_out(
-        tmp_path, step, stuck):
+        tmp_path, step, is_repeated):
     rig = Rig(tmp_path, model=KNOWN)
     outputs = np.round(noisy(60.0, 0.5 * np.sin(np.arange(1500) / 50.0)) / step) * step
     rig.feed(outputs, SLOW)
     assert not rig.pipeline.repeat_fault
     rig.feed(np.full(500, 0.3), SLOW)
-    assert bool(rig.pipeline.repeat_fault) == stuck
+    assert bool(rig.pipeline.repeat_fault) == is_repeated
 
 
 def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_nothing(tmp_path):
