@@ -79,8 +79,7 @@ STOPPING_DURATION = 1.5
 _MIN_TURN_ANGLE = 1.0 * DEGREE
 #: Largest number of own commands that have not come back; 5 s at 50 Hz.
 _MAX_PENDING_COMMANDS = 256
-#: Longest pause of the node in a drive, s: after it the base has stopped by itself, or turned
-#: on.
+#: Longest pause of the node in a drive, s: after it the base has stopped by itself, or turned on.
 _MAX_NODE_PAUSE = 1.0
 #: Time over which stamps and clock are compared in a drive, s; it shows a jump of the stamps.
 _DRIVE_COMPARISON_TIME = 2.0
