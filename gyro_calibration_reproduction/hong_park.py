@@ -180,12 +180,9 @@ def _short_move() -> Contradiction:
     fit = fit_heading(*noiseless_output(motion), motion)
     found, (s, b) = (SelfCalibration(fit.scale_factor_error, fit.bias),
                      _percent_errors(fit.scale_factor_error, fit.bias))
-    numbers = {
-        's_bar': 100.0 * (found.scale * (1.0 + TRUE_SCALE_ERROR) - 1.0),
-        'b_bar': 100.0 * (found.offset * (1.0 + TRUE_SCALE_ERROR) / -TRUE_BIAS - 1.0),
-        's': s,
-        'b': b
-    }
+    numbers = {'s_bar': 100.0 * (found.scale * (1.0 + TRUE_SCALE_ERROR) - 1.0),
+               'b_bar': 100.0 * (found.offset * (1.0 + TRUE_SCALE_ERROR) / -TRUE_BIAS - 1.0),
+               's': s, 'b': b}
     return Contradiction(numbers,
                          'Figure 6: a trapezoid of 3.8 s up to 0.4 rad/s errs by {s_bar:.2f} % in '
                          's_bar and {b_bar:.2f} % in b_bar, which is {s:.1f} % in s and {b:.1f} % '
@@ -243,15 +240,12 @@ def _bias_unit() -> Contradiction:
 
 
 def _percentages() -> Contradiction:
-    return Contradiction(
-        {
-            'table': _percent_reduction(CALIBRATED_ROW[0]),
-            'mean': _percent_reduction(PROPOSED_ROW[0]),
-            'deviation': 100.0 - 100.0 * PROPOSED_ROW[1] / PURE_ROW[1]
-        }, 'Section 4.2: the text states that self-calibration reduces the error '
-        'by 41 %, table 1 by {table:.0f} %. Both methods together reduce the '
-        'mean error by {mean:.0f} %, and its standard deviation by '
-        '{deviation:.0f} %.')
+    return Contradiction({'table': _percent_reduction(CALIBRATED_ROW[0]),
+                          'mean': _percent_reduction(PROPOSED_ROW[0]),
+                          'deviation': 100.0 - 100.0 * PROPOSED_ROW[1] / PURE_ROW[1]},
+                         'Section 4.2: the text states that self-calibration reduces the error by '
+                         '41 %, table 1 by {table:.0f} %. Both methods together reduce the mean '
+                         'error by {mean:.0f} %, and its standard deviation by {deviation:.0f} %.')
 
 
 def _half_an_hour() -> Contradiction:
@@ -347,15 +341,12 @@ def _noise_over_threshold(errors: Array) -> Contradiction:
     reductions = dict(zip((method[0] for method in METHODS),
                           100.0 - 100.0 * errors.mean(axis=0) / errors[:, 0].mean()))
     sigma = math.sqrt(XV3500.noise.rate_variance(1.0 / GYRO_SAMPLE_RATE)) / DEGREE
-    numbers = {
-        'sigma': sigma,
-        'ratio': THRESHOLD / sigma,
-        'passes': 100.0 * math.erfc(THRESHOLD / sigma / math.sqrt(2.0)),
-        'single': reductions['threshold filter, single samples'],
-        'mean': reductions['threshold filter, mean of 0.2 s'],
-        'known': reductions['rest known exactly'],
-        'both': reductions['likelihood and filter, mean of 0.2 s']
-    }
+    numbers = {'sigma': sigma, 'ratio': THRESHOLD / sigma,
+               'passes': 100.0 * math.erfc(THRESHOLD / sigma / math.sqrt(2.0)),
+               'single': reductions['threshold filter, single samples'],
+               'mean': reductions['threshold filter, mean of 0.2 s'],
+               'known': reductions['rest known exactly'],
+               'both': reductions['likelihood and filter, mean of 0.2 s']}
     return Contradiction(numbers,
                          'Eq. 12: 2.5 deg/sqrt(h) is {sigma:.3f} deg/s in a white sample at 100 '
                          'Hz, so 0.3 deg/s is {ratio:.2f} sigma, and {passes:.0f} % of the '

@@ -375,17 +375,11 @@ def _sine(generator: np.random.Generator, runs: int, progress: Progress) -> Cont
               for sagnac in (SINE_CONSTANT, STRONG_SINE_CONSTANT)] for _ in progress(range(runs))]
     (weak, weak_sine), (strong, strong_sine) = np.mean(found, axis=0) / DEGREE
     return Contradiction(
-        {
-            'k': SINE_CONSTANT,
-            'weak': weak,
-            'weak_sine': weak_sine,
-            'strong_k': STRONG_SINE_CONSTANT,
-            'strong': strong,
-            'strong_sine': strong_sine
-        }, 'Eq. 3: a cubic approximates a sine at low rates only. Calibrated up to'
-        ' 60 deg/s, the polynomial (3, 2) errs between 70 and 100 deg/s by '
-        '{weak:.4f} deg/s, five effects with a sine by {weak_sine:.4f} (k = '
-        '{k:.2f} s); with k = {strong_k:.2f} s by {strong:.3f} and '
+        {'k': SINE_CONSTANT, 'weak': weak, 'weak_sine': weak_sine,
+         'strong_k': STRONG_SINE_CONSTANT, 'strong': strong, 'strong_sine': strong_sine},
+        'Eq. 3: a cubic approximates a sine at low rates only. Calibrated up to 60 deg/s, the '
+        'polynomial (3, 2) errs between 70 and 100 deg/s by {weak:.4f} deg/s, five effects with a '
+        'sine by {weak_sine:.4f} (k = {k:.2f} s); with k = {strong_k:.2f} s by {strong:.3f} and '
         '{strong_sine:.4f}.')
 
 

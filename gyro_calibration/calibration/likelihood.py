@@ -644,8 +644,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     first-order lag of 0.2 s causes 0.9 % of scale factor error. The lag is of first order against
     a profile of rates, which a robot only follows; against headings, which were measured on the
     robot itself, it is small and taken to second order. Other deviations from a profile
-    (`following`) are fitted within their priors, and so is a stretch with a turn of its own,
-    weighted by its probability.
+    (`tracking_error_columns`) are fitted within their priors, and so is a stretch with a turn of
+    its own, weighted by its probability.
 
     Parameters
     ----------
@@ -664,9 +664,46 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
 
     """
     alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation)
-    offset, found_lag = alignment.find_coarse_offset(
-        largest_time_offset + (0.0 if alignment.is_measured else MAX_TRACKING_LAG)), 0.0
-    data = alignment.require_increments(offset, found_lag)
+    offset, data, mixture, estimate = _fit_offset(alignment, largest_time_offset)
+    values, covariance = estimate.values[:2], mixture.covariance[:2, :2]
+    found, edges, inside, noise_deviation = _find_stretch_of_fit(estimate, data)
+    if alignment.is_measured:
+        # noise during turns only, such as slip of wheels, exceeds its robust estimate
+        noise_deviation = max(noise_deviation,
+                              math.sqrt(max(found.remaining_squares, 0.0) / (len(inside) - 4.0)))
+    else:
+        values = mixture.values[:2]
+        probability, stretch_values, stretch_covariance = _weigh_stretch(
+            estimate, data, found, inside, noise_deviation)
+        change = stretch_values - values
+        covariance = ((1.0 - probability) * covariance + probability * stretch_covariance
+                      + probability * (1.0 - probability) * np.outer(change, change))
+        values = values + probability * change
+    scale, bias = values.tolist()
+    # with a slip, first the columns of the differences between turns, then of the ends of turns
+    slips = mixture.values[data.prior_deviation == slip_deviation]
+    slips = slips[:len(slips) // 2]
+    slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
+    begin, end = data.time[edges[[found.first, found.last]]].tolist()
+    reference_noise = (math.sqrt(estimate.rate_variance * estimate.noise.ratio)
+                       / abs(_nonzero_scale(estimate.values[0])))
+    return ScaleBiasFit(
+        scale - 1.0, bias, covariance, offset, math.sqrt(estimate.rate_variance), reference_noise,
+        (abs(found.excess_rate) * float(inside.sum()),
+         math.sqrt(found.explained_squares) / noise_deviation),
+        math.sqrt(mixture.covariance[2, 2]),
+        np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
+        *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
+        *_residual_squares(data, estimate, alignment.is_measured),
+        slip_deviation=slip)
+
+
+def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
+        float, _Increments, _ModelAverage, _Estimate]:
+    """Return the time offset, s, and the increments, the mean over the noise and the fit there."""
+    lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
+    offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
+    data = alignment.require_increments(offset, lag)
     for prior_factors in (data.prior_factors[:1], data.prior_factors, data.prior_factors):
         before = offset
         mixture = _average_over_noise(data, prior_factors)
@@ -676,49 +713,17 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
             if alignment.is_measured:
                 estimate = _errors_in_variables(data, estimate)
             delay_change = float(np.clip(estimate.values[2], -0.02, 0.02))
-            lag_change = (0.0
-                          if alignment.is_measured else max(float(estimate.values[3]), -found_lag))
+            lag_change = 0.0 if alignment.is_measured else max(float(estimate.values[3]), -lag)
             if abs(delay_change) < 1e-9 and abs(lag_change) < 1e-9:
                 break
-            offset, found_lag = offset - delay_change, found_lag + lag_change
-            data = alignment.require_increments(offset, found_lag)
+            offset, lag = offset - delay_change, lag + lag_change
+            data = alignment.require_increments(offset, lag)
             estimate = _solve_weighted(data, _IncrementCovariance(data, estimate.noise.ratio),
                                        data.columns, estimate.prior_deviation)
         if (len(prior_factors) == len(data.prior_factors)
                 and abs(offset - before) < _OFFSET_TOLERANCE):
             break
-    values, delay_change = estimate.values[:2], math.sqrt(mixture.covariance[2, 2])
-    covariance = mixture.covariance[:2, :2]
-    found, edges, inside, noise_deviation = _find_stretch_of_fit(estimate, data)
-    if alignment.is_measured:
-        # noise during turns only, such as slip of wheels, exceeds its robust estimate
-        noise_deviation = max(noise_deviation,
-                              math.sqrt(max(found.remaining_squares, 0.0) / (len(inside) - 4.0)))
-    else:
-        values = mixture.values[:2]
-        stretch_probability, stretch_values, stretch_covariance = _weigh_stretch(
-            estimate, data, found, inside, noise_deviation)
-        difference = stretch_values - values
-        covariance = (
-            (1.0 - stretch_probability) * covariance + stretch_probability * stretch_covariance
-            + stretch_probability * (1.0 - stretch_probability) * np.outer(difference, difference))
-        values = values + stretch_probability * difference
-    scale, bias = values.tolist()
-    # with a slip, first the columns of the differences between turns, then of the ends of turns
-    slips = mixture.values[data.prior_deviation == slip_deviation]
-    slips = slips[:len(slips) // 2]
-    begin, end = data.time[edges[[found.first, found.last]]].tolist()
-    return ScaleBiasFit(
-        scale - 1.0, bias, covariance, offset, math.sqrt(estimate.rate_variance),
-        math.sqrt(estimate.rate_variance * estimate.noise.ratio) / abs(
-            _nonzero_scale(estimate.values[0])),
-        (abs(found.excess_rate) * float(inside.sum()),
-         math.sqrt(found.explained_squares) / noise_deviation),
-        delay_change, np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
-        *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
-        *_residual_squares(data, estimate, alignment.is_measured),
-        slip_deviation=math.sqrt(float(np.mean(slips ** 2))) if slip_deviation and len(slips)
-        else 0.0)
+    return offset, data, mixture, estimate
 
 
 #: The noise is estimated again where the offset changed by more than this, s.

@@ -215,14 +215,11 @@ def _model_data(model: GyroModel) -> dict[str, Any]:
     """Return the fitted values with their intervals, covariance, ranges and technology."""
     values: dict[str, dict[str, Any]] = {}
     for effect, parameter, value, deviation in model.estimates():
+        half_width = NORMAL_QUANTILE_975 * deviation
         values.setdefault(effect, {})[parameter.name] = {
-            'estimate': value,
-            'standard_deviation': deviation,
-            'ci95': [
-                value - NORMAL_QUANTILE_975 * deviation, value + NORMAL_QUANTILE_975 * deviation
-            ] if math.isfinite(deviation) else None,
-            'unit': parameter.unit
-        }
+            'estimate': value, 'standard_deviation': deviation,
+            'ci95': [value - half_width, value + half_width] if math.isfinite(deviation) else None,
+            'unit': parameter.unit}
     return {'effects': values,
             'covariance': None if model.covariance is None else model.covariance.tolist(),
             'rate_range_rad_s': model.rate_range,

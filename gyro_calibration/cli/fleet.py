@@ -136,11 +136,9 @@ def _fleet(given: argparse.Namespace) -> Answer:
 def _write_results(given: argparse.Namespace, types: Sequence[TypeSummary],
                    records: Sequence[dict[str, Any]], data: dict[str, Any]) -> list[str]:
     """Write the results, and return the names of their files."""
-    content = {
-        'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
-        'report.html': render_report(types, records).encode(),
-        **table_files(types, records)
-    }
+    content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
+               'report.html': render_report(types, records).encode(),
+               **table_files(types, records)}
     names = list(content)
     for found in types:
         for unit, model in build_models(found):

@@ -184,12 +184,8 @@ def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -
                             mark_deviation=marking, output=output[known])
     direction = 'counter-clockwise' if found.turns > 0 else 'clockwise'
     before, after = found.rest_durations
-    data = {
-        'turns': found.turns,
-        'turning_s': found.duration,
-        'rests_s': list(found.rest_durations),
-        'marking_rad': marking
-    }
+    data = {'turns': found.turns, 'turning_s': found.duration,
+            'rests_s': list(found.rest_durations), 'marking_rad': marking}
     return _store_and_answer(
         given, model, log, found.fit, known, 'turns', data,
         [f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '

@@ -239,13 +239,10 @@ def _error_data(errors: ErrorSummary) -> dict[str, float]:
 
 
 def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]:
-    return [{
-        f'from_{unit}': low,
-        f'to_{unit}': high,
-        'turns': int(np.count_nonzero(mask)),
-        'static': _error_data(summarize_errors(errors.static[mask])),
-        'modelled': _error_data(summarize_errors(errors.modelled[mask]))
-    } for low, high, mask in bins]
+    return [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
+             'static': _error_data(summarize_errors(errors.static[mask])),
+             'modelled': _error_data(summarize_errors(errors.modelled[mask]))}
+            for low, high, mask in bins]
 
 
 def _write_table(path: str, errors: TurnErrors) -> None:

@@ -428,11 +428,9 @@ def _value_data(summary: TypeSummary, value: ValueSummary) -> dict[str, Any]:
 
 def _interval_data(interval: Interval, index: int) -> dict[str, Any]:
     ends = [float(interval.low[index]), float(interval.high[index])]
-    return {
-        'estimate': float(interval.value[index]),
-        'standard_deviation': float(interval.deviation[index]),
-        'ci95': ends if all(map(math.isfinite, ends)) else None
-    }
+    return {'estimate': float(interval.value[index]),
+            'standard_deviation': float(interval.deviation[index]),
+            'ci95': ends if all(map(math.isfinite, ends)) else None}
 
 
 def _alarm_data(names: Sequence[str], outlier: Outlier) -> dict[str, Any]:

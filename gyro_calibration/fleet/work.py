@@ -241,12 +241,8 @@ def process_log(task: LogTask) -> dict[str, Any]:
         key = _record_key(task, content)
         found = _load_record(task.record_path, key)
         if found is None:
-            found = {
-                'schema': SCHEMA,
-                'key': key,
-                'sha256': content,
-                **_calibrate_and_diagnose(task)
-            }
+            found = {'schema': SCHEMA, 'key': key, 'sha256': content,
+                     **_calibrate_and_diagnose(task)}
             write_atomically(task.record_path, json.dumps(found, allow_nan=False).encode())
         stated = _stated_fields(entry)
         if entry.temperature is None:
@@ -300,26 +296,15 @@ def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
     content = hashlib.sha256()
     for values in (getattr(log, quantity) for quantity in QUANTITIES):
         content.update(b'' if values is None else values.tobytes())
+    offset = extra_values['time_offset']['value'] if extra_values else 0.0
     found: dict[str, Any] = {
-        'content': content.hexdigest(),
-        'mean_temperature': temperature,
-        'status': DONE,
-        'reason': '',
-        'method': method,
-        'samples': len(log),
+        'content': content.hexdigest(), 'mean_temperature': temperature, 'status': DONE,
+        'reason': '', 'method': method, 'samples': len(log),
         'duration_s': None if log.time is None else float(log.time[-1] - log.time[0]),
-        'values': {
-            **_value_records(model),
-            **extra_values
-        },
-        'slow': fit_slow_effects(log, extra_values['time_offset']['value']
-                                 if extra_values else 0.0) if log.time is not None else {},
-        'noise': {
-            name: float(value) for name, value in vars(model.noise).items()
-        },
-        'diagnosis': None,
-        'page': ''
-    }
+        'values': {**_value_records(model), **extra_values},
+        'slow': {} if log.time is None else fit_slow_effects(log, offset),
+        'noise': {name: float(value) for name, value in vars(model.noise).items()},
+        'diagnosis': None, 'page': ''}
     if task.generator is not None:
         found |= _summarize_diagnosis(task, log)
     return found
@@ -380,13 +365,8 @@ def _summarize_diagnosis(task: LogTask, log: Log) -> dict[str, Any]:
         found = (diagnose_table(log, None) if log.time is None
                  else diagnose([log], task.generator, names=[to_printable(task.entry.log)]))
     except (DataRefused, ArithmeticError, np.linalg.LinAlgError) as error:
-        return {
-            'diagnosis': {
-                'verdict': 'refused',
-                'reason': _format_reason(error, task.entry.log),
-                'findings': []
-            }
-        }
+        return {'diagnosis': {'verdict': 'refused',
+                              'reason': _format_reason(error, task.entry.log), 'findings': []}}
     page = task.record_path.with_suffix('.html')
     write_atomically(page, render_report(found).encode())
     findings = [{'effect': each.effect, 'status': each.status, 'p_value': each.p_value,

@@ -168,12 +168,10 @@ def _format_mujoco(parameters: SimulatorParameters) -> tuple[str, set[str]]:
         attributes['cutoff'] = f'{parameters.saturation:.9g}'
         names.add('saturation')
     if parameters.time_offset > 0.0:
-        attributes |= {
-            'delay': f'{parameters.time_offset:.9g}',
-            'interval': f'{parameters.interval:.9g}',
-            'nsample': f'{math.ceil(parameters.time_offset / parameters.interval) + 2}',
-            'interp': 'linear'
-        }
+        attributes |= {'delay': f'{parameters.time_offset:.9g}',
+                       'interval': f'{parameters.interval:.9g}',
+                       'nsample': f'{math.ceil(parameters.time_offset / parameters.interval) + 2}',
+                       'interp': 'linear'}
         names.add('time_offset')
     inside = ' '.join(f'{name}="{value}"' for name, value in attributes.items())
     return f'<sensor>\n  <gyro {inside}/>\n</sensor>', names | {'angle_random_walk'}

@@ -595,9 +595,5 @@ class Pipeline:
         return 'the heading is zero here and now'
 
 
-_WHEEL_SOURCES = {
-    'none': (),
-    'odom': (ODOMETRY, ),
-    'cmd_vel': (COMMAND, ),
-    'both': (ODOMETRY, COMMAND)
-}
+_WHEEL_SOURCES = {'none': (), 'odom': (ODOMETRY,), 'cmd_vel': (COMMAND,),
+                  'both': (ODOMETRY, COMMAND)}
