@@ -73,8 +73,8 @@ def make(given: argparse.Namespace) -> None:
     drawn: list[Case] = []
     for part in given.part:
         every = list(part_cases(part, given.cases))
-        drawn += [every[place] for place in generator.choice(len(every), given.cases,
-                                                             replace=False)]
+        drawn += [every[place]
+                  for place in generator.choice(len(every), given.cases, replace=False)]
     given.folder.mkdir(parents=True, exist_ok=True)
     public: dict[str, Any] = {}
     truth: dict[str, Any] = {}
@@ -124,8 +124,9 @@ def score(given: argparse.Namespace) -> None:
     unknown = set(answers) - set(truth)
     if unknown:
         raise ValueError(f'{given.answers}: no such cases: {", ".join(sorted(unknown)[:5])}')
-    found = summarize([score_case(each, answers.get(name, {})) for name, each in sorted(
-        truth.items(), key=lambda item: PARTS.index(item[1]['part']))])
+    found = summarize(
+        [score_case(each, answers.get(name, {}))
+         for name, each in sorted(truth.items(), key=lambda item: PARTS.index(item[1]['part']))])
     if given.json:
         print(
             json.dumps({
@@ -135,8 +136,7 @@ def score(given: argparse.Namespace) -> None:
                         'of': count,
                         'interval': wilson_interval(good, count) if count else None
                     } for column, (good, count) in counts.items()
-                } for row, counts in found.items()
-            }))
+                } for row, counts in found.items()}))
         return
     print(f'{said.get("method", "")}: {len(answers)} answers to {len(truth)} cases; %, with '
           f'Wilson intervals of 95 %\n\n{markdown_table(found)}')

@@ -54,8 +54,7 @@ IMPERFECT_REFERENCES = {
         ('encoder', (0.09, 0.5)),
         ('course', (1.0, 5.0, 10.0)),
     )
-    for size in sizes
-}
+    for size in sizes}
 COMPANION_EFFECTS = (
     'scale_factor_asymmetry',
     'cubic_nonlinearity',
@@ -144,10 +143,9 @@ def part_cases(part: str, repetitions: int) -> Iterator[Case]:
                                reference, number)
     else:
         multiples = (3.0,) if part == 'outside' else SIZE_MULTIPLES
-        names: Sequence[tuple[str, ...]] = ([(name, ) for name in {
-            'effects': FORMS,
-            'outside': OUTSIDE_CATALOGUE
-        }.get(part, ())] or [()])
+        names: Sequence[tuple[str, ...]] = [
+            (name, )
+            for name in {'effects': FORMS, 'outside': OUTSIDE_CATALOGUE}.get(part, ())] or [()]
         yield from (Case(part, each, multiple, _choose_in_turn(NOISES, number + place),
                          _choose_reference(each, number + place), number)
                     for number in range(repetitions) for multiple in multiples
@@ -177,8 +175,8 @@ def make_logs(case: Case, generator: np.random.Generator) -> list[HiddenLog]:
             case.names, case.multiple, generator, IMPERFECT_REFERENCES[case.reference], noise)]
     if case.look_alikes is not None:
         log = hide_look_alike(case.look_alikes, case.names[0], generator)
-        return ([log] if case.part == 'sets' else
-                [log, record_separating(case.look_alikes, log, generator)])
+        return ([log] if case.part == 'sets'
+                else [log, record_separating(case.look_alikes, log, generator)])
     step = ({'reference': 'heading', 'encoder_step': ENCODER_STEP} if case.reference == 'encoder'
             else {'reference': case.reference})
     if case.part not in ('pairs', 'triples'):

@@ -71,8 +71,7 @@ def known_model(known: KnownModel) -> Any:
     from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
     from gyro_calibration.model.gyro_model import GyroModel, Term
     from gyro_calibration.model.noise import Noise
-    terms = (Term(BIAS, (known['bias'],)),
-             Term(SCALE_FACTOR_ERROR, (known['scale_factor_error'],)))
+    terms = Term(BIAS, (known['bias'],)), Term(SCALE_FACTOR_ERROR, (known['scale_factor_error'],))
     return GyroModel(terms, noise=Noise(known['angle_random_walk'], known['bias_instability'],
                                         known['rate_random_walk']))
 
@@ -175,10 +174,9 @@ def build_problem(logs: Sequence[Path], known: KnownModel | None) -> Problem:
     wanted = propose_candidates(read[0][0])
     tables, errors = [], []
     for number, (each, error, kept) in enumerate(read):
-        columns = [
-            FORMS[name].error(each, each.rate, size, shapes) *
-            (not (number and FORMS[name].is_single_event)) for name, size, shapes, _ in wanted
-        ]
+        columns = [FORMS[name].error(each, each.rate, size,
+                                     shapes) * (not (number and FORMS[name].is_single_event))
+                   for name, size, shapes, _ in wanted]
         plain = [block_means(each.rate, each.interval), np.ones(len(error))]
         own = [plain[0]] + [plain[1] * (place == number) for place in range(len(read))]
         if known is not None:
@@ -199,8 +197,8 @@ def build_problem(logs: Sequence[Path], known: KnownModel | None) -> Problem:
         count = 0
     # without columns that are zero or proportional to the nuisances
     seen = np.linalg.norm(table, axis=0) > 1e-6 * lengths
-    return Problem(error, table[:, seen], tuple(
-        owner for owner, each in zip(owners, seen) if each), count)
+    return Problem(error, table[:, seen],
+                   tuple(owner for owner, each in zip(owners, seen) if each), count)
 
 
 def select_greedily(logs: Sequence[Path], known: KnownModel | None) -> Answer:
@@ -234,10 +232,9 @@ def select_by_lasso(logs: Sequence[Path], known: KnownModel | None) -> Answer:
     errors = []
     for out in range(FOLD_COUNT):
         inside, outside = fold != out, fold == out
-        errors.append([
-            np.mean((problem_to_solve.error[outside] - columns[outside] @ weights) ** 2)
-            for weights in lasso_path(columns[inside], problem_to_solve.error[inside], penalties)
-        ])
+        errors.append([np.mean((problem_to_solve.error[outside] - columns[outside] @ weights) ** 2)
+                       for weights in lasso_path(columns[inside], problem_to_solve.error[inside],
+                                                 penalties)])
     mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0) / math.sqrt(FOLD_COUNT)
     least = int(np.argmin(mean))
     place = int(np.flatnonzero(mean <= mean[least] + spread[least])[0])
@@ -295,5 +292,4 @@ def answers_of_columns(least_squares: Problem, chosen: Sequence[int]) -> list[Na
 METHODS = {
     'gyro_calibration': gyro_calibration,
     'greedy': select_greedily,
-    'lasso': select_by_lasso
-}
+    'lasso': select_by_lasso}

@@ -99,8 +99,8 @@ def judge_answer(causes: Sequence[Cause], findings: Sequence[NamedCause],
     sizes = tuple(len(each) for each in sets if each & wanted)
     complete = (len(matched) == len(wanted) == len(sizes) and max(sizes, default=0) <= MAX_SET_SIZE
                 and not extra and not unexplained_variables)
-    right = (bool(unexplained_variables) and not findings if wanted
-             & set(OUTSIDE_CATALOGUE) else complete)
+    right = (bool(unexplained_variables) and not findings if wanted & set(OUTSIDE_CATALOGUE)
+             else complete)
     return Judgement(
         bool(findings or unexplained_variables),
         bool(findings) and EQUIVALENT_CAUSES.get(findings[0].effect, findings[0].effect) in wanted,
@@ -110,9 +110,8 @@ def judge_answer(causes: Sequence[Cause], findings: Sequence[NamedCause],
 
 def _names_in_set(finding: NamedCause) -> set[str]:
     """Return the set of a finding; causes that no log can distinguish are one."""
-    return ({
-        EQUIVALENT_CAUSES.get(name, name) for name in (finding.effect, *finding.ambiguous_with)
-    })
+    return {EQUIVALENT_CAUSES.get(name, name)
+            for name in (finding.effect, *finding.ambiguous_with)}
 
 
 def _match_causes(wanted: Sequence[str], sets: Sequence[set[str]]) -> dict[str, int]:
@@ -207,8 +206,7 @@ def _count_scores(scores: Sequence[ScoredCase]) -> dict[str, tuple[int, int]]:
         'first': [each.judgement.is_first for each in scores if each.has_hidden],
         'in set': [each.judgement.is_in_set for each in scores if each.has_hidden],
         'right': [each.is_right for each in scores],
-        'interval': [held for each in scores for held in each.judgement.interval_holds.values()]
-    }
+        'interval': [held for each in scores for held in each.judgement.interval_holds.values()]}
     return {name: (sum(values), len(values)) for name, values in columns.items()}
 
 
@@ -223,8 +221,8 @@ def markdown_table(found: Mapping[str, Mapping[str, tuple[int, int]]]) -> str:
     lines = ['| part | cases | detected | named first | in set | right | interval holds |',
              f'|---|---:{"|---:" * 5}|']
     for row, counts in found.items():
-        cells = [f'{100.0 * good / count:.0f} ({100.0 * low:.0f} to {100.0 * high:.0f})'
-                 if count else '' for good, count in counts.values()
+        cells = [f'{100.0 * good / count:.0f} ({100.0 * low:.0f} to {100.0 * high:.0f})' if count
+                 else '' for good, count in counts.values()
                  for low, high in [wilson_interval(good, count) if count else (0.0, 0.0)]]
         lines.append(f'| {row} | {counts["right"][1]} | {" | ".join(cells)} |')
     return '\n'.join(lines)

@@ -72,11 +72,8 @@ def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Arr
     for run, each in enumerate(replays):
         values = candidate.columns(each)
         absent = candidate.log_index is not None and candidate.log_index != run
-        parts.append(
-            np.array([
-                np.zeros(each.point_count - 1) if absent else each.transform_samples(value)
-                for value in values
-            ]))
+        parts.append(np.array([np.zeros(each.point_count - 1) if absent
+                               else each.transform_samples(value) for value in values]))
     return np.concatenate(parts, axis=1)
 
 
@@ -88,9 +85,9 @@ def effect_candidate(name: str, *shapes: float, log_index: int | None = None) ->
     known = CATALOGUE[name]
     if (distortion := known.distortion) is not None:
         # change of the rate by a delay, a lag, a clock rate or a limit
-        return Candidate(name, shapes, lambda each: (
-            distortion(each.channels.rate, each.channels.time, *shapes) - each.channels.rate,),
-            log_index, 1.0)
+        return Candidate(
+            name, shapes, lambda each: (distortion(each.channels.rate, each.channels.time,
+                                                   *shapes) - each.channels.rate,), log_index, 1.0)
     amplitude = known.coefficients[0].default if known.coefficients else None
     return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), log_index,
                      amplitude)
@@ -103,9 +100,9 @@ def gaussian_pulse(time: Array, middle: float, width: float) -> Array:
 
 #: Effects of the reference -> columns by log and shapes, and the shapes that a fit finds.
 _REFERENCE_EFFECTS: Mapping[str, tuple[Callable[..., Sequence[Array]], list[int]]] = {
-    'reference_once_per_rev': (lambda each: (
-        -each.channels.rate * np.sin(each.channels.heading),
-        -each.channels.rate * np.cos(each.channels.heading)), []),
+    'reference_once_per_rev': (lambda each: (-each.channels.rate * np.sin(each.channels.heading),
+                                             -each.channels.rate * np.cos(each.channels.heading)),
+                               []),
     'reference_slip': (lambda each, width, *moments: tuple(
         -gaussian_pulse(each.channels.time, moment, width) for moment in moments), [0])}
 
@@ -128,14 +125,10 @@ def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidat
 
 def constant_channels(replays: Sequence[Replay]) -> frozenset[str]:
     """Return the channels that are nearly constant in each log that has them."""
-    known = {
-        name: [
-            getattr(each.channels, name) for each in replays if name in each.available_channels
-        ] for name in MIN_CHANNEL_RANGE
-    }
-    return frozenset(
-        name for name, values in known.items()
-        if values and max(float(np.ptp(value)) for value in values) < MIN_CHANNEL_RANGE[name])
+    known = {name: [getattr(each.channels, name) for each in replays
+                    if name in each.available_channels] for name in MIN_CHANNEL_RANGE}
+    return frozenset(name for name, values in known.items() if values
+                     and max(float(np.ptp(value)) for value in values) < MIN_CHANNEL_RANGE[name])
 
 
 def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
@@ -154,8 +147,8 @@ def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
 
 def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give all causes that these logs may show, each with its first shapes."""
-    has = (frozenset.intersection(*(each.available_channels
-                                    for each in replays)) - constant_channels(replays))
+    has = frozenset.intersection(
+        *(each.available_channels for each in replays)) - constant_channels(replays)
     duration, interval = max(each.duration for each in replays), replays[0].interval
     fastest = max(float(np.abs(each.channels.rate).max()) for each in replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
@@ -254,10 +247,8 @@ _DEFAULT_KNOTS = (8,)
 #: Largest number of times of a bump in a log, and its widths as shares of the duration.
 MAX_BUMP_TIMES, BUMP_WIDTHS = 40, (0.007, 0.02, 0.05)
 #: Numbers of waves over the range of a variable.
-WAVE_COUNTS = {
-    'rate': tuple(np.arange(1.0, 12.5, 0.5)),
-    'temperature': tuple(np.arange(1.0, 8.5, 0.5))
-}
+WAVE_COUNTS = {'rate': tuple(np.arange(1.0, 12.5, 0.5)),
+               'temperature': tuple(np.arange(1.0, 8.5, 0.5))}
 _DEFAULT_WAVE_COUNTS = (1.0, 1.5, 2.0, 3.0, 4.0)
 HEADING_HARMONICS = range(2, 11)
 
@@ -288,9 +279,8 @@ def generic_terms(replays: Sequence[Replay]) -> list[Candidate]:
         for width in BUMP_WIDTHS:
             count = min(MAX_BUMP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
-                found.append(
-                    _unnamed_term('time', _bump_columns(moment, width * each.duration), run,
-                                  moment))
+                found.append(_unnamed_term('time', _bump_columns(moment, width * each.duration),
+                                           run, moment))
     return found
 
 
@@ -301,8 +291,8 @@ def _unnamed_term(name: str, columns: ColumnFunction, log_index: int | None = No
 
 def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable]]:
     """Give the variables that change in these logs, each scaled to -1 to 1."""
-    has = (frozenset.intersection(*(each.available_channels
-                                    for each in replays)) - constant_channels(replays))
+    has = frozenset.intersection(
+        *(each.available_channels for each in replays)) - constant_channels(replays)
     known: dict[str, Variable] = {'rate': lambda each: each.channels.rate}
     if 'temperature' in has:
         known['temperature'] = lambda each: each.channels.temperature
@@ -337,20 +327,16 @@ def _bump_columns(middle: float, width: float) -> ColumnFunction:
 
 def _single_variable_terms(name: str, variable: Variable) -> Iterator[Candidate]:
     for waves in WAVE_COUNTS.get(name, _DEFAULT_WAVE_COUNTS):
-        yield _unnamed_term(
-            name,
-            _function_columns(
-                variable, lambda x, waves: (np.sin(np.pi * waves * x), np.cos(np.pi * waves * x)),
-                waves))
+        yield _unnamed_term(name, _function_columns(
+            variable, lambda x, waves: (np.sin(np.pi * waves * x),
+                                        np.cos(np.pi * waves * x)), waves))
     for power in (2, 4, 5) if name == 'rate' else (3, 4) if name == 'temperature' else (2, 3):
         if (name, power) != ('rate', 2):
             yield _unnamed_term(
                 name, _function_columns(variable, lambda x, power: (x ** power, ), power))
     for steep in (-8.0, -4.0, 4.0, 8.0):
-        yield _unnamed_term(
-            name,
-            _function_columns(variable, lambda x, steep: (np.exp(steep * x - abs(steep)), ),
-                              steep))
+        yield _unnamed_term(name, _function_columns(
+            variable, lambda x, steep: (np.exp(steep * x - abs(steep)), ), steep))
     for count in SPLINE_KNOTS.get(name, _DEFAULT_KNOTS):
         knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
         # their sum is constant, as the bias is

@@ -170,9 +170,9 @@ def make_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
 def mark_suspected(found: Finding) -> Finding:
     """Return a finding as suspected, with the experiment that would establish it as remedy."""
     separate_by = CAUSES[found.effect].separate_by
-    return replace(found, status='suspected', remedy=(
-        f'record again: {separate_by}' if separate_by
-        else 'record longer, and check that it is found again'))
+    return replace(found, status='suspected',
+                   remedy=(f'record again: {separate_by}' if separate_by
+                           else 'record longer, and check that it is found again'))
 
 
 _REMEDIES = {
@@ -186,9 +186,9 @@ def add_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
                  model: GyroModel) -> list[Finding]:
     """Return findings with their shares of the heading error and their remedies."""
     inside = {term.effect.name for term in model.terms}
-    return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy or (
-        '' if CAUSES[each.effect].origin == 'gyro' and each.effect not in inside
-        else _REMEDIES[CAUSES[each.effect].origin])) for each in findings]
+    return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy
+                    or ('' if CAUSES[each.effect].origin == 'gyro' and each.effect not in inside
+                        else _REMEDIES[CAUSES[each.effect].origin])) for each in findings]
 
 
 #: Next experiment, with numbers of `observed_range` -> pairs of causes that it distinguishes.

@@ -48,10 +48,10 @@ def element(name: str, *children: str | None, **attributes: str | float | None) 
              else f'{value:.2f}'.rstrip('0').rstrip('.')
              for key, value in attributes.items() if value is not None}
     named = ''.join(f' {key}="{_escaped(value)}"' for key, value in given.items())
-    inside = ''.join(child if isinstance(child, Markup) else _escaped(child) for child in children
-                     if child is not None)
-    return Markup(f'<{name}{named}/>' if name in
-                  _VOID_ELEMENTS else f'<{name}{named}>{inside}</{name}>')
+    inside = ''.join(child if isinstance(child, Markup) else _escaped(child)
+                     for child in children if child is not None)
+    return Markup(f'<{name}{named}/>' if name in _VOID_ELEMENTS
+                  else f'<{name}{named}>{inside}</{name}>')
 
 
 def join_markup(*parts: str) -> Markup:
@@ -179,9 +179,9 @@ def draw_chart(chart: Chart) -> Markup:
     picture = element('svg', element('title', chart.title, id=f'{chart.name}-title'),
                       element('desc', chart.description, id=f'{chart.name}-description'),
                       *_grid_elements(chart, names, across, up), *marks,
-                      element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots,
-                              class_='cursor'), viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img',
-                      tabindex='0', aria_labelledby=f'{chart.name}-title {chart.name}-description',
+                      element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots, class_='cursor'),
+                      viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img', tabindex='0',
+                      aria_labelledby=f'{chart.name}-title {chart.name}-description',
                       data_at=_format_positions(at))
     return element('figure', element('figcaption', chart.title), picture,
                    element('ul', *map(_legend_entry, chart.lines), class_='legend'),
@@ -262,18 +262,18 @@ def _draw_line(line: Line, at: Array, places: Array, up: _Axis, shown: Mask) -> 
                   for each, value in zip(x, y)]
     else:
         begins = (shown & ~np.concatenate([[False], shown[:-1]]))[shown]
-        parts.append(element('path', d=''.join(
-            f'{"M" if begin else "L"}{each:.1f} {value:.1f}'
-            for each, value, begin in zip(x, y, begins)), class_='stroke'))
+        parts.append(element('path', d=''.join(f'{"M" if begin else "L"}{each:.1f} {value:.1f}'
+                                               for each, value, begin in zip(x, y, begins)),
+                             class_='stroke'))
     return element('g', *parts, class_=line.style)
 
 
 def _legend_entry(line: Line) -> Markup:
     mark = (element('circle', cx=12.0, cy=6.0, r=3.0) if line.draw_dots
             else element('path', d='M1 6H23', class_='stroke'))
-    spread = [] if line.deviation is None else [
-        element('path', d='M12 0V12', class_='bars') if line.draw_dots
-        else element('rect', x=1.0, y=1.0, width=22.0, height=10.0, class_='band')]
+    spread = ([] if line.deviation is None
+              else [element('path', d='M12 0V12', class_='bars') if line.draw_dots
+                    else element('rect', x=1.0, y=1.0, width=22.0, height=10.0, class_='band')])
     swatch = element('svg', element('g', *spread, mark, class_=line.style),
                      viewBox='0 0 24 12', class_='swatch', aria_hidden='true')
     return element('li', swatch, line.name + ('' if line.deviation is None else ', 95 %'))
@@ -288,17 +288,16 @@ def _value_table(chart: Chart) -> Markup:
             '' if line.deviation is None
             else f' ± {format_number(NORMAL_QUANTILE_975 * float(line.deviation[row]), 2)}')
 
-    heads = [(chart.x_label, chart.x_unit), *((each.name, chart.y_unit)
-                                              for each in chart.lines)]
+    heads = [(chart.x_label, chart.x_unit), *((each.name, chart.y_unit) for each in chart.lines)]
     table = element(
         'table', element('caption', join_markup(chart.title, ', ', chart.y_label)),
-        element('thead', element('tr', *(element(
-            'th', _axis_label(name, unit), scope='col', data_name=name, data_unit=unit)
-            for name, unit in heads))),
-        element('tbody', *(element(
-            'tr', element('td', chart.x_names[round(float(at)) - 1] if chart.x_names
-                          else format_number(float(at), 4)),
-            *(element('td', value(line, row)) for line in chart.lines))
-            for row, at in enumerate(chart.x))))
+        element('thead',
+                element('tr', *(element('th', _axis_label(name, unit), scope='col', data_name=name,
+                                        data_unit=unit) for name, unit in heads))),
+        element('tbody',
+                *(element('tr', element('td', chart.x_names[round(float(at)) - 1] if chart.x_names
+                                        else format_number(float(at), 4)),
+                          *(element('td', value(line, row)) for line in chart.lines))
+                  for row, at in enumerate(chart.x))))
     return element('details', element('summary', 'Values'),
                    element('div', table, class_='scroll', tabindex='0'))

@@ -107,17 +107,16 @@ def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: A
     if window is None:
         return Gain(held_out, rate, None, HEADING_WINDOW)
     whole = np.sum(counts, axis=0)[1]
-    return Gain(held_out, rate, heading, window, {
-        name: float(np.sqrt(np.sum(each, axis=0)[1] / whole))
-        for name, each in squares.items() if name != 'straight'})
+    return Gain(held_out, rate, heading, window,
+                {name: float(np.sqrt(np.sum(each, axis=0)[1] / whole))
+                 for name, each in squares.items() if name != 'straight'})
 
 
 def held_out_mask(replay: Replay, block_duration: float) -> Mask:
     """Mark the samples that are held out, shape (n,)."""
     number = _block_numbers(replay, block_duration)
-    return (replay.valid & (number % HELD_OUT_STRIDE == 1)
-            & (number < int((replay.channels.time[-1] - replay.channels.time[0]) / block_duration
-                            + 1e-9)))
+    return replay.valid & (number % HELD_OUT_STRIDE == 1) & (
+        number < int((replay.channels.time[-1] - replay.channels.time[0]) / block_duration + 1e-9))
 
 
 def _block_numbers(replay: Replay, block_duration: float) -> Array:
@@ -134,8 +133,8 @@ def _drop_samples(replay: Replay, dropped: Mask) -> Replay:
 def _rate_residuals(replay: Replay, log_index: int,
                     fit: FittedValues | None) -> tuple[Array, Array]:
     """Return the residuals of a log against smooth and measured reference, after a fit if any."""
-    added = (0.0 if fit is None else fit.total_contribution(replay, log_index)
-             + fit.biases[log_index])
+    added = (0.0 if fit is None
+             else fit.total_contribution(replay, log_index) + fit.biases[log_index])
     return (replay.channels.output - replay.channels.rate - added,
             replay.channels.output - replay.reference - added)
 
@@ -212,8 +211,8 @@ def jackknife_change(square_sums: Array, counts: Array) -> Change:
     parts = len(counts)
     if parts < _MIN_PARTS:
         return Change(float(before), float(after), None)
-    others = np.sqrt(np.maximum(square_sums.sum(axis=0) - square_sums, 0.0)
-                     / (counts.sum() - counts)[:, None])
+    others = np.sqrt(
+        np.maximum(square_sums.sum(axis=0) - square_sums, 0.0) / (counts.sum() - counts)[:, None])
     deviation = (parts - 1) / np.sqrt(parts) * np.std(others[:, 0] - others[:, 1], ddof=1)
     half = float(student.ppf(0.975, parts - 1) * deviation)
     won = float(before - after)

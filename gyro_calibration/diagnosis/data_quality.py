@@ -256,8 +256,8 @@ def _check_samples(found: DataQuality, output: Array, rate: Array | None, line: 
     """Check the samples of the gyro for quantization, limits, repeats and outliers."""
     codes, comparison = find_codes(output[has_output]), compare_output(output, rate, line)
     limit = find_limit(codes, comparison, FALSE_ALARM_CHANCE)
-    at_limit = (np.zeros(len(output), dtype=bool)
-                if limit is None else limit.is_reached(comparison.output))
+    at_limit = (np.zeros(len(output), dtype=bool) if limit is None
+                else limit.is_reached(comparison.output))
     valid, band = has_output & ~at_limit, find_dead_band(codes, comparison.output)
     repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     if repeated is not None and repeated.includes_limit_run(at_limit):
@@ -265,20 +265,19 @@ def _check_samples(found: DataQuality, output: Array, rate: Array | None, line: 
         repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     valid = valid if repeated is None else valid & ~repeated.is_repeat
     # Samples next to a dead band are the tail of the noise outside it.
-    outlying = find_outliers(
-        comparison, valid if band is None else valid
-        & ~binary_dilation(band.contains(comparison.output), iterations=NEIGHBOURS_PER_SIDE),
-        0.5 * codes.step, FALSE_ALARM_CHANCE)
+    outlying = find_outliers(comparison, valid if band is None else valid & ~binary_dilation(
+        band.contains(comparison.output), iterations=NEIGHBOURS_PER_SIDE), 0.5 * codes.step,
+                             FALSE_ALARM_CHANCE)
     valid = valid if outlying is None else valid & ~outlying.is_outlier
     away_from_limit = np.ones(len(output), dtype=bool)
     if limit is not None and comparison.expected is not None:
         # by the expected output: a selection by the measured output would be biased by its noise
         near = _LIMIT_MARGIN_SIGMAS * max(comparison.noise_deviation, comparison.scatter)
-        away_from_limit = (~((comparison.expected > limit.high - near) |
-                             (comparison.expected < limit.low + near)))
-    findings = (*found.findings,
-                *_code_findings(codes, comparison, limit, at_limit, model), *_sample_findings(
-                    repeated, outlying, log, found.heading_step, comparison.noise_deviation))
+        away_from_limit = ~(
+            (comparison.expected > limit.high - near) | (comparison.expected < limit.low + near))
+    findings = (*found.findings, *_code_findings(codes, comparison, limit, at_limit, model),
+                *_sample_findings(repeated, outlying, log, found.heading_step,
+                                  comparison.noise_deviation))
     matters = codes.step >= MIN_STEP_NOISE_RATIO * comparison.noise_deviation
     return replace(found, findings=findings, usable=valid & away_from_limit,
                    limit=None if limit is None else limit.size,
@@ -333,8 +332,8 @@ def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None
                              f'{count} single samples differ from their neighbours by up to '
                              f'{outlying.largest_sigmas:.0f} sigma, the first at {first:.3f} s')
     interval = float(np.median(np.diff(log.time)))
-    if (reference_step and (not noise_deviation or reference_step ** 2 / 6.0 /
-                            (interval * noise_deviation) ** 2 > MIN_STEP_VARIANCE_SHARE)):
+    if (reference_step and (not noise_deviation or reference_step ** 2 / 6.0
+                            / (interval * noise_deviation) ** 2 > MIN_STEP_VARIANCE_SHARE)):
         yield _sized_finding('reference_quantization', reference_step, 0.0, 0.0,
                              'the reference heading comes in steps of '
                              f'{reference_step / DEGREE:.4g} deg: its rate '
@@ -446,8 +445,8 @@ def _evenness(log: Log, step: float) -> float:
                             max(round(0.2 * _COMPARISON_SPAN / interval), 5))
     count = max(round(2.0 * _COMPARISON_SPAN / interval), _BLOCK_SAMPLES)
     blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
-    return float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2)) if len(
-        blocks) else 1.0
+    return (float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2)) if len(blocks)
+            else 1.0)
 
 
 @dataclass(frozen=True)
@@ -491,15 +490,14 @@ def heading_difference(log: Log) -> HeadingDifference:
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         rate = bridge_gaps(log.reference_rate)
         heading = integrate_with_curvature(
-            log.time,
-            rate + _fit_tones(output - rate, np.column_stack([output, slope,
-                                                              np.ones(len(output))])))
+            log.time, rate + _fit_tones(output - rate,
+                                        np.column_stack([output, slope, np.ones(len(output))])))
     assert heading is not None
     longest = max(round(_COMPARISON_SPAN / interval), 4)
     variance = {}
     for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
-        off, *motion = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag] for each in (
-            heading - turned, turned, output, slope))
+        off, *motion = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
+                        for each in (heading - turned, turned, output, slope))
         known = np.isfinite(off)
         if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
             columns = np.column_stack(motion)[known]
@@ -507,8 +505,8 @@ def heading_difference(log: Log) -> HeadingDifference:
             variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
                                        / float(stats.norm.isf(0.05))) ** 2
     whole = variance.pop(1.0, 0.0)
-    error = max([0.0, *((each - part * whole) / (6.0 * (1.0 - part))
-                        for part, each in variance.items())])
+    error = max(
+        [0.0, *((each - part * whole) / (6.0 * (1.0 - part)) for part, each in variance.items())])
     white = white_noise_deviation(log.output) * math.sqrt(interval)
     return HeadingDifference(
         math.sqrt(error),

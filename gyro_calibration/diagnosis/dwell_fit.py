@@ -116,8 +116,8 @@ class NamedCauses:
 def model_channels(model: GyroModel, dwells: Dwells) -> Channels:
     """Return the channels of a model, at its reference temperature if the table has none."""
     channels = channels_of(dwells)
-    return channels if dwells.temperature is not None else replace(
-        channels, temperature=np.full(len(dwells), model.reference_temperature))
+    return (channels if dwells.temperature is not None
+            else replace(channels, temperature=np.full(len(dwells), model.reference_temperature)))
 
 
 def simulate_output(model: GyroModel, dwells: Dwells) -> Array:
@@ -168,27 +168,24 @@ def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float
     change, needless = _choose_temperature_origin(change, model, naming_level(false_alarm_rate))
     guilty = tuple(each for each in change.effects if each not in (*NUISANCE_EFFECTS, *needless)
                    and _effect_p_value(change, tested, each) < naming_level(false_alarm_rate))
-    change = _refit_without(
-        change,
-        frozenset(each.name for each in change.effects
-                  if each not in (*NUISANCE_EFFECTS, *needless, *guilty)))
+    change = _refit_without(change,
+                            frozenset(each.name for each in change.effects
+                                      if each not in (*NUISANCE_EFFECTS, *needless, *guilty)))
     if model is None:
         return NamedCauses(change, change, guilty, tested, false_alarm_rate)
     fit = _refit_changed_values(dwells, model, change)
-    changed_nuisances = [
-        each for each in NUISANCE_EFFECTS if each in fit.effects
-        and _change_p_value(fit, model, each) < naming_level(false_alarm_rate, True)
-    ]
-    return NamedCauses(
-        fit, change, (*(_effect_or_confounder(each, fit) for each in guilty), *changed_nuisances),
-        tested, false_alarm_rate)
+    changed_nuisances = [each for each in NUISANCE_EFFECTS if each in fit.effects
+                         and _change_p_value(fit, model,
+                                             each) < naming_level(false_alarm_rate, True)]
+    return NamedCauses(fit, change, (*(_effect_or_confounder(each, fit) for each in guilty),
+                                     *changed_nuisances), tested, false_alarm_rate)
 
 
 def naming_level(false_alarm_rate: float, is_nuisance: bool = False) -> float:
     """Return the level at which one cause is named."""
-    return (_NUISANCE_ALARM_SHARE * false_alarm_rate
-            / len(NUISANCE_EFFECTS) if is_nuisance else _CAUSE_ALARM_SHARE * false_alarm_rate /
-            (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS)))
+    return (
+        _NUISANCE_ALARM_SHARE * false_alarm_rate / len(NUISANCE_EFFECTS) if is_nuisance
+        else _CAUSE_ALARM_SHARE * false_alarm_rate / (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS)))
 
 
 def _refit_without(change: Calibration, names: frozenset[str]) -> Calibration:
@@ -201,12 +198,10 @@ def _refit_without(change: Calibration, names: frozenset[str]) -> Calibration:
 def _refit_changed_values(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibration:
     """Refit the changed effects as a whole, the values of the model and their changes."""
     own = {term.effect.name for term in model.terms}
-    effects = tuple(
-        other if (other := _confounder(each)) is not None and other.name in own - {each.name}
-        else each for each in change.effects)
-    fit, _ = resolve_confounders(
-        fit_effects(subtract_effects(dwells, model, effects), effects, change.scatter),
-        stated_technology(model))
+    effects = tuple(other if (other := _confounder(each)) is not None
+                    and other.name in own - {each.name} else each for each in change.effects)
+    fit, _ = resolve_confounders(fit_effects(subtract_effects(dwells, model, effects), effects,
+                                             change.scatter), stated_technology(model))
     return with_reference_temperature(fit, model.reference_temperature)
 
 
@@ -244,12 +239,12 @@ def _effect_p_value(fit: Calibration, model: GyroModel, effect: Effect,
         return 1.0
     used, others = _used_dwells(fit), [term for term in fit.terms if term.effect is not effect]
     if added is None:
-        added = (sum(term.error(channels_of(used)) for term in fit.terms if term.effect is effect)
-                 + np.zeros(len(used)))
+        added = sum(term.error(channels_of(used))
+                    for term in fit.terms if term.effect is effect) + np.zeros(len(used))
     if not np.any(added):
         return 1.0
-    columns = (np.column_stack([*sensitivity_columns(used, others).T, added])
-               if others else added[:, None])
+    columns = (np.column_stack([*sensitivity_columns(used, others).T, added]) if others
+               else added[:, None])
     uncertain = Uncertainty.from_fit(used, fit.scatter, columns, fit.residual[fit.scatter.inliers])
     # the deviation of the last value by dwells over that by dwells and model
     whitener = Whitener(used, fit.scatter)
@@ -290,8 +285,8 @@ def _choose_temperature_origin(fit: Calibration, model: GyroModel | None,
     """Return a fit with a reference temperature that needs no slope, and the unneeded effects."""
     if fit.dwells.temperature is None:
         return fit, ()
-    first = (_USUAL_TEMPERATURES if model is None else
-             (model.reference_temperature, *_USUAL_TEMPERATURES))
+    first = (_USUAL_TEMPERATURES if model is None
+             else (model.reference_temperature, *_USUAL_TEMPERATURES))
     if BIAS_TEMPERATURE_QUADRATIC in fit.effects:
         for place in (*first, float(fit.dwells.temperature.mean()),
                       float(fit.dwells.temperature[0])):
@@ -304,11 +299,9 @@ def _choose_temperature_origin(fit: Calibration, model: GyroModel | None,
 
 def with_reference_temperature(fit: Calibration, temperature: float) -> Calibration:
     """Return the same fit with another reference temperature of its effects."""
-    terms = [
-        replace(term, values=(temperature, *term.values[1:])) if term.effect.nonlinear_parameters
-        and term.effect.nonlinear_parameters[0].name == 'reference_temperature' else term
-        for term in fit.terms
-    ]
+    terms = [replace(term, values=(temperature, *term.values[1:]))
+             if term.effect.nonlinear_parameters and term.effect.nonlinear_parameters[0].name
+             == 'reference_temperature' else term for term in fit.terms]
     places = [place for place, term in enumerate(terms)
               if not any(shape.default is None for shape in term.effect.nonlinear_parameters)]
     channels = channels_of(fit.dwells)
@@ -346,8 +339,7 @@ def assemble_model(dwells: Dwells, model: GyroModel | None, fit: Calibration) ->
     # the confounder of an effect of the model may stand in its place
     kept_terms = [
         term for term in model.terms if (other := _confounder(term.effect)) not in fit.effects
-        or term.effect in fit.effects or any(each.effect is other for each in model.terms)
-    ]
+        or term.effect in fit.effects or any(each.effect is other for each in model.terms)]
     own = [term.effect.name for term in kept_terms]
     terms = (*(new.get(term.effect.name, term) for term in kept_terms),
              *(term for name, term in new.items() if name not in own))
@@ -368,8 +360,8 @@ def _combined_covariance(model: GyroModel, fit: Calibration,
         return None
     known = np.zeros((0, 0)) if model.covariance is None else model.covariance
     both, places = block_diag(known, found), []
-    of_model, of_fit = (_covariance_indices(model.terms,
-                                            0), _covariance_indices(fit.terms, len(known)))
+    of_model, of_fit = (_covariance_indices(model.terms, 0),
+                        _covariance_indices(fit.terms, len(known)))
     for term in terms:
         places += of_fit.get(term.effect.name, []) or of_model[term.effect.name]
     return both[np.ix_(places, places)]
@@ -396,8 +388,8 @@ _MAX_CURVE_COLUMNS = 9
 _MIN_DWELLS_PER_COLUMN = 4
 #: Least part of the columns of a curve that is independent of the model.
 _MIN_INDEPENDENT_SHARE = 1e-3
-RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = (
-    'rate', 'temperature', 'rate_times_temperature', 'order_of_dwells', 'sweep')
+RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = ('rate', 'temperature', 'rate_times_temperature',
+                                            'order_of_dwells', 'sweep')
 SINGLE_RATES = 'single_rates'
 #: Least number of sweeps that repeat a rate for a column of that rate.
 _MIN_REPEATING_SWEEPS = 4
@@ -422,9 +414,8 @@ def find_structure(fit: Calibration, false_alarm_rate: float,
 
     """
     used = select_dwells(fit.dwells, fit.scatter.inliers)
-    probes = ({
-        name: columns for name, columns in _structure_curves(used).items() if columns.shape[1]
-    })
+    probes = {name: columns
+              for name, columns in _structure_curves(used).items() if columns.shape[1]}
     known, error = sensitivity_columns(used, fit.terms), fit.residual[fit.scatter.inliers]
     found, gains, curve_count = [], {}, len(probes)
     while probes:
@@ -487,10 +478,8 @@ def _structure_curves(dwells: Dwells) -> Mapping[str, Array]:
                                   len(dwells) // _MIN_DWELLS_PER_COLUMN)),
         SINGLE_RATES: _rate_columns(dwells),
         ORDER: _spline_columns(np.arange(len(dwells)).astype(float), slow),
-        SWEEP: _sweep_columns(dwells)
-    }
-    if (dwells.temperature is not None
-            and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD):
+        SWEEP: _sweep_columns(dwells)}
+    if (dwells.temperature is not None and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD):
         probes[TEMPERATURE] = _spline_columns(dwells.temperature, slow)
         rate, temperature = (_scale_to_unit_range(dwells.rate),
                              _scale_to_unit_range(dwells.temperature))
@@ -532,8 +521,8 @@ def _sweep_columns(dwells: Dwells) -> Array:
     parts = cross_validation_parts(dwells)
     if len(dwells) < 8 * (parts.max() + 1):
         return np.zeros((len(dwells), 0))
-    return ((parts[:, None] == np.arange(parts.max() + 1)) *
-            (_scale_to_unit_range(dwells.rate) ** 2)[:, None])
+    return (parts[:, None] == np.arange(parts.max()
+                                        + 1)) * (_scale_to_unit_range(dwells.rate) ** 2)[:, None]
 
 
 #: Confounders of bias and scale factor that dwells in one pose on one table never rule out.
@@ -546,10 +535,8 @@ def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]
     """Return the alternatives of an effect, and the experiment that would distinguish them."""
     if effect in _ALWAYS_CONFOUNDED:
         return [_ALWAYS_CONFOUNDED[effect]], CAUSES[effect.name].separate_by
-    steady = [
-        (sigmas, other) for other in _swapped_fits(fit, effect)
-        if (sigmas := math.sqrt(max(other.misfit - fit.misfit, 0.0))) < MIN_DISTINGUISHING_SIGMAS
-    ]
+    steady = [(sigmas, other) for other in _swapped_fits(fit, effect) if (sigmas := math.sqrt(
+        max(other.misfit - fit.misfit, 0.0))) < MIN_DISTINGUISHING_SIGMAS]
     found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
     found += [(sigmas, name) for name, columns in _unsteady_causes(fit, effect)
               if (sigmas := _advantage_sigmas(fit, effect, columns)) < MIN_DISTINGUISHING_SIGMAS]
@@ -589,8 +576,8 @@ def _advantage_sigmas(fit: Calibration, effect: Effect, columns: list[Array]) ->
     term = next(each for each in fit.terms if each.effect is effect)
     whitener = Whitener(used, fit.scatter)
     # the residual with what the effect explains
-    error = whitener.whiten((fit.residual
-                             + term.error(channels_of(fit.dwells)))[fit.scatter.inliers])
+    error = whitener.whiten(
+        (fit.residual + term.error(channels_of(fit.dwells)))[fit.scatter.inliers])
     known = whitener.whiten(
         sensitivity_columns(used, [each for each in fit.terms if each is not term]))
     misfits = []

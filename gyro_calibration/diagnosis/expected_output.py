@@ -30,15 +30,13 @@ from scipy import stats
 from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
-_COMMON_FACTORS: Mapping[str, float] = {
-    'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi,
-    '-pi/180': -math.pi / 180.0, '-180/pi': -180.0 / math.pi,
-    '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
+_COMMON_FACTORS: Mapping[str, float] = {'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi,
+                                        '-pi/180': -math.pi / 180.0, '-180/pi': -180.0 / math.pi,
+                                        '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
 #: Powers of two instead of powers of ten, and vice versa.
 _BINARY_FACTORS: Mapping[str, float] = {
     **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)},
-    '1000/1024': 1000.0 / 1024.0,
-    '1048576/1000000': 1.048576, '1000000/1048576': 1.0 / 1.048576}
+    '1000/1024': 1000.0 / 1024.0, '1048576/1000000': 1.048576, '1000000/1048576': 1.0 / 1.048576}
 UNIT_FACTORS: Mapping[str, float] = {**_COMMON_FACTORS, **_BINARY_FACTORS}
 #: Largest ratio of the factor of a gyro to 1 in the right unit, or to the factor of another unit.
 _MAX_GYRO_RATIO = 1.1
@@ -68,20 +66,18 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
     matches = []
     for name, value in UNIT_FACTORS.items():
         # far from 1 a confusion is the only explanation
-        least, known = ((_MAX_FACTOR_ERROR, _MAX_DEVIATION) if is_implausible_factor(value) else
-                        (1e-4, _MAX_DEVIATION_NEAR_ONE))
+        least, known = ((_MAX_FACTOR_ERROR, _MAX_DEVIATION) if is_implausible_factor(value)
+                        else (1e-4, _MAX_DEVIATION_NEAR_ONE))
         if (abs(factor - value) < max(2.0 * deviation, least * abs(value))
                 and abs(factor / value - 1.0) < _MAX_FACTOR_ERROR
                 and deviation < known * min(abs(value - 1.0), abs(value))):
             matches.append(name)
     if matches:
         return min(matches, key=lambda name: abs(factor - UNIT_FACTORS[name]))
-    distant_matches = [
-        name for name, value in _COMMON_FACTORS.items()
-        if _factor_ratio(factor, value) < _MAX_GYRO_RATIO
-    ]
-    return (distant_matches[0]
-            if distant_matches and deviation < _MAX_DEVIATION * abs(factor) else None)
+    distant_matches = [name for name, value in _COMMON_FACTORS.items()
+                       if _factor_ratio(factor, value) < _MAX_GYRO_RATIO]
+    return (distant_matches[0] if distant_matches and deviation < _MAX_DEVIATION * abs(factor)
+            else None)
 
 
 def is_implausible_factor(factor: float) -> bool:
@@ -160,8 +156,8 @@ def compare_output(output: Array, rate: Array | None, line: LineFit | None) -> O
         return OutputComparison(whole, None, white_noise_deviation(output))
     expected = line.factor * rate + line.offset
     difference = output - expected
-    scatter = (1.4826 * float(np.nanmedian(np.abs(difference)))
-               if np.isfinite(difference).any() else math.inf)
+    scatter = (1.4826 * float(np.nanmedian(np.abs(difference))) if np.isfinite(difference).any()
+               else math.inf)
     return OutputComparison(whole, expected,
                             min(white_noise_deviation(output), white_noise_deviation(difference)),
                             scatter)
@@ -236,8 +232,8 @@ def model_scale_factor(model: GyroModel, rate: Array) -> float:
 def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
     low, high = output.min(), output.max()
     # without the ends, which may be clipped, unless most samples are there
-    inliers = ((output > low + _END_SHARE * (high - low)) & (output < high - _END_SHARE *
-                                                             (high - low)))
+    inliers = (output > low
+               + _END_SHARE * (high - low)) & (output < high - _END_SHARE * (high - low))
     if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.3 * np.ptp(rate):
         inliers = np.ones(len(rate), dtype=bool)
     for _ in range(_FIT_ITERATIONS):
@@ -249,9 +245,8 @@ def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
         inliers = np.abs(residual) <= 5.0 * robust_deviation(residual) + 1e-15
     # the standard deviation by the scatter of up to 20 parts, as the noise is coloured
     columns, residual = columns[inliers], residual[inliers]
-    pieces = np.minimum(
-        np.arange(len(residual)) * min(20,
-                                       len(residual) // 2) // len(residual), 19)
+    pieces = np.minimum(np.arange(len(residual)) * min(20, len(residual) // 2) // len(residual),
+                        19)
     scores = np.array([np.bincount(pieces, column * residual) for column in columns.T])
     inverse = np.linalg.pinv(columns.T @ columns)
     student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)

@@ -93,13 +93,11 @@ def add_causes(model: GyroModel, fit: FittedValues, bias_deviation: float) -> Gy
     """Return a model with all named effects of the gyro, and with corrected bias and scale."""
     new, term_covariance = _terms_with_covariance(fit, bias_deviation)
     moves = _has_motion(fit) and not is_scale_implausible(fit)
-    return add_terms(model, new, term_covariance, [
-        each.channels.output[each.valid] + each.simulated_error[each.valid]
-        for each in fit.replays if moves
-    ], [
-        each.channels.temperature[each.valid]
-        for each in fit.replays if 'temperature' in each.available_channels
-    ])
+    return add_terms(model, new, term_covariance,
+                     [each.channels.output[each.valid] + each.simulated_error[each.valid]
+                      for each in fit.replays if moves],
+                     [each.channels.temperature[each.valid]
+                      for each in fit.replays if 'temperature' in each.available_channels])
 
 
 def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
@@ -107,9 +105,9 @@ def add_terms(model: GyroModel, new: Sequence[Term], term_covariance: Array,
     """Return a model with more terms and their covariance, and ranges that include the logs."""
     has_ranges = bool(model.terms)
     return replace(
-        model, terms=_merge_terms(model.terms, new), covariance=_extended_covariance(
-            model, new, term_covariance), rate_range=widen_range(model.rate_range, outputs,
-                                                                 has_ranges),
+        model, terms=_merge_terms(model.terms, new),
+        covariance=_extended_covariance(model, new, term_covariance),
+        rate_range=widen_range(model.rate_range, outputs, has_ranges),
         temperature_range=widen_range(model.temperature_range, temperatures, has_ranges))
 
 
@@ -127,10 +125,8 @@ def origin_notes(findings: Sequence[Finding], factors: Sequence[float]) -> dict[
     sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
             for each in findings if each.ambiguous_with]
     output_factors = list(factors) if any(factor != 1.0 for factor in factors) else []
-    return {
-        name: note
-        for name, note in (('ambiguous', sets), ('output_multiplied_by', output_factors)) if note
-    }
+    return {name: note for name, note in (('ambiguous', sets),
+                                          ('output_multiplied_by', output_factors)) if note}
 
 
 def previous_origins(model: GyroModel) -> dict[str, object]:
@@ -189,10 +185,8 @@ def _terms_with_covariance(fit: FittedValues, bias_deviation: float) -> tuple[li
     implausible = is_scale_implausible(fit)
     scale = 0.0 if implausible else fit.scale_factor_error.value
     # the mean bias of the logs given that scale factor error
-    rates = [
-        with_distorted_rate(each, fit.causes).channels.rate[each.valid].mean()
-        for each in fit.replays
-    ]
+    rates = [with_distorted_rate(each, fit.causes).channels.rate[each.valid].mean()
+             for each in fit.replays]
     bias = np.mean(fit.biases) + (fit.scale_factor_error.value - scale) * np.mean(rates)
     terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
     ranks: list[int | None] = [None, None if implausible else fit.estimate_index(-1, 0)]
@@ -202,12 +196,11 @@ def _terms_with_covariance(fit: FittedValues, bias_deviation: float) -> tuple[li
             shapes = len(known.candidate.shapes)
             ranks += [
                 fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
-                for number in range(len(terms[-1].values))
-            ]
+                for number in range(len(terms[-1].values))]
     fitted = {number: rank for number, rank in enumerate(ranks) if rank is not None}
     term_covariance = np.zeros((len(ranks), len(ranks)))
-    term_covariance[np.ix_(list(fitted), list(fitted))] = fit.covariance[
-        np.ix_(list(fitted.values()), list(fitted.values()))]
+    term_covariance[np.ix_(list(fitted), list(fitted))] = fit.covariance[np.ix_(
+        list(fitted.values()), list(fitted.values()))]
     term_covariance[0, 0] = bias_deviation ** 2
     return terms, term_covariance
 
@@ -236,8 +229,8 @@ def _merge_term(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
         return (*terms, new)
     aligned, *others = _align_reference(old, new)
     one = _combine_terms(old, aligned)
-    return None if one is None else _merge_terms(
-        tuple(one if term is old else term for term in terms), others)
+    return (None if one is None
+            else _merge_terms(tuple(one if term is old else term for term in terms), others))
 
 
 def _align_reference(old: Term, new: Term) -> list[Term]:
@@ -249,11 +242,8 @@ def _align_reference(old: Term, new: Term) -> list[Term]:
                                             _COMPENSATING_EFFECTS[new.effect.name],
                                             Term(new.effect, (begin, value)))
     if new.effect is BIAS_TEMPERATURE_QUADRATIC:
-        return [
-            aligned,
-            Term(compensating_effect, (begin, 2.0 * offset * value)),
-            Term(BIAS, (offset ** 2 * value, ))
-        ]
+        return [aligned, Term(compensating_effect, (begin, 2.0 * offset * value)),
+                Term(BIAS, (offset ** 2 * value, ))]
     return [aligned, Term(compensating_effect, (offset * value,))]
 
 
@@ -296,8 +286,8 @@ def _extended_covariance(model: GyroModel, new: Sequence[Term],
     """
     if model.terms and model.covariance is None:
         return None
-    values, deviations = (_fitted_values(_merge_terms(model.terms,
-                                                      new)), np.sqrt(np.diag(term_covariance)))
+    values, deviations = (_fitted_values(_merge_terms(model.terms, new)),
+                          np.sqrt(np.diag(term_covariance)))
     changes = np.zeros((len(values), len(term_covariance)))
     for place in np.flatnonzero(deviations).tolist():
         changes[:, place] = (_fitted_values(

@@ -93,8 +93,7 @@ class Gate:
             'name': self.name,
             'passed': self.passed,
             'said': self.evidence,
-            'remedy': self.remedy
-        }
+            'remedy': self.remedy}
 
 
 @dataclass(frozen=True)
@@ -391,8 +390,7 @@ class Diagnosis:
             'logs': list(self.logs),
             'gates': [gate.to_dict() for gate in self.gates],
             'heading_shares': dict(self.heading_shares),
-            'reference': None if self.reference is None else self.reference.to_dict()
-        }
+            'reference': None if self.reference is None else self.reference.to_dict()}
 
 
 def _noise_to_dict(noise: Noise) -> dict[str, float]:

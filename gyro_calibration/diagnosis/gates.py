@@ -126,17 +126,17 @@ def select_reference(log: Log) -> tuple[Log, tuple[str, ...]]:
     counts = [0 if values is None else int(np.isfinite(values).sum())
               for values in (log.reference_rate, log.reference_heading)]
     by_rate = counts[0] > 0 and 2 * counts[0] >= counts[1]
-    notes = () if by_rate or not counts[0] else (
-        f'The reference rate is known in {counts[0]} samples only; '
-        f'the heading, known in {counts[1]}, is used.',)
+    notes = (() if by_rate or not counts[0]
+             else (f'The reference rate is known in {counts[0]} samples only; '
+                   f'the heading, known in {counts[1]}, is used.',))
     log = replace(log, reference_rate=log.reference_rate if by_rate else None,
                   reference_heading=log.reference_heading if counts[1] else None)
     rate = reference_rate(log)
     if rate is None or not np.nanmax(np.abs(rate)) > 0.0 or not is_at_rest(log):
         return log, notes
-    return replace(log, reference_rate=0.0 * rate, reference_heading=None), (
-        *notes, 'The reference shows noise alone, which the gyro does not measure; '
-        'the gyro is taken to be at rest.')
+    return (replace(log, reference_rate=0.0 * rate, reference_heading=None),
+            (*notes, 'The reference shows noise alone, which the gyro does not measure; '
+             'the gyro is taken to be at rest.'))
 
 
 def resample_reference(log: Log) -> Log:
@@ -374,8 +374,8 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
         return
     yield _motion_gate(agreed, log)
     if agreed.coherence > _MIN_UNIT_COHERENCE:
-        own = (1.0 if model is None else model_scale_factor(
-            model, np.gradient(reference_angle(log), log.time)))
+        own = (1.0 if model is None
+               else model_scale_factor(model, np.gradient(reference_angle(log), log.time)))
         # a model with other units is refused by `check_model_units`
         yield from _unit_gates(agreed, own if 0.1 < abs(own) < 10.0 else 1.0, log)
 
@@ -485,10 +485,8 @@ def _regress_at_best_lag(time: Array, turned: Array, point_times: Array, heading
     """Return factor, its deviation, coherence and residual, rad, at the best lag."""
     change, steps = np.diff(heading), np.diff(point_times)
     lags = span * np.arange(-_MAX_LAG_SPANS, _MAX_LAG_SPANS + 1)
-    found = [
-        _regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change)
-        for lag in lags
-    ]
+    found = [_regress_changes(np.diff(np.interp(point_times - lag, time, turned)), steps, change)
+             for lag in lags]
     least = min(1.0 - each[2] for each in found)
     # a periodic motion agrees again a period later
     near = [place for place, each in enumerate(found) if 1.0 - each[2] <= 1.5 * least + 0.01]
@@ -509,8 +507,8 @@ def _regress_changes(gyro: Array, steps: Array,
             kept[:] = True
     variance, left = float(np.var(change[kept])), float(np.var(off[kept]))
     coherence = max(1.0 - left / variance, 0.0) if variance > 0.0 else 0.0
-    deviation = math.sqrt(left / max(kept.sum() - 2, 1)
-                          / max(float(np.var(columns[kept, 0])), 1e-300))
+    deviation = math.sqrt(
+        left / max(kept.sum() - 2, 1) / max(float(np.var(columns[kept, 0])), 1e-300))
     return float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left)
 
 

@@ -71,8 +71,8 @@ def draw_residuals(noises: NoiseHypotheses, count: Array, probability: Array, dr
     chosen_noises = generator.choice(len(probability), draws, p=probability)
     deviation = np.repeat((1.0 / np.sqrt(noises.weights)).astype(np.float32), count.astype(int),
                           axis=1)
-    return (generator.standard_normal(
-        (draws, deviation.shape[1]), np.float32) * deviation[chosen_noises])
+    return generator.standard_normal((draws, deviation.shape[1]),
+                                     np.float32) * deviation[chosen_noises]
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ def marginalize_nuisances(nuisances: Array, columns: Array, groups: Sequence[Col
 
     def products(one: Array, other: Array) -> Array:
         """Return the products of rows under each noise, shape (g, rows, rows of the other)."""
-        return np.tensordot(noises.weights, np.array(
-            [one[:, part] @ other[:, part].T for part in parts]), 1)
+        return np.tensordot(noises.weights,
+                            np.array([one[:, part] @ other[:, part].T for part in parts]), 1)
 
     own, crossing = products(nuisances, nuisances), products(nuisances, columns)
     towards = np.linalg.solve(own, crossing)
@@ -176,15 +176,14 @@ def noise_likelihood(residuals: Array, nuisances: Array, columns: Array, starts:
                      noises: NoiseHypotheses, marginalization: Marginalized) -> NoiseLikelihood:
     """Return the likelihood of residuals, (d, m), whitened by the first noise."""
     parts = _band_slices(starts, nuisances.shape[1])
-    towards, crossed = (noises.weights @ np.stack(
-        [residuals[:, part] @ each[:, part].T for part in parts], axis=1)
+    towards, crossed = (
+        noises.weights @ np.stack([residuals[:, part] @ each[:, part].T for part in parts], axis=1)
         for each in (nuisances, columns))
     value = np.linalg.solve(marginalization.nuisance_information, towards[..., None])[..., 0]
     squares = (np.add.reduceat(residuals ** 2, starts, axis=1) @ noises.weights.T
                - (value * towards).sum(axis=-1))
-    likelihood = (
-        -0.5 *
-        (marginalization.degrees_of_freedom * np.log(squares) + marginalization.log_determinant))
+    likelihood = -0.5 * (marginalization.degrees_of_freedom * np.log(squares)
+                         + marginalization.log_determinant)
     pull = crossed - (towards[:, :, None, :] @ marginalization.projections)[:, :, 0]
     return NoiseLikelihood(likelihood, squares, towards, pull)
 
@@ -210,8 +209,7 @@ def _candidate_evidence(by_noise: NoiseLikelihood, marginalization: Marginalized
                                     np.log(information[:, 0, 0]),
                                     marginalization.degrees_of_freedom, 1)
     gained = ((scores[:, :, None, :] @ np.linalg.inv(information))[:, :, 0] * scores).sum(axis=-1)
-    return _average_over_noises(by_noise, gained,
-                                np.linalg.slogdet(information)[1],
+    return _average_over_noises(by_noise, gained, np.linalg.slogdet(information)[1],
                                 marginalization.degrees_of_freedom, len(group))
 
 
@@ -220,12 +218,11 @@ def _average_over_noises(by_noise: NoiseLikelihood, explained_squares: Array,
                          column_count: int) -> Array:
     """Return the evidence averaged over the noises (see the module)."""
     ratio = np.log1p(-np.minimum(explained_squares / by_noise.residual_squares, 1.0 - 1e-9))
-    change = (0.5 * (column_count * np.log(by_noise.residual_squares) -
-                     (degrees_of_freedom - column_count) * ratio - log_determinant))
+    change = 0.5 * (column_count * np.log(by_noise.residual_squares)
+                    - (degrees_of_freedom - column_count) * ratio - log_determinant)
     best = by_noise.log_likelihood.argmax(axis=1)
-    scale = (0.5 *
-             (log_determinant[best]
-              - column_count * np.log(by_noise.residual_squares[np.arange(len(best)), best])))
+    scale = 0.5 * (log_determinant[best]
+                   - column_count * np.log(by_noise.residual_squares[np.arange(len(best)), best]))
     return (log_sum_exp(by_noise.log_likelihood + change) + scale
             - log_sum_exp(by_noise.log_likelihood))
 

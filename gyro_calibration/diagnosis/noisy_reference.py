@@ -93,16 +93,14 @@ _CURVE_BINS = 20
 _SEARCH_ALARM_SHARE, _VALUE_ALARM_SHARES = (0.6, {
     'bias': 0.05,
     'scale_factor_error': 0.05,
-    'time_offset': 0.1
-})
+    'time_offset': 0.1})
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
     'encoder': 'an encoder',
     'odometry': 'odometry',
     'motion_capture': 'motion capture',
-    'gyro': 'another gyro'
-}
+    'gyro': 'another gyro'}
 _METHOD_TEXT = ('The heading by {} was compared with the integral of the output over spans of a '
                 'second '
                 'or more, under noise of gyro and reference that was found together with the '
@@ -171,8 +169,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     parts, time = _heading_contributions(extended), extended.spans.time
     noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
     rates = extended.spans.point_rates()
-    of_heading = heading_error_shares([(parts, time)], 2.0 * (
-        noise['reference'] ** 2 + noise['motion'] ** 2 * float(np.mean(rates ** 2))))
+    of_heading = heading_error_shares(
+        [(parts, time)],
+        2.0 * (noise['reference'] ** 2 + noise['motion'] ** 2 * float(np.mean(rates ** 2))))
     findings = [*_value_findings(extended, model, false_alarm_rate, reference), *record.findings,
                 *(each for cause in found for each in [_cause_finding(cause, extended)]
                   if not each.parameters[each.effect].contains_zero)]
@@ -192,9 +191,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                      None if not changed and model is not None else gain, before, after,
                      _untestable_causes(plain), [curve], heading_curve(parts, time), None,
                      (*record.remarks, *_remarks(reference, extended, prior is not None)),
-                     false_alarm_rate, trace=trace, method=_METHOD_TEXT.format(
-                         _REFERENCE_PHRASES[reference.kind]), reference=replace(
-                             reference, noise=noise), heading_shares=of_heading)
+                     false_alarm_rate, trace=trace,
+                     method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
+                     reference=replace(reference, noise=noise), heading_shares=of_heading)
 
 
 # values
@@ -211,10 +210,10 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
         if name == 'bias' and model is not None:
             # the mean bias of a log differs from that of the model by bias wander
             duration = float(fit.spans.time[-1] - fit.spans.time[0])
-            deviation = math.sqrt(deviation ** 2 + max(
-                2.0 / math.pi * each.bias_instability ** 2
-                + each.rate_random_walk ** 2 * duration / 3.0
-                for each in (_gyro_noise(fit), model.noise)))
+            deviation = math.sqrt(
+                deviation ** 2 + max(2.0 / math.pi * each.bias_instability ** 2
+                                     + each.rate_random_walk ** 2 * duration / 3.0
+                                     for each in (_gyro_noise(fit), model.noise)))
         if name == 'time_offset' and lag is not None:
             # to first order a lag is a delay
             place_of_lag = fit.value_slice(lag).start
@@ -325,8 +324,7 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
         own_places = fit.value_slice(cause)
         values = fit.values[own_places].tolist()
         if cause.cause == 'bandwidth':
-            terms.append(Term(CATALOGUE['bandwidth'],
-                              (math.sqrt(2.0 * max(values[0], 1e-10)),)))
+            terms.append(Term(CATALOGUE['bandwidth'], (math.sqrt(2.0 * max(values[0], 1e-10)),)))
             places.append(None)
         elif cause.cause in CATALOGUE:
             terms.append(Term(CATALOGUE[cause.cause], (*cause.shapes, *values)))
@@ -345,10 +343,9 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
 def _gyro_noise(fit: SpanFit) -> Noise:
     """Return the noise of the gyro; bias wander that the log does not show is 0."""
     # at the edge of the grid nothing bounds it from below
-    return Noise(fit.noise_size('angle_random_walk'), **{
-        part.name: fit.noise_size(part.name)
-        if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
-        for part in wander_noise(fit.spans)})
+    return Noise(fit.noise_size('angle_random_walk'),
+                 **{part.name: fit.noise_size(part.name) if fit.fit.sizes[part.name][1] > 1.01
+                    * part.size_range[0] else 0.0 for part in wander_noise(fit.spans)})
 
 
 # gain
@@ -358,9 +355,8 @@ def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
     values = fit.values.copy()
     values[2] -= fit.spans.delay
     columns = design_matrix(fit.spans, fit.causes) * values
-    found = ({
-        name: columns[:, place] for place, name in enumerate(BASE_VALUES) if name != 'time_offset'
-    })
+    found = {name: columns[:, place]
+             for place, name in enumerate(BASE_VALUES) if name != 'time_offset'}
     for cause in fit.causes:
         found[cause.cause] = columns[:, fit.value_slice(cause)].sum(axis=1)
     found['left'] = fit.spans.observed - columns.sum(axis=1)
@@ -416,9 +412,8 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
         if name not in seen:
             shown[name] = (f'the logs have no {" and no ".join(lacks)}'.replace('_', ' ') if lacks
                            else 'fewer than three stretches turn, which do not distinguish it '
-                           'from a scale factor error'
-                           if plain.scale_held and _follows_the_rate(name)
-                           else 'the errors of the reference hide it over short spans')
+                           'from a scale factor error' if plain.scale_held and _follows_the_rate(
+                               name) else 'the errors of the reference hide it over short spans')
     return shown
 
 
@@ -446,8 +441,7 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
     before, after = (-each / steps
                      for each in (sum(parts.values(), 0.0 * parts['left']), parts['left']))
     order = np.array_split(np.argsort(measured, kind='stable'),
-                           min(_CURVE_BINS,
-                               len(steps) // 4 + 1))
+                           min(_CURVE_BINS, len(steps) // 4 + 1))
     at, given, left = (np.array([float(each[part].mean()) for part in order])
                        for each in (measured, before, after))
     deviation = np.array([float(after[part].std()) / math.sqrt(len(part)) for part in order])
@@ -496,8 +490,7 @@ def propose_terms(fit: SpanFit) -> Iterator[CauseTerm]:
 def _follows_the_rate(cause: str) -> bool:
     """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
     effect = CATALOGUE.get(cause)
-    return (cause == 'reference_once_per_rev' if effect is None
-            else 'rate' in effect.inputs)
+    return (cause == 'reference_once_per_rev' if effect is None else 'rate' in effect.inputs)
 
 
 def _columns(done: SpanFit) -> Iterator[CauseTerm]:
@@ -606,16 +599,14 @@ def _find_best_cause(fit: SpanFit, rich_fit: SpanFit, open_terms: Sequence[Cause
         if each.cause not in best_of or chances[other][1] > chances[best_of[each.cause]][1]:
             best_of[each.cause] = other
     gain = chances[strongest][1]
-    equivalent_causes = {
-        name: other for name, other in best_of.items()
-        if chances[other][1] > gain - math.log(_MAX_LIKELIHOOD_RATIO) or other == strongest
-    }
+    equivalent_causes = {name: other for name, other in best_of.items() if chances[other][1] > gain
+                         - math.log(_MAX_LIKELIHOOD_RATIO) or other == strongest}
     # the simplest of the equivalent causes: with the fewest values and fitted shapes
 
     def count_values(other: int) -> int:
         effect = CATALOGUE.get(open_terms[other].cause)
-        return widths[other].shape[1] + sum(each.default is None for each in getattr(
-            effect, 'nonlinear_parameters', ()))
+        return widths[other].shape[1] + sum(
+            each.default is None for each in getattr(effect, 'nonlinear_parameters', ()))
 
     place = min(equivalent_causes.values(),
                 key=lambda other: (count_values(other), corrected_chances[other]))
@@ -642,11 +633,12 @@ def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[s
     both -= base @ (base.T @ both)
     clusters = [each[rows] for each in (data.row_stretches, *data.row_sectors)]
     sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
-    return [(1.0, 0.0, 0.0) if each.is_positive
-            and float(both[:, place.start] @ both[:, -1]) <= 0.0 else _cluster_robust_evidence(
-                both[:, place], both[:, -1],
-                clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], 1e-6
-                * sizes[place]) for place, each in zip(places, open_terms)]
+    return [
+        (1.0, 0.0, 0.0) if each.is_positive and float(both[:, place.start] @ both[:, -1]) <= 0.0
+        else _cluster_robust_evidence(both[:, place], both[:, -1],
+                                      clusters if CAUSES[each.cause].along in _MOTION_VARIABLES
+                                      else clusters[:1], 1e-6 * sizes[place])
+        for place, each in zip(places, open_terms)]
 
 
 def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
@@ -696,9 +688,8 @@ def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice]
         for fold in sets:
             held = np.isin(data.row_stretches, fold)
             rest = ~held
-            gains = [
-                gain for _, gain, _ in _term_evidences(data, columns, places, open_terms, rest)
-            ]
+            gains = [gain
+                     for _, gain, _ in _term_evidences(data, columns, places, open_terms, rest)]
             best = int(np.argmax(gains))
             same_choices += open_terms[best].cause in equivalent_causes
             off = []

@@ -141,8 +141,7 @@ _STEP_SHARES = {
     'alternatives': 11,
     'noise figures': 1,
     'cross-validation': 3,
-    'findings': 4
-}
+    'findings': 4}
 
 #: A cause and its alternatives, each with its deficit in log-likelihood.
 Alternatives = Sequence[tuple[SelectedCause, float]]
@@ -218,13 +217,10 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     steps.begin('data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
     steps.begin('replay of the model')
-    replays = [
-        replay(
-            log if clean.unit_factor == 1.0 or log.output is None else replace(
-                log, output=log.output * clean.unit_factor), clean.usable, generator,
-            clean.update_interval, clean.heading_step, clean.output_step, model)
-        for log, clean in zip(logs, quality)
-    ]
+    replays = [replay(log if clean.unit_factor == 1.0 or log.output is None
+                      else replace(log, output=log.output * clean.unit_factor), clean.usable,
+                      generator, clean.update_interval, clean.heading_step, clean.output_step,
+                      model) for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
     search, everything = _search_with_filtered_noise(replays, generator,
                                                      _SEARCH_ALARM_SHARE * rate, steps)
@@ -252,18 +248,17 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     changed = [] if model is None else _model_value_findings(found, model, noise, rate)
     within = [(known, members) for known, members in zip(named, sets) if known not in out]
     lasting = any(not is_single_event(known) for known, _ in within)
-    won = (measure_gain(search,
-                        {each.candidate.cause for _, members in within
-                         for each, _ in members}, model is not None) if
-           (lasting or changed) and not is_scale_implausible(found) else None)
+    won = measure_gain(
+        search, {each.candidate.cause for _, members in within for each, _ in members},
+        model is not None) if (lasting or changed) and not is_scale_implausible(found) else None
     offered = won is None or not won.is_worse
     steps.begin('findings')
     more = find_suspected(search, (*named, *unnamed))
     taken = {each.candidate.cause for each in named}
     findings = [*_cause_findings(search, found, sets, unnamed, [
-        each for each in unconfirmed
-        if is_lasting(each.candidate) and each.candidate.cause not in taken]
-        or ([more.causes[-1]] if more else [])), *_record_findings(quality, changed)]
+        each for each in unconfirmed if is_lasting(each.candidate)
+        and each.candidate.cause not in taken] or ([more.causes[-1]] if more else [])),
+                *_record_findings(quality, changed)]
     if model is not None:
         findings += _noise_findings(figures, model, rate, found.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
@@ -272,24 +267,20 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                           if out else found.fit, found.replays, lasting_only=True)
     plain, deviation = (FittedValues(fit_causes(search.problem, []), found.replays),
                         _mean_bias_deviation(inside, noise))
-    before = model or add_origin_notes(
-        replace(add_causes(GyroModel(), plain, deviation), noise=noise), GyroModel(), quality)
-    after = (extend_model(model, inside, quality, findings, noise, deviation) if offered
-             else before)
+    before = model or add_origin_notes(replace(add_causes(GyroModel(), plain, deviation),
+                                               noise=noise), GyroModel(), quality)
+    after = extend_model(model, inside, quality, findings, noise, deviation) if offered else before
     # Curves before the extension contain the best bias and scale factor error, unless these differ
     # significantly from those of the model.
     left, shown = (model_residuals(found.replays) if changed else unbiased_residuals(plain),
                    inside if offered else plain)
     of_heading = heading_error_shares(
-        [
-            found.heading_contributions(run, plain if model is None else None)
-            for run in range(len(replays))
-        ],
+        [found.heading_contributions(run, plain if model is None else None)
+         for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
     return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
-                     tuple(unexplained_structures(search, found,
-                                                  unnamed)), noise, simulated, won, before, after,
-                     _untestable_causes(search, logs), residual_curves(left, shown),
+                     tuple(unexplained_structures(search, found, unnamed)), noise, simulated, won,
+                     before, after, _untestable_causes(search, logs), residual_curves(left, shown),
                      heading_error_curve(left, shown), allan_curves(found, noise, simulated),
                      tuple(_remarks(quality, names, found, unnamed, refuted, out, won, model)),
                      rate, heading_shares=of_heading)
@@ -300,8 +291,8 @@ def _cause_findings(search: Search, fit: FittedValues, alternatives_of: Sequence
                     suspected_causes: Sequence[SelectedCause]) -> Iterator[Finding]:
     """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
     for place, (known, members) in enumerate(zip(fit.causes, alternatives_of)):
-        others = [(each.candidate.cause, lack) for each, lack in members
-                  if each.candidate.cause != known.candidate.cause]
+        others = [(each.candidate.cause, lack)
+                  for each, lack in members if each.candidate.cause != known.candidate.cause]
         yield cause_finding(
             search, fit, place, _cause_p_value(search, (*fit.causes, *unnamed), place), members,
             next_experiment(known.candidate.cause, others, observed_range(fit.replays)))
@@ -343,10 +334,8 @@ def _search_with_filtered_noise(replays: Sequence[Replay], generator: np.random.
     return search, search_causes(search)
 
 
-def _withdraw_names(
-    search: Search,
-    causes: tuple[SelectedCause, ...]
-) -> tuple[tuple[SelectedCause, ...], tuple[SelectedCause, ...]]:
+def _withdraw_names(search: Search, causes: tuple[SelectedCause, ...]) -> tuple[
+        tuple[SelectedCause, ...], tuple[SelectedCause, ...]]:
     """
     Separate named causes from structure without a name.
 
@@ -376,15 +365,14 @@ def _withdraw_names(
     unnamed = tuple(each for each in causes if each not in kept)
     if not unnamed:
         return kept, ()
-    rest = tuple(
-        each for each in unnamed
-        if not is_named(each.candidate) or CAUSES[each.candidate.cause].along not in
-        {unnamed_variable(other.candidate) for other in unnamed if not is_named(other.candidate)})
+    rest = tuple(each for each in unnamed if not is_named(each.candidate)
+                 or CAUSES[each.candidate.cause].along not in {unnamed_variable(
+                     other.candidate) for other in unnamed if not is_named(other.candidate)})
     left = eliminate_backward(search, refine_jointly(search, (*kept, *rest)))
-    return tuple(
-        each for each in left if any(each.candidate.cause == one.candidate.cause
-                                     and each.candidate.log_index == one.candidate.log_index
-                                     for one in kept)), rest
+    return tuple(each
+                 for each in left if any(each.candidate.cause == one.candidate.cause
+                                         and each.candidate.log_index == one.candidate.log_index
+                                         for one in kept)), rest
 
 
 def _size_sigmas(search: Search, causes: tuple[SelectedCause, ...]) -> list[float]:
@@ -412,17 +400,16 @@ def _is_repeatable(search: Search, causes: tuple[SelectedCause, ...],
     return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
 
 
-def _choose_simplest(
-        search: Search, named: tuple[SelectedCause, ...],
-        unnamed: tuple[SelectedCause, ...]
-) -> tuple[tuple[SelectedCause, ...], list[Alternatives]]:
+def _choose_simplest(search: Search, named: tuple[SelectedCause, ...],
+                     unnamed: tuple[SelectedCause,
+                                    ...]) -> tuple[tuple[SelectedCause, ...], list[Alternatives]]:
     """Replace each cause by its simplest alternative, and return the alternatives of each."""
     def size(known: SelectedCause) -> int:
         """Return the number of fitted values of a cause."""
         candidate = known.candidate
-        return len(fitted_shape_indices(candidate)) + (
-            0 if candidate.amplitude is not None
-            else len(candidate.columns(search.problem.replays[0])))
+        return len(fitted_shape_indices(
+            candidate)) + (0 if candidate.amplitude is not None
+                           else len(candidate.columns(search.problem.replays[0])))
 
     sets: list[Alternatives] = []
     for place in range(len(named)):
@@ -453,19 +440,16 @@ def _model_value_findings(fit: FittedValues, model: GyroModel, noise: Noise,
                      for name in NOISE_NAMES[1:]))
     deviations = np.hypot([_mean_bias_deviation(fit, likely), scale.deviation], own)
     different = []
-    for name, value, deviation, confounders in (
-            ('bias', bias, float(deviations[0]), ()),
-            ('scale_factor_error', scale.value, float(deviations[1]), ('reference_scale',))):
+    for name, value, deviation, confounders in (('bias', bias, float(deviations[0]), ()),
+                                                ('scale_factor_error', scale.value,
+                                                 float(deviations[1]), ('reference_scale',))):
         chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
         if chance < _BIAS_ALARM_SHARE * false_alarm_rate:
-            different.append(
-                make_finding(
-                    name, {
-                        name: Estimate.from_half_width(value, NORMAL_QUANTILE_975 * deviation,
-                                                       CAUSES[name].unit)
-                    }, chance, confounders, minimum_detectable=5.4 * deviation,
-                    evidence='it adds to the value of the model, '
-                    f'{abs(value) / deviation:.3g} sigma from zero'))
+            different.append(make_finding(
+                name, {name: Estimate.from_half_width(value, NORMAL_QUANTILE_975 * deviation,
+                                                      CAUSES[name].unit)}, chance, confounders,
+                minimum_detectable=5.4 * deviation, evidence='it adds to the value of the model, '
+                f'{abs(value) / deviation:.3g} sigma from zero'))
     return different
 
 
@@ -491,10 +475,8 @@ def _noise_findings(noise_parameters: NoiseParameters, model: GyroModel, false_a
                 continue
             unit, value = CAUSES[name].unit, getattr(noise_parameters.noise, name)
             found.append(
-                make_finding(
-                    name, {name: Estimate(value, noise_parameters.intervals[name], unit)},
-                    noise_parameters.p_values[name],
-                    evidence='the model states '
+                make_finding(name, {name: Estimate(value, noise_parameters.intervals[name], unit)},
+                             noise_parameters.p_values[name], evidence='the model states '
                              f'{format_amount(getattr(expected, name), unit, name)}, '
                              f'the log {format_amount(value, unit, name)}'))
     return found
@@ -503,8 +485,8 @@ def _noise_findings(noise_parameters: NoiseParameters, model: GyroModel, false_a
 def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     """Return the reason for each cause that these logs cannot show."""
     replays = search.problem.replays
-    has = (frozenset.intersection(*(each.available_channels
-                                    for each in replays)) | {'time', 'output'})
+    has = frozenset.intersection(
+        *(each.available_channels for each in replays)) | {'time', 'output'}
     of_motion = frozenset({'reference', *REFERENCES})
     has |= (of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES)
             else frozenset())
@@ -553,8 +535,8 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: FittedVa
                   else '')
         yield (f'A second {name.replace("_", " ")} is not added to the extended model, as it '
                f'cannot be merged with the first one{remedy}.')
-    for name in dict.fromkeys(
-            each.candidate.cause for each in fit.causes if is_single_event(each)):
+    for name in dict.fromkeys(each.candidate.cause
+                              for each in fit.causes if is_single_event(each)):
         yield (f'The {name.replace("_", " ")} occurs once: it is not in the extended model, '
                'whose bias is the mean over the logs.')
     if gain is not None and gain.is_worse:
@@ -570,11 +552,10 @@ def cause_finding(search: Search, fit: FittedValues, cause_index: int, p_value: 
     known = fit.causes[cause_index]
     candidate, name = known.candidate, known.candidate.cause
     parameters = _cause_parameters(fit, cause_index)
-    probability = probabilities({name: 0.0, **{
-        each.candidate.cause: lack for each, lack in reversed(alternatives)}})
-    confounders = [
-        each.candidate.cause for each, _ in alternatives if each.candidate.cause != name
-    ]
+    probability = probabilities(
+        {name: 0.0, **{each.candidate.cause: lack for each, lack in reversed(alternatives)}})
+    confounders = [each.candidate.cause
+                   for each, _ in alternatives if each.candidate.cause != name]
     size = next(iter(parameters.values()))
     deviation = size.deviation
     if name == 'time_offset' and identify_sample_offset(size.estimate, deviation,
@@ -655,12 +636,12 @@ def unexplained_structures(search: Search, fit: FittedValues,
         name = (CAUSES[known.candidate.cause].along if is_named(known.candidate)
                 else unnamed_variable(known.candidate))
         variables.setdefault(name, []).append(len(fit.causes) + place)
-    least, most = (_residual_variance(search, fit,
-                                      causes), _residual_variance(search, fit, fit.causes))
+    least, most = (_residual_variance(search, fit, causes),
+                   _residual_variance(search, fit, fit.causes))
     structures = []
     for name, places in variables.items():
-        without = _residual_variance(search, fit, [known for place, known in enumerate(causes)
-                                                   if place not in places])
+        without = _residual_variance(
+            search, fit, [known for place, known in enumerate(causes) if place not in places])
         chance = min(search.null_distribution.p_value(causes[place].candidate.cause,
                                                       evidence_for(search, causes, place))
                      for place in places)

@@ -145,17 +145,14 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
     after = assemble_model(dwells, model, named.fit) if offered else before
     strengths = {effect: _misfit_reduction(named, effect) for effect in named.causes}
-    findings = add_remedies([
-        *record.findings,
-        *_outlier_findings(dwells, named.fit, _OUTLIER_ALARM_SHARE * false_alarm_rate),
-        *(_cause_finding(named, effect)
-          for effect in sorted(named.causes, key=lambda each: -strengths[each]))
-    ], {}, after)
+    findings = add_remedies(
+        [*record.findings,
+         *_outlier_findings(dwells, named.fit, _OUTLIER_ALARM_SHARE * false_alarm_rate),
+         *(_cause_finding(named, effect)
+           for effect in sorted(named.causes, key=lambda each: -strengths[each]))], {}, after)
     if after is not before:
-        after = replace(after, origin={
-            **after.origin,
-            **origin_notes(findings, [record.unit_factor])
-        })
+        after = replace(after,
+                        origin={**after.origin, **origin_notes(findings, [record.unit_factor])})
     return Diagnosis(
         tuple(findings), structures, Noise(),
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
@@ -184,8 +181,8 @@ def _conclude_causes(
         and max((gain for name, gain in gains.items()
                  if CAUSES[effect.name].along in name.split('_times_')), default=0.0)
         > _MAX_UNEXPLAINED_RATIO * _misfit_reduction(named, effect))
-    return (_conclude_causes(dwells, model, false_alarm_rate, withdrawn) if withdrawn else
-            (named, structures, withdrawn))
+    return (_conclude_causes(dwells, model, false_alarm_rate, withdrawn) if withdrawn
+            else (named, structures, withdrawn))
 
 
 def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
@@ -213,13 +210,10 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
     part_numbers = np.unique(parts[known], return_inverse=True)[1]
     what = 'sweeps' if len(np.unique(dwells.sweep)) >= MIN_SWEEPS else 'consecutive dwells'
     # the heading error of a turn over the window at the rate of a dwell
-    squares = {
-        name: np.outer(np.bincount(part_numbers, error[known] ** 2), [1.0, HEADING_WINDOW ** 2])
-        for name, error in errors.items()
-    }
+    squares = {name: np.outer(np.bincount(part_numbers, error[known] ** 2),
+                              [1.0, HEADING_WINDOW ** 2]) for name, error in errors.items()}
     return gain_from_squares(f'{what} left out, each of {groups.max() + 1} groups in '
-                             'turn', squares,
-                             np.outer(np.bincount(part_numbers), [1, 1]),
+                             'turn', squares, np.outer(np.bincount(part_numbers), [1, 1]),
                              'plain' if model is None else 'given', HEADING_WINDOW)
 
 
@@ -253,8 +247,8 @@ def _misfit_reduction(named: NamedCauses, effect: Effect) -> float:
     if effect not in NUISANCE_EFFECTS:
         rest = _fit_without(named.change_fit, named.change_effect(effect))
         return math.inf if rest is None else rest.misfit - named.change_fit.misfit
-    return (value_change(named.fit, named.model, effect)
-            / _term_with_deviations(named.fit, effect)[1][0]) ** 2
+    return (value_change(named.fit, named.model,
+                         effect) / _term_with_deviations(named.fit, effect)[1][0]) ** 2
 
 
 def _fit_without(fit: Calibration, effect: Effect) -> Calibration | None:
@@ -273,8 +267,8 @@ def _cause_finding(named: NamedCauses, effect: Effect) -> Finding:
         for place, deviation in zip(term.fitted_indices, deviations)}
     return make_finding(effect.name, estimates, named.p_value(effect), others,
                         minimum_detectable=_minimum_detectable(named, effect),
-                        separate_by=separate_by, evidence=_evidence_sentence(named,
-                                                                             effect), **along)
+                        separate_by=separate_by, evidence=_evidence_sentence(named, effect),
+                        **along)
 
 
 def _model_values(named: NamedCauses, effect: Effect) -> tuple[float, ...]:
@@ -290,8 +284,8 @@ def _term_with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[
     covariance = fit.model.covariance
     deviations = (np.full(len(owners), math.nan) if covariance is None
                   else np.sqrt(np.diag(covariance)))
-    return term, [float(deviation) for owner, deviation in zip(owners, deviations)
-                  if owner is term]
+    return term, [float(deviation)
+                  for owner, deviation in zip(owners, deviations) if owner is term]
 
 
 def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
@@ -318,8 +312,8 @@ def _detectable_size(fit: Calibration, effect: Effect, level: float) -> float:
     place = [term.effect for term in fit.terms for _ in term.fitted_indices].index(effect)
     uncertain = Uncertainty.from_fit(used, fit.scatter, sensitivity_columns(used, fit.terms),
                                      fit.residual[fit.scatter.inliers])
-    deviation = math.sqrt(float(np.tensordot(uncertain.weights, uncertain.covariances,
-                                             axes=1)[place, place]))
+    deviation = math.sqrt(
+        float(np.tensordot(uncertain.weights, uncertain.covariances, axes=1)[place, place]))
 
     def excess(sigmas: float) -> float:
         outside = (uncertain.probability_below(-sigmas * deviation)[place]
@@ -456,9 +450,8 @@ def error_curves(dwells: Dwells, scatter: Scatter, before: GyroModel,
                                   before, after))
         # A scale factor that changes with temperature averages out over turns both ways, unless
         # errors count in the sense of the turn.
-        found.append(
-            _error_curve('temperature_while_turning', 'degC', used.temperature, senses, used,
-                         scatter, before, after))
+        found.append(_error_curve('temperature_while_turning', 'degC', used.temperature, senses,
+                                  used, scatter, before, after))
     return tuple(found)
 
 

@@ -101,8 +101,8 @@ class RegressionProblem:
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
         parts = [coefficient_angles(each.point_count) for each in self.replays]
-        return np.concatenate(parts), np.concatenate([
-            np.full(len(part), each.point_interval) for part, each in zip(parts, self.replays)])
+        return np.concatenate(parts), np.concatenate([np.full(len(part), each.point_interval)
+                                                      for part, each in zip(parts, self.replays)])
 
     def whitening_factors(self, noise_index: int) -> Array:
         """Return the factors that whiten coefficients whitened by the first noise, shape (m,)."""
@@ -112,12 +112,11 @@ class RegressionProblem:
 
 def build_problem(replays: Sequence[Replay]) -> RegressionProblem:
     """Set up the regression of logs with a grid of noises."""
-    rounding_ratio = (_estimate_rounding_ratio(replays) if any(
-        each.heading_step for each in replays) else 0.0)
-    return _assemble_problem(
-        tuple(replays), NoiseShape(rounding_ratio=rounding_ratio),
-        noise_grid(min(each.point_interval for each in replays),
-                   max(each.duration for each in replays), rounding_ratio))
+    rounding_ratio = (
+        _estimate_rounding_ratio(replays) if any(each.heading_step for each in replays) else 0.0)
+    return _assemble_problem(tuple(replays), NoiseShape(rounding_ratio=rounding_ratio),
+                             noise_grid(min(each.point_interval for each in replays),
+                                        max(each.duration for each in replays), rounding_ratio))
 
 
 def _estimate_rounding_ratio(replays: Sequence[Replay]) -> float:
@@ -145,10 +144,9 @@ def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
     angle, step = (np.concatenate([part for part, _ in parts]),
                    np.concatenate([np.full(len(part), step) for part, step in parts]))
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
-    relative = np.array([
-        np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen],
-                        first_of)
-        for shape in shapes]) / [len(part) for part in few]
+    relative = np.array([np.add.reduceat(
+        shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen], first_of)
+                         for shape in shapes]) / [len(part) for part in few]
     # Each combination of components has the same prior probability, whatever its number of sizes.
     kinds = [(bool(each.walk_ratio), bool(each.markov_ratio), bool(each.flicker_corner))
              for each in shapes]
@@ -212,9 +210,8 @@ class RegressionFit:
         best = int(of.noise_likelihood.log_likelihood[0].argmax())
         factor = of.problem.whitening_factors(best) * np.sqrt(
             of.marginalized.degrees_of_freedom / of.noise_likelihood.residual_squares[0, best])
-        return [
-            part * own for part, own in zip(self.residual_transforms(), self._split_by_log(factor))
-        ]
+        return [part * own
+                for part, own in zip(self.residual_transforms(), self._split_by_log(factor))]
 
     def residual_transforms(self) -> list[Array]:
         """Return each log's residual whitened by the first noise: shape (points - 1,)."""
@@ -232,8 +229,8 @@ class RegressionFit:
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
         covariance = np.linalg.inv(self.marginalized.nuisance_information[kept])
-        values = np.einsum('gpq,gq->gp', covariance, self.noise_likelihood.nuisance_scores[0,
-                                                                                           kept])
+        values = np.einsum('gpq,gq->gp', covariance,
+                           self.noise_likelihood.nuisance_scores[0, kept])
         mean = weights @ values
         variances = (weights * self.noise_likelihood.residual_squares[0, kept]
                      / self.marginalized.degrees_of_freedom)
@@ -271,10 +268,9 @@ def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause],
     """
     replays = [with_distorted_rate(each, causes) for each in problem.replays]
     widths = []
-    residual = np.concatenate([
-        each.transform_residual(each.channels.output - each.reference
-                                - (new.channels.rate - each.channels.rate))
-        for each, new in zip(problem.replays, replays)])
+    residual = np.concatenate([each.transform_residual(
+        each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
+                               for each, new in zip(problem.replays, replays)])
     columns, owner = [np.concatenate([each.transform_samples(each.channels.rate)
                                       for each in replays])[None]], [(-1, 0)]
     for place, known in enumerate(causes):
@@ -319,8 +315,8 @@ def _perturb_shape(candidate: Candidate, shape_index: int, duration: float) -> C
     step = (1e-3 / duration if candidate.cause == 'interference_tone'
             else _RELATIVE_SHAPE_STEP * abs(shape) if shape else 1e-6)
     moved = with_shape(candidate, shape_index, shape + step)
-    return (with_shape(candidate, shape_index, shape
-                       - step) if moved.shapes[shape_index] == shape else moved)
+    return (with_shape(candidate, shape_index, shape - step) if moved.shapes[shape_index] == shape
+            else moved)
 
 
 def smooth_shapes(candidate: Candidate) -> list[int]:
@@ -330,9 +326,8 @@ def smooth_shapes(candidate: Candidate) -> list[int]:
 
 def discontinuous_shapes(candidate: Candidate) -> list[int]:
     """Return the indices of fitted shapes on which the columns do not depend smoothly."""
-    return [
-        place for place in fitted_shape_indices(candidate) if place not in smooth_shapes(candidate)
-    ]
+    return [place
+            for place in fitted_shape_indices(candidate) if place not in smooth_shapes(candidate)]
 
 
 def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
@@ -373,20 +368,17 @@ def estimate_noise_levels(fit: RegressionFit) -> tuple[Replay, ...]:
     """
     is_filtered = [high_frequency_power_ratio(part) < 1.0 for part in fit.whitened_transforms()]
     while any(needs_averaging := [
-            high_frequency_power_ratio(part) < SMOOTHED_POWER_RATIO and 2.0
-            * each.point_interval <= _MAX_AVERAGING_TIME
-            for each, part in zip(fit.original_replays, fit.whitened_transforms())
-    ]):
+            high_frequency_power_ratio(part) < SMOOTHED_POWER_RATIO
+            and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME
+            for each, part in zip(fit.original_replays, fit.whitened_transforms())]):
         fit = _refit(fit, [replace(each, decimation=each.decimation * (1 + more))
                            for each, more in zip(fit.original_replays, needs_averaging)])
     for number in range(_LEVEL_ITERATIONS if any(is_filtered) else 0):
         # First by the residual that is not whitened, or slow noise would compensate the filter.
         of = zip(fit.original_replays,
                  fit.whitened_transforms() if number else fit.residual_transforms(), is_filtered)
-        fit = _refit(fit, [
-            each.with_scaled_noise_levels(relative_part_powers(part)) if falls else each
-            for each, part, falls in of
-        ])
+        fit = _refit(fit, [each.with_scaled_noise_levels(relative_part_powers(part)) if falls
+                           else each for each, part, falls in of])
     return fit.original_replays
 
 
@@ -422,8 +414,8 @@ def add_nuisance_columns(fit: RegressionFit, columns: Array) -> RegressionFit:
 
 def _fit_columns(problem: RegressionProblem, original_replays: tuple[Replay, ...],
                  causes: tuple[SelectedCause, ...], residual: Array, columns: Array,
-                 column_owners: tuple[tuple[int, int],
-                                      ...], column_counts: tuple[int, ...]) -> RegressionFit:
+                 column_owners: tuple[tuple[int, int], ...],
+                 column_counts: tuple[int, ...]) -> RegressionFit:
     """Return the fit of a whitened residual to independent columns under each noise."""
     kept = _independent_columns(columns)
     of, nothing = columns[kept], np.empty((0, len(residual)))
@@ -485,9 +477,8 @@ class FittedValues:
     @cached_property
     def _estimates(self) -> tuple[dict[tuple[int, int], int], Array, Array]:
         values, covariance = self.fit.estimates
-        return ({
-            owner: rank for rank, owner in enumerate(self.fit.column_owners)
-        }, values, covariance)
+        return ({owner: rank for rank, owner in enumerate(self.fit.column_owners)}, values,
+                covariance)
 
     @cached_property
     def _profile_deviations(self) -> dict[tuple[int, int], float]:
@@ -526,10 +517,8 @@ class FittedValues:
         candidate = self.causes[cause_index].candidate
         if candidate.amplitude is not None:
             return []
-        return [
-            self._estimated_value(cause_index, number)
-            for number in range(len(self.causes[cause_index].values))
-        ]
+        return [self._estimated_value(cause_index, number)
+                for number in range(len(self.causes[cause_index].values))]
 
     def shapes(self, cause_index: int) -> dict[int, Value]:
         """Return the fitted shapes of a cause, by their places."""
@@ -578,11 +567,9 @@ class FittedValues:
 
         """
         each = self.replays[log_index]
-        parts = {
-            **self.output_contributions(each, log_index), 'bias': np.full(
-                len(each.valid), self.biases[log_index]),
-            'left': self.residuals[log_index] - self.biases[log_index]
-        }
+        parts = {**self.output_contributions(each, log_index),
+                 'bias': np.full(len(each.valid), self.biases[log_index]),
+                 'left': self.residuals[log_index] - self.biases[log_index]}
         if plain_fit is not None:
             parts['scale_factor_error'] -= plain_fit.total_contribution(each, log_index)
             parts['bias'] -= plain_fit.biases[log_index]
@@ -612,10 +599,8 @@ class FittedValues:
         if cause_index < 0:
             parts = [with_distorted_rate(each, self.causes).channels.rate for each in self.replays]
         elif number >= 0 and self.is_included(cause_index):
-            parts = [
-                self.causes[cause_index].candidate.columns(with_distorted_rate(
-                    each, self.causes))[number] for each in self.replays
-            ]
+            parts = [self.causes[cause_index].candidate.columns(
+                with_distorted_rate(each, self.causes))[number] for each in self.replays]
         else:
             return 0.0
         return float(np.mean([part[each.valid].mean() for part, each in zip(parts, self.replays)]))

@@ -127,8 +127,7 @@ def relative_part_powers(whitened: Array) -> Array:
 
     """
     parts = np.array_split(whitened ** 2,
-                           max(min(_MAX_LEVEL_PARTS,
-                                   len(whitened) // _MIN_PART_COEFFICIENTS), 1))
+                           max(min(_MAX_LEVEL_PARTS, len(whitened) // _MIN_PART_COEFFICIENTS), 1))
     found = np.array([part.mean() for part in parts])
     return (np.maximum(np.concatenate([found[1:2], found[1:]]) / found[1], _MIN_NOISE_LEVEL)
             if len(found) > 1 else np.ones(1))
@@ -177,10 +176,8 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     plain = [NoiseShape(walk, strength, time, rounding_ratio) for walk in walks
              for strength, time in [(0.0, 1.0), *strong]]
     corners = np.geomspace(0.1 / duration, 0.3 / interval, _FLICKER_CORNER_COUNT)
-    return plain + [
-        NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
-        for walk in walks[::4] for corner in corners
-    ]
+    return plain + [NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
+                    for walk in walks[::4] for corner in corners]
 
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
@@ -304,9 +301,8 @@ class Replay:
             return cosine_transform(
                 self.resample(values, white_noise_deviation(values[self.valid])))
         smooth = values + (self.reference - self.channels.rate)
-        return cosine_transform(
-            self.resample(smooth, white_noise_deviation(smooth[self.valid]))
-            - self._reference_rounding())
+        return cosine_transform(self.resample(smooth, white_noise_deviation(smooth[self.valid]))
+                                - self._reference_rounding())
 
     def transform_samples(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
@@ -318,9 +314,8 @@ class Replay:
 
     def with_scaled_noise_levels(self, factors: Array) -> Replay:
         """Return the log with its levels multiplied by factors, as its noise for gaps."""
-        fill_transform = cosine_transform(self.fill_noise) * np.sqrt(
-            interpolate_noise_level(
-                coefficient_angles(len(self.fill_noise)) * self.decimation, factors))
+        fill_transform = cosine_transform(self.fill_noise) * np.sqrt(interpolate_noise_level(
+            coefficient_angles(len(self.fill_noise)) * self.decimation, factors))
         filling = inverse_cosine_transform(fill_transform)
         return replace(self, noise_levels=self.noise_levels * factors,
                        fill_noise=filling / white_noise_deviation(filling))
@@ -366,8 +361,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     _refuse_gaps(log.time[kept], place)
     every = max(1, math.ceil((place[-1] + 1) / MAX_POINTS))
     if model is not None and log.temperature is None:  # simulated at the reference temperature
-        prepared_log = replace(prepared_log, temperature=np.full(len(log),
-                                                                 model.reference_temperature))
+        prepared_log = replace(prepared_log,
+                               temperature=np.full(len(log), model.reference_temperature))
     # the heading for effects: that of the reference, or the integral of its rate
     heading = prepared_log.reference_heading
     if heading is None or not np.isfinite(heading).all():
@@ -377,8 +372,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
                     if getattr(log, name) is not None)
     rounded = heading_step if prepared_log.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
-    expected_rounding = (_expected_rounding(log.output, smooth, kept, output_step)
-                         if output_step else np.zeros(len(time)))
+    expected_rounding = (_expected_rounding(log.output, smooth, kept, output_step) if output_step
+                         else np.zeros(len(time)))
     coarse = max(output_step ** 2 / 12.0 - float(np.var(expected_rounding[kept])), 0.0)
     plain = Replay(replace(channels, output=log.output - expected_rounding), reference, kept,
                    place, interval, every, filling, rounded, has, np.zeros(len(time)), coarse)
@@ -428,9 +423,8 @@ def _smoothing_decimation(base_replay: Replay) -> int:
     """
     residual, factor, decimation = base_replay.channels.output - base_replay.reference, 1, 1
     while 2 * factor * base_replay.point_interval <= _MAX_AVERAGING_TIME:
-        power = (replace(
-            base_replay,
-            decimation=base_replay.decimation * factor).transform_samples(residual) ** 2)
+        power = replace(base_replay, decimation=base_replay.decimation * factor).transform_samples(
+            residual) ** 2
         _, second, _, last = (float(np.median(part)) for part in np.array_split(power, 4))
         factor *= 2
         if last < SMOOTHED_POWER_RATIO * second:
@@ -464,8 +458,8 @@ def _reference_rates(log: Log, time: Array, is_held: bool,
                      heading_step: float) -> tuple[Array, Array]:
     """Return the reference rate for the comparison, and the smoothed one for effects."""
     if log.reference_rate is not None:
-        rate = (_interpolate_updates(time, log.reference_rate, heading_step)
-                if is_held else log.reference_rate)
+        rate = (_interpolate_updates(time, log.reference_rate, heading_step) if is_held
+                else log.reference_rate)
         return rate, _interpolate_gaps(time, rate)
     if log.reference_heading is not None:
         heading = (_interpolate_updates(time, log.reference_heading, heading_step) if is_held
@@ -534,13 +528,11 @@ def _interpolate_updates(time: Array, values: Array, step: float) -> Array:
     renewed = np.flatnonzero((np.diff(values, prepend=np.nan) != 0.0) & known)
     update_times, update_values = time[renewed], values[renewed]
     usual = float(np.median(np.diff(update_times)))
-    held_updates = 1 + np.flatnonzero((np.diff(update_times) > _STANDSTILL_FACTOR * usual)
-                                      &
-                                      (np.abs(np.diff(update_values)) > _STANDSTILL_FACTOR * step))
-    update_times, update_values = (np.insert(update_times, held_updates,
-                                             update_times[held_updates] - usual),
-                                   np.insert(update_values, held_updates,
-                                             update_values[held_updates - 1]))
+    held_updates = 1 + np.flatnonzero((np.diff(update_times) > _STANDSTILL_FACTOR * usual) & (
+        np.abs(np.diff(update_values)) > _STANDSTILL_FACTOR * step))
+    update_times, update_values = (
+        np.insert(update_times, held_updates, update_times[held_updates] - usual),
+        np.insert(update_values, held_updates, update_values[held_updates - 1]))
     return np.where(known, np.interp(time, update_times, update_values), np.nan)
 
 
@@ -548,12 +540,12 @@ def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Ar
     """Return the rate of a heading by splines, nan where lost; and a smooth one without steps."""
     lost = ~np.isfinite(heading)
     rate = CubicSpline(time, _interpolate_gaps(time, heading))(time, 1)
-    near = (maximum_filter1d(lost, 3)
-            | maximum_filter1d(binary_opening(lost, np.ones(_GAP_MARGIN_SAMPLES)),
-                               2 * _GAP_MARGIN_SAMPLES + 1))
+    near = maximum_filter1d(
+        lost, 3) | maximum_filter1d(binary_opening(lost, np.ones(_GAP_MARGIN_SAMPLES)),
+                                    2 * _GAP_MARGIN_SAMPLES + 1)
     raw = np.where(near, np.nan, rate)
-    return (raw, _filter_rounding(rate, heading_step, float(np.median(np.diff(time))))
-            if heading_step else rate)
+    return raw, _filter_rounding(rate, heading_step,
+                                 float(np.median(np.diff(time)))) if heading_step else rate
 
 
 def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> Mask:
@@ -588,6 +580,5 @@ def _filter_rounding(rate: Array, step: float, interval: float) -> Array:
                 * spline_derivative_gain(np.arange(len(rate)) * math.pi / len(rate)))
     power = uniform_filter1d(coefficients ** 2, _SMOOTHING_BINS, mode='nearest')
     return idct(
-        coefficients
-        * np.clip(1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300), 0.0, 1.0),
-        norm='ortho')
+        coefficients * np.clip(1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300),
+                               0.0, 1.0), norm='ortho')

@@ -109,23 +109,23 @@ def _header(diagnosis: Diagnosis) -> Markup:
                     for name in ('name', 'serial_number')).strip()
     about = ' · '.join(
         filter(None, ['Diagnosis', gyro, ', '.join(map(sanitize_text, diagnosis.logs))]))
-    return element(
-        'header', element('p', about, class_='about'), element('h1', what),
-        element('p', gained, class_='gained'),
-        element('p', parts, class_='gained') if
-        (parts := heading_error_sentence(diagnosis)) else None,
-        element('p', verdict_phrase(diagnosis), class_=f'verdict {diagnosis.verdict}'),
-        None if diagnosis.gain is None else element(
-            'div', *(_tile(*each) for each in _gain_rows(diagnosis.gain)), class_='tiles'))
+    return element('header', element('p', about, class_='about'), element('h1', what),
+                   element('p', gained, class_='gained'), element('p', parts, class_='gained')
+                   if (parts := heading_error_sentence(diagnosis)) else None,
+                   element('p', verdict_phrase(diagnosis), class_=f'verdict {diagnosis.verdict}'),
+                   None if diagnosis.gain is None
+                   else element('div', *(_tile(*each) for each in _gain_rows(diagnosis.gain)),
+                                class_='tiles'))
 
 
 def _tile(what: str, errors: Change, unit: str) -> Markup:
     name, factor = display_unit(unit)
-    return element('div', element('p', as_sentence(what).rstrip('.')), element(
-        'p', format_number(errors.before * factor), element('span', ' → ', class_='quiet'),
-        format_number(errors.after * factor), element('span', f' {name}', class_='quiet'),
-        class_='big'), element('p', f'reduced by {_reduction_text(errors, unit)}', class_='quiet'),
-        class_='tile')
+    return element(
+        'div', element('p', as_sentence(what).rstrip('.')),
+        element('p', format_number(errors.before * factor), element('span', ' → ', class_='quiet'),
+                format_number(errors.after * factor), element('span', f' {name}', class_='quiet'),
+                class_='big'),
+        element('p', f'reduced by {_reduction_text(errors, unit)}', class_='quiet'), class_='tile')
 
 
 def _reduction_text(errors: Change, unit: str) -> str:
@@ -141,10 +141,10 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     yield _section('Structure that no cause explains',
                    [_bullet_list(map(structure_sentence, diagnosis.unexplained))]
                    if diagnosis.unexplained else [])
-    yield _section('Shares of the heading error', [
-        element('p', 'Parts of the mean square of the heading error over 60 s.'),
-        _responsive_table(['', 'share'], heading_share_rows(diagnosis))
-    ] if diagnosis.heading_shares else [])
+    yield _section('Shares of the heading error',
+                   [element('p', 'Parts of the mean square of the heading error over 60 s.'),
+                    _responsive_table(['', 'share'], heading_share_rows(diagnosis))]
+                   if diagnosis.heading_shares else [])
     yield _section('Gain on held-out parts' if diagnosis.gain is not None else 'Heading',
                    _gain_content(diagnosis))
     noise = _responsive_table(['', 'residual', 'simulation'], noise_rows(diagnosis))
@@ -153,13 +153,13 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
                        [_side_by_side([draw_chart(_allan_chart(diagnosis.noise_curve)), noise])])
     elif diagnosis.noise != Noise():
         yield _section('Noise', [noise])
+    yield _section('Along the other variables',
+                   [_side_by_side(draw_chart(_residual_chart(curve, place))
+                                  for place, curve in others)] if implicated and others else [])
     yield _section(
-        'Along the other variables',
-        [_side_by_side(draw_chart(_residual_chart(curve, place))
-                       for place, curve in others)] if implicated and others else [])
-    yield _section('What these data cannot show', [element('dl', *(
-        join_markup(element('dt', join_list(names)), element('dd', reason))
-        for reason, names in causes_by_reason(diagnosis.cannot_show).items()))]
+        'What these data cannot show',
+        [element('dl', *(join_markup(element('dt', join_list(names)), element('dd', reason))
+                         for reason, names in causes_by_reason(diagnosis.cannot_show).items()))]
         if diagnosis.cannot_show else [])
     yield _section('The model', [
         element('p', 'This is the extended model, as model.yaml has it; compensate, simulate and '
@@ -262,8 +262,8 @@ def _horizontal_unit(curve: Curve) -> tuple[str, float]:
 def _rate_unit(values: Array) -> tuple[str, float]:
     """Return the unit in which people read rates up to these, and the factor to it."""
     largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
-    return (('deg/h', 3600.0 / DEGREE) if 0.0 < largest < _DEG_PER_HOUR_LIMIT else
-            ('deg/s', 1.0 / DEGREE))
+    return (('deg/h', 3600.0 / DEGREE) if 0.0 < largest < _DEG_PER_HOUR_LIMIT
+            else ('deg/s', 1.0 / DEGREE))
 
 
 def _error_chart(curve: Curve, place: int) -> Chart | None:
@@ -273,10 +273,8 @@ def _error_chart(curve: Curve, place: int) -> Chart | None:
     measured = curve.simulated + curve.before
     unit, factor = _rate_unit(measured)
     across, scale = _horizontal_unit(curve)
-    lines = [
-        Line('measured', 'measured', factor * measured, factor * curve.deviation, draw_dots=True),
-        Line('simulated', 'simulated', factor * curve.simulated)
-    ]
+    lines = [Line('measured', 'measured', factor * measured, factor * curve.deviation,
+                  draw_dots=True), Line('simulated', 'simulated', factor * curve.simulated)]
     if not _is_unchanged(curve):
         lines.append(Line('simulated, extended', 'after', factor * (measured - curve.after)))
     along = readable_name(curve.along)
@@ -327,11 +325,8 @@ def _thin_points(at: Array, *values: Array) -> list[Array]:
 # causes
 
 def _cause_article(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
-    facts = [
-        *certainty_sentences(found),
-        detectability_sentence(found),
-        remedy_sentence(found, diagnosis)
-    ]
+    facts = [*certainty_sentences(found), detectability_sentence(found),
+             remedy_sentence(found, diagnosis)]
     uncertain = (element('p', alternatives_sentence(found), class_='uncertain')
                  if found.ambiguous_with else None)
     sizes_of = _responsive_table(['', 'estimate', '95 % interval'], [
@@ -355,8 +350,10 @@ def _responsive_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Ma
     body = (element('tr', element('th', row[0], scope='row'), *(
         element('td', cell, data_head=head) for head, cell in zip(heads[1:], row[1:])))
         for row in rows)
-    table = element('table', element('thead', element('tr', *(
-        element('th', head, scope='col') for head in heads))), element('tbody', *body))
+    table = element(
+        'table',
+        element('thead', element('tr', *(element('th', head, scope='col') for head in heads))),
+        element('tbody', *body))
     return element('div', table, class_='fold')
 
 
@@ -366,18 +363,14 @@ def _gain_content(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     parts = [] if diagnosis.heading is None else [draw_chart(_heading_chart(diagnosis.heading))]
     if diagnosis.gain is not None:
         errors = _gain_rows(diagnosis.gain)
-        yield element('p', ' '.join([
-            f'Measured on {sanitize_text(diagnosis.gain.held_out)}, which took no part in the '
-            'choice or '
-            'the fit.', *(f'The extended model {change_phrase(each, unit, f"the {what}")}.'
-                          for what, each, unit in errors)]))
-        parts.append(
-            _responsive_table(['rms', 'before', 'after', 'reduction, 95 % interval'], [[
-                what,
-                format_amount(each.before, unit),
-                format_amount(each.after, unit),
-                _reduction_text(each, unit)
-            ] for what, each, unit in errors]))
+        yield element('p', ' '.join(
+            [f'Measured on {sanitize_text(diagnosis.gain.held_out)}, which took no part in the '
+             'choice or '
+             'the fit.', *(f'The extended model {change_phrase(each, unit, f"the {what}")}.'
+                           for what, each, unit in errors)]))
+        parts.append(_responsive_table(['rms', 'before', 'after', 'reduction, 95 % interval'], [
+            [what, format_amount(each.before, unit), format_amount(each.after, unit),
+             _reduction_text(each, unit)] for what, each, unit in errors]))
     yield _side_by_side(parts) if parts else None
 
 

@@ -138,14 +138,11 @@ def _band_energies(fit: RegressionFit) -> _BandEnergies:
     problem, (angle, step) = fit.problem, fit.problem.coefficient_angles()
     left = np.concatenate(fit.residual_transforms()) * problem.deviation
     # The noise parameters before a filter are those of frequencies below its cut-off.
-    used = np.concatenate([
-        coefficient_angles(each.point_count) < 1.5 * np.pi / len(each.noise_levels)
-        for each in problem.replays
-    ])
-    coarse = np.concatenate([
-        np.full(each.point_count - 1, each.rounding_variance / each.decimation)
-        for each in problem.replays
-    ])
+    used = np.concatenate([coefficient_angles(each.point_count) < 1.5 * np.pi
+                           / len(each.noise_levels) for each in problem.replays])
+    coarse = np.concatenate(
+        [np.full(each.point_count - 1, each.rounding_variance / each.decimation)
+         for each in problem.replays])
     frequency = angle / (2.0 * np.pi * step)
     wave = 2.0 - 2.0 * np.cos(angle)
     parts = [1.0 / step, 1.0 / (2.0 * np.pi * frequency * step), step / wave]
@@ -179,18 +176,18 @@ def _fit_noise(bands: _BandEnergies, fixed: dict[int, float],
     size = bands.unit_variances.shape[1]
     free = [place for place in range(size) if place not in fixed]
     usual = bands.energy / bands.count
-    begin = start if start is not None else np.log(np.array([
-        (usual / bands.unit_variances[:, place]).min() for place in range(size)]))
+    begin = start if start is not None else np.log(
+        np.array([(usual / bands.unit_variances[:, place]).min() for place in range(size)]))
     logarithms = np.array([fixed.get(place, begin[place]) for place in range(size)])
 
     def cost(some: Array) -> float:
         logarithms[free] = some
         return bands.cost(logarithms)
 
-    found = [minimize(cost, begin[free] + shift, method='L-BFGS-B',
-                      bounds=[(-60.0, 20.0)] * len(free))
-             for shift in (0.0, *(-3.0 * (np.arange(len(free)) == place)
-                                  for place in range(1, len(free))))]
+    found = [
+        minimize(cost, begin[free] + shift, method='L-BFGS-B', bounds=[(-60.0, 20.0)] * len(free))
+        for shift in (0.0,
+                      *(-3.0 * (np.arange(len(free)) == place) for place in range(1, len(free))))]
     best = min(found, key=lambda one: one.fun)
     logarithms[free] = best.x
     return logarithms.copy(), float(best.fun)
@@ -257,8 +254,8 @@ def _curve_variables(
     yield 'time', 's', lambda each: each.channels.time - each.channels.time[0]
     if any(np.ptp(each.channels.rate) > 0.0 for each in replays):
         yield 'rate', 'rad/s', lambda each: each.channels.rate
-        yield ('rate_change', 'rad/s²',
-               lambda each: np.gradient(each.channels.rate, each.channels.time))
+        yield ('rate_change',
+               'rad/s²', lambda each: np.gradient(each.channels.rate, each.channels.time))
         yield 'heading', 'rad', lambda each: np.mod(each.channels.heading, 2.0 * np.pi)
     if 'temperature' in has:
         yield 'temperature', 'degC', lambda each: each.channels.temperature
@@ -332,8 +329,8 @@ def _amplitude_spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
         frequency, np.geomspace(frequency[0], frequency[-1], CURVE_BINS + 1)))[:-1]
     largest = [np.maximum.reduceat(values, edges) for values in amplitude]
     middle = np.sqrt(frequency[edges] * frequency[np.append(edges[1:], len(frequency)) - 1])
-    usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges)
-                    / np.diff(np.append(edges, len(frequency))))
+    usual = np.sqrt(
+        np.add.reduceat(amplitude[1] ** 2, edges) / np.diff(np.append(edges, len(frequency))))
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
 
 
@@ -352,6 +349,6 @@ def allan_curves(fit: FittedValues, fitted: Noise, expected: Noise) -> NoiseCurv
     allan = allan_deviation(
         each.resample(fit.residuals[0])[:_MAX_ALLAN_SAMPLES], each.point_interval)
     times = allan.time
-    return NoiseCurve(times, allan.deviation, np.sqrt(fitted.allan_variance(times)),
-                      np.sqrt(expected.allan_variance(times))
-                      if expected.angle_random_walk else None)
+    return NoiseCurve(
+        times, allan.deviation, np.sqrt(fitted.allan_variance(times)),
+        np.sqrt(expected.allan_variance(times)) if expected.angle_random_walk else None)

@@ -57,8 +57,8 @@ def local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
     values of the same size or larger, and at most that usual for the smallest relative step.
 
     """
-    steps = np.full(len(output), max(codes.step, float(np.diff(codes.values).min())
-                                     if len(codes.values) > 1 else 1.0))
+    steps = np.full(len(output), max(
+        codes.step, float(np.diff(codes.values).min()) if len(codes.values) > 1 else 1.0))
     sides = {sign: np.sort(sign * codes.values[sign * codes.values >= 0.0])
              for sign in (1.0, -1.0)}
     finest = min(float((np.diff(sizes) / sizes[1:]).min(initial=np.inf))
@@ -121,8 +121,8 @@ def _rest_rate_limit(output: Array) -> float:
 
 def sample_deviation(comparison: OutputComparison) -> float:
     """Return the standard deviation of samples from the expected output, rad/s."""
-    return (comparison.noise_deviation if comparison.expected is None else max(
-        comparison.noise_deviation, comparison.scatter))
+    return (comparison.noise_deviation if comparison.expected is None
+            else max(comparison.noise_deviation, comparison.scatter))
 
 
 @dataclass(frozen=True)
@@ -199,8 +199,8 @@ def _is_clipped(comparison: OutputComparison, sign: float, extreme: float, step:
     at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
     runs = int(np.count_nonzero(np.diff(at_extreme.astype(np.int8), prepend=0) > 0))
     fine = step < _FINE_STEP_NOISE_RATIO * comparison.noise_deviation
-    beyond = (np.array([]) if comparison.expected is None else
-              sign * comparison.expected[at_extreme & np.isfinite(comparison.expected)] - extreme)
+    beyond = (np.array([]) if comparison.expected is None else sign
+              * comparison.expected[at_extreme & np.isfinite(comparison.expected)] - extreme)
     if not beyond.size:
         return fine and runs >= _MIN_LIMIT_RUNS
     middle = float(np.median(beyond))
@@ -277,8 +277,8 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
     width = local_code_steps(codes, comparison.output[:-1])
     chance, run_chance = _repeat_chances(change, expected, width, known)
     if band is not None:  # a sample in it repeats while the next is due in it
-        within, chances = (band.contains(
-            comparison.output[:-1]), band.membership_chance(comparison)[1:])
+        within, chances = (band.contains(comparison.output[:-1]),
+                           band.membership_chance(comparison)[1:])
         chance, run_chance = (np.where(within, np.maximum(each, chances), each)
                               for each in (chance, run_chance))
         width = np.where(within, 2.0 * band.half_width, width)
@@ -298,13 +298,11 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
         else:
             # Repeats of a coarse code depend on each other: a fault only if it should have left.
             left = abs(cumulative_expected[stop] - cumulative_expected[start]) - width[start]
-            unlikely = (float(2.0 * stats.norm.sf(left /
-                                                  (math.sqrt(2.0) * sample_deviation(comparison))))
-                        if left > 0.0 else 1.0)
+            unlikely = float(2.0 * stats.norm.sf(
+                left / (math.sqrt(2.0) * sample_deviation(comparison)))) if left > 0.0 else 1.0
         if unlikely * len(valid) < level:
             repeats[start + 1:stop + 1], p_value = True, min(p_value, unlikely * len(valid))
-    return (RepeatedSamples(repeats, float(chance[known].sum()), p_value)
-            if repeats.any() else None)
+    return RepeatedSamples(repeats, float(chance[known].sum()), p_value) if repeats.any() else None
 
 
 def _repeat_chances(change: Array, expected: Array, step: Array,
@@ -358,8 +356,8 @@ def _same_code_chance(expected: Array, deviation: float, step: Array) -> Array:
     scale = np.maximum(deviation, 1e-9 * step)
     low, middle, high = ((edge - expected) / scale for edge in (-step, 0.0, step))
     above, below = ndtr(high) - ndtr(middle), ndtr(middle) - ndtr(low)
-    sizes = (expected * (above - below) + scale *
-             (2.0 * _normal_density(middle) - _normal_density(high) - _normal_density(low)))
+    sizes = expected * (above - below) + scale * (2.0 * _normal_density(middle)
+                                                  - _normal_density(high) - _normal_density(low))
     # Differences of nearly nothing are rounding.
     return np.where(step < _NARROW_CODE_RATIO * scale, step / scale * _normal_density(middle),
                     np.clip(above + below - sizes / step, 0.0, 1.0))
@@ -430,25 +428,21 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
     limit = max(_MIN_OUTLIER_SIGMAS, float(stats.norm.isf(0.25 * level / len(output))))
     # how much the output is expected to change about each sample
     expected_change = np.zeros(len(output)) if expected is None else np.ptp(
-        sliding_window_view(np.pad(expected, 2
-                                   * NEIGHBOURS_PER_SIDE, mode='edge'), 4 * NEIGHBOURS_PER_SIDE
-                            + 1), axis=1)
+        sliding_window_view(np.pad(expected, 2 * NEIGHBOURS_PER_SIDE, mode='edge'),
+                            4 * NEIGHBOURS_PER_SIDE + 1), axis=1)
     sigmas = _outlier_sigmas(output, expected_change, valid, min_scatter)
     if expected is not None:
         sigmas = np.maximum(
             sigmas, _outlier_sigmas(output - expected, expected_change, valid, min_scatter))
         # near a jump of the reference of half the size: a jolt, or the reference is outlying
         jumps = maximum_filter1d(_distance_to_median(expected), 2 * _JOLT_SAMPLES + 1)
-        sigmas[jumps > 0.5
-               * np.minimum(_distance_to_median(output), _distance_to_median(output
-                                                                             - expected))] = 0.0
-    tested = (valid & (np.count_nonzero(_neighbour_samples(~valid, NEIGHBOURS_PER_SIDE), axis=1)
-                       < NEIGHBOURS_PER_SIDE))
+        sigmas[jumps > 0.5 * np.minimum(_distance_to_median(output),
+                                        _distance_to_median(output - expected))] = 0.0
+    tested = valid & (np.count_nonzero(_neighbour_samples(~valid, NEIGHBOURS_PER_SIDE),
+                                       axis=1) < NEIGHBOURS_PER_SIDE)
     outlying = _drop_long_runs((sigmas > limit) & tested)
-    count, near = (int(np.count_nonzero(outlying)),
-                   int(
-                       np.count_nonzero((sigmas > _NEAR_OUTLIER_SIGMAS) & (sigmas <= limit)
-                                        & tested)))
+    count, near = (int(np.count_nonzero(outlying)), int(
+        np.count_nonzero((sigmas > _NEAR_OUTLIER_SIGMAS) & (sigmas <= limit) & tested)))
     if (not count or near > 0.5 * count + stats.poisson.isf(
             0.01, 2.0 * len(output) * stats.norm.sf(_NEAR_OUTLIER_SIGMAS))
             or _is_due_to_motion(outlying, expected_change, comparison)):
@@ -482,20 +476,18 @@ def _outlier_sigmas(values: Array, expected_change: Array, valid: Mask,
     off = np.abs(values - np.median(near, axis=1))
     # A step, a corner or a steep slope is off the median, but within the range of its neighbours.
     outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
-    scale = np.maximum(
-        np.maximum(_local_deviation(off, valid), _deviation_by_motion(off, expected_change,
-                                                                      valid)),
-        max(min_scatter, 1e-300))
+    scale = np.maximum(np.maximum(_local_deviation(off, valid),
+                                  _deviation_by_motion(off, expected_change, valid)),
+                       max(min_scatter, 1e-300))
     return np.where(outside > 0.5 * off, off / scale, 0.0)
 
 
 def _local_deviation(distance: Array, valid: Mask) -> Array:
     """Return the robust standard deviation in blocks, the largest of those next to a sample."""
     blocks = max(1, len(distance) // _SCATTER_BLOCK_SAMPLES)
-    scales = np.array([
-        _robust_deviation(part[kept])
-        for part, kept in zip(np.array_split(distance, blocks), np.array_split(valid, blocks))
-    ])
+    scales = np.array(
+        [_robust_deviation(part[kept])
+         for part, kept in zip(np.array_split(distance, blocks), np.array_split(valid, blocks))])
     edged = np.pad(scales, 1, mode='edge')
     scales = np.maximum(np.maximum(edged[:-2], edged[1:-1]), edged[2:])
     return np.repeat(scales, [len(part) for part in np.array_split(distance, blocks)])
@@ -507,10 +499,8 @@ def _robust_deviation(off: Array) -> float:
 
 def _deviation_by_motion(distance: Array, expected_change: Array, valid: Mask) -> Array:
     """Return the standard deviation among samples of like motion, by far ones too if enough."""
-    edges = (np.unique(
-        np.quantile(expected_change[valid],
-                    np.linspace(0.0, 1.0, _MOTION_KINDS
-                                + 1)[1:-1])) if valid.any() else np.array([]))
+    edges = np.unique(np.quantile(expected_change[valid], np.linspace(
+        0.0, 1.0, _MOTION_KINDS + 1)[1:-1])) if valid.any() else np.array([])
     kinds = np.searchsorted(edges, expected_change, side='left')
     scales = np.zeros(len(edges) + 1)
     for kind in range(len(scales)):
@@ -540,8 +530,8 @@ def _is_due_to_motion(outlying: Mask, expected_change: Array,
     by_chance = 0.5 + stats.norm.isf(_PATTERN_CHANCE) / np.sqrt(12.0 * len(ranks))
     if ranks.mean() > max(_MAX_MEAN_MOTION_RANK, by_chance):
         return True
-    turning = ((expected_change > 3.0 * comparison.noise_deviation)
-               & np.isfinite(comparison.expected))
+    turning = (expected_change > 3.0 * comparison.noise_deviation) & np.isfinite(
+        comparison.expected)
     if np.count_nonzero(outlying & turning) < _MIN_PATTERN_OUTLIERS:
         return False
     speeds = np.abs(comparison.expected)

@@ -196,8 +196,8 @@ class Search:
     scanned_causes: frozenset[str] = SCANNED_CAUSES
     unidentifiable: frozenset[str] = frozenset()
     columns_cache: dict[CausesKey, CandidateColumns] = field_of(default_factory=dict)
-    step_cache: dict[CausesKey, tuple[SearchStep | None,
-                                      list[SearchStep]]] = field_of(default_factory=dict)
+    step_cache: dict[CausesKey, tuple[SearchStep | None, list[SearchStep]]] = field_of(
+        default_factory=dict)
     on_part: OnPart = lambda words: None
 
     @property
@@ -245,8 +245,8 @@ def simulate_null_distribution(fit: RegressionFit, columns: CandidateColumns,
         if not np.isfinite(null_evidence[:, own]).any():
             start[cause], scale[cause] = 0.0, 1.0  # not identifiable in these data
             continue
-        most = (np.sort(log_mean_exp(
-            null_evidence[:, own]))[int((1.0 - share) * len(null_evidence)):])
+        most = np.sort(
+            log_mean_exp(null_evidence[:, own]))[int((1.0 - share) * len(null_evidence)):]
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
     return NullDistribution(start, scale, share)
 
@@ -262,8 +262,8 @@ def start_search(replays: Sequence[Replay], generator: np.random.Generator, rate
     shown, places = screen_candidates(fit, columns), indices_by_cause(found)
     if shown.max() > STRONG_EVIDENCE:
         problem, fit = everywhere, fit_causes(everywhere, [])
-    unidentifiable = frozenset(cause for cause, own in places.items()
-                               if not np.isfinite(shown[own]).any())
+    unidentifiable = frozenset(
+        cause for cause, own in places.items() if not np.isfinite(shown[own]).any())
     on_part('significance, by simulated noise')
     return Search(problem, columns, simulate_null_distribution(fit, columns, generator),
                   rate / len(places), unidentifiable=unidentifiable, on_part=on_part)
@@ -274,28 +274,22 @@ def restrict_search(search: Search, replays: Sequence[Replay], causes: Collectio
     """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
     found = [each for each in search.candidates if each.cause in causes]
     problem = build_problem(replays)
-    return replace(search, problem=problem, candidate_columns=make_candidate_columns(
-        problem, found), rate=rate, scanned_causes=SCANNED_CAUSES & frozenset(causes),
-                   columns_cache={}, step_cache={})
+    return replace(search, problem=problem,
+                   candidate_columns=make_candidate_columns(problem, found),
+                   rate=rate, scanned_causes=SCANNED_CAUSES & frozenset(causes), columns_cache={},
+                   step_cache={})
 
 
 def _drop_unlikely_noises(problem: RegressionProblem,
                           candidates: Sequence[Candidate]) -> RegressionProblem:
     """Remove noises that are unlikely both without causes and with one column of each cause."""
-    middle = [
-        places[len(places) // 2]
-        for places in indices_by_cause([each for each in candidates if is_named(each)]).values()
-    ]
-    tried = [
-        each.noise_likelihood
-        for each in (fit_causes(problem, []),
-                     fit_causes(problem, [], [candidates[place] for place in middle]))
-    ]
-    kept = np.flatnonzero(
-        np.any([
-            each.log_likelihood[0] > each.log_likelihood[0].max() - MAX_LIKELIHOOD_DEFICIT
-            for each in tried
-        ], axis=0))
+    middle = [places[len(places) // 2] for places in indices_by_cause(
+        [each for each in candidates if is_named(each)]).values()]
+    tried = [each.noise_likelihood
+             for each in (fit_causes(problem, []),
+                          fit_causes(problem, [], [candidates[place] for place in middle]))]
+    kept = np.flatnonzero(np.any([each.log_likelihood[0] > each.log_likelihood[0].max()
+                                  - MAX_LIKELIHOOD_DEFICIT for each in tried], axis=0))
     if not len(kept):
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
@@ -317,9 +311,8 @@ class _ScreenedCandidate:
 def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
     """Return the logs that may contain one more instance of a cause."""
     taken = [known.candidate.log_index for known in fit.causes if known.candidate.cause == cause]
-    return [
-        run for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]
-    ]
+    return [run
+            for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]]
 
 
 def find_tones(fit: RegressionFit) -> list[_ScreenedCandidate]:
@@ -356,11 +349,11 @@ def _unalias_frequency(replay: Replay, frequency: float) -> float:
     def relative_power(at: float) -> float:
         """Return the ratio of the power at a frequency to that of its neighbours."""
         place = round(at)
-        return float(power[place - 2:place + 3].max()
-                     / np.median(power[max(place - 60, 0):place + 61]))
+        return float(
+            power[place - 2:place + 3].max() / np.median(power[max(place - 60, 0):place + 61]))
 
-    return (float(max(places[places < len(power) - 3], key=relative_power)) /
-            (2.0 * samples.duration))
+    return float(
+        max(places[places < len(power) - 3], key=relative_power)) / (2.0 * samples.duration)
 
 
 def _is_tone_of_gyro(replay: Replay, frequency: float) -> bool:
@@ -375,19 +368,16 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
     """Return the clearest jumps of the reference's heading, where it accelerates."""
     found = []
     parts = np.cumsum([each.point_count - 1 for each in fit.problem.replays])[:-1]
-    divided = np.split(
-        fit.problem.whitening_factors(int(fit.noise_likelihood.log_likelihood[0].argmax()))
-        / fit.problem.deviation, parts)
+    divided = np.split(fit.problem.whitening_factors(
+        int(fit.noise_likelihood.log_likelihood[0].argmax())) / fit.problem.deviation, parts)
     left = fit.whitened_series()
     for run in _logs_to_scan(fit, 'reference_slip'):
         each, white, factor = fit.problem.replays[run], left[run], divided[run]
         acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
-            tried = [
-                _fit_slips(each, run, white, factor, moments,
-                           max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS
-            ]
+            tried = [_fit_slips(each, run, white, factor, moments,
+                                max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
             # The largest number indicates a continuous disturbance, not slips.
             if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
                 found += tried
@@ -404,8 +394,8 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
     value = 0.5 * (size[indices] / deviation) ** 2 - likely - COLUMN_PENALTY
     # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
     # of an encoder is constant at rest, and differs by up to a step between two rests.
-    value[(wide[indices] / size[indices] < 0.3)
-          | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
+    value[(wide[indices]
+           / size[indices] < 0.3) | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
@@ -439,8 +429,8 @@ def _isolated_point(replay: Replay, index: int, width: float) -> int | None:
     begin = max(index - reach, 0)
     near = left[begin:index + reach + 1]
     off = (near - np.median(near)) ** 2
-    return (begin + int(off.argmax())
-            if off.max() > max(40.0 * np.median(off), 0.4 * off.sum()) else None)
+    return (begin + int(off.argmax()) if off.max() > max(40.0 * np.median(off), 0.4 * off.sum())
+            else None)
 
 
 def _is_jump_of_reference(replay: Replay, moment: float) -> bool:
@@ -464,8 +454,8 @@ def _columns_given_causes(search: Search, causes: Sequence[SelectedCause]) -> Ca
         return search.candidate_columns
     if key not in search.columns_cache:
         search.columns_cache.clear()  # one is hundreds of megabytes
-        search.columns_cache[key] = make_candidate_columns(search.problem, search.candidates,
-                                                           changes)
+        search.columns_cache[key] = make_candidate_columns(
+            search.problem, search.candidates, changes)
     return search.columns_cache[key]
 
 
@@ -499,8 +489,8 @@ def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> Se
     low, high = _shape_bounds(fit.original_replays, begin, place)
 
     def cost(at: float) -> float:
-        return (
-            -add_cause(fit, with_shape(begin, place, _to_shape(at, begin, place))).log_likelihood)
+        return -add_cause(fit,
+                          with_shape(begin, place, _to_shape(at, begin, place))).log_likelihood
 
     best = minimize_scalar(cost, bounds=(low, high), method='bounded',
                            options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
@@ -545,9 +535,8 @@ def _linearized_start(fit: RegressionFit, candidate: Candidate) -> Candidate:
     values, _ = free.estimates
     ratio = float(values[-1])
     place = fitted_shape_indices(candidate)[0]
-    return with_shape(
-        candidate, place, candidate.shapes[place]
-        * float(np.copysign(abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio)))
+    return with_shape(candidate, place, candidate.shapes[place] * float(
+        np.copysign(abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio)))
 
 
 def find_strongest(search: Search,
@@ -575,15 +564,12 @@ def _search_strongest(
         causes: Sequence[SelectedCause]) -> tuple[SearchStep | None, list[SearchStep]]:
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit, causes)
-    if not any(
-            search.excess_evidence(each.candidate.cause, each.mean_evidence) > 0.0
-            for each in first):
-        found = [
-            refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
-            for each in first if search.excess_evidence(
-                each.candidate.cause, each.mean_evidence,
-                SUSPECTED_RATE_FACTOR if is_lasting(each.candidate) else 1.0) > 0.0
-        ]
+    if not any(search.excess_evidence(each.candidate.cause, each.mean_evidence) > 0.0
+               for each in first):
+        found = [refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
+                 for each in first if search.excess_evidence(
+                     each.candidate.cause, each.mean_evidence,
+                     SUSPECTED_RATE_FACTOR if is_lasting(each.candidate) else 1.0) > 0.0]
         return None, sorted(found, key=lambda step: -step.score)
     top = max(first, key=lambda each: each.evidence)
     # Causes that distort the rate are equal to first order; large ones need refined shapes.
@@ -621,11 +607,9 @@ def find_suspected(search: Search, selected: Sequence[SelectedCause]) -> SearchS
     score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
     cause_names = {each.candidate.cause for each in selected}
     candidates = ((step, step.causes[-1].candidate) for step in steps)
-    return next(
-        (step for step, candidate in candidates
-         if is_lasting(candidate) and candidate.cause not in cause_names and
-         search.excess_evidence(candidate.cause, step.score - score, SUSPECTED_RATE_FACTOR) > 0.0),
-        None)
+    return next((step for step, candidate in candidates if is_lasting(candidate)
+                 and candidate.cause not in cause_names and search.excess_evidence(
+                     candidate.cause, step.score - score, SUSPECTED_RATE_FACTOR) > 0.0), None)
 
 
 def _screen_causes(search: Search, fit: RegressionFit,
@@ -656,16 +640,15 @@ def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> tuple[Sel
 def _gauss_newton_update(fit: RegressionFit, cause_index: int, values: Array) -> SelectedCause:
     known = fit.causes[cause_index]
     own = dict(zip(fit.column_owners, values))
-    free = tuple(
-        float(own.get((cause_index, number), 0.0))
-        for number in range(fit.column_counts[cause_index]))
+    free = tuple(float(own.get((cause_index, number), 0.0))
+                 for number in range(fit.column_counts[cause_index]))
     found = free or (known.candidate.amplitude or 0.0,)
     candidate = known.candidate
     for shape in fitted_shape_indices(candidate):
         change = own.get((cause_index, -1 - shape), 0.0)
         before = candidate.shapes[shape]
-        candidate = with_shape(candidate, shape, before + float(
-            np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
+        candidate = with_shape(candidate, shape, before
+                               + float(np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
     return replace(known, candidate=candidate, values=found or known.values)
 
 
@@ -686,9 +669,8 @@ def search_causes(search: Search) -> tuple[SelectedCause, ...]:
                 columns_cache={}, step_cache={}))
     return max((everything, named),
                key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
-                   complexity_penalty(each) + (0.0
-                                               if is_named(each.candidate) else UNNAMED_PENALTY)
-                   for each in named))
+                   complexity_penalty(each)
+                   + (0.0 if is_named(each.candidate) else UNNAMED_PENALTY) for each in named))
 
 
 def complexity_penalty(cause: SelectedCause) -> float:
@@ -770,8 +752,8 @@ def prediction_sigmas(log_likelihood_gains: Array) -> float:
     """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
     clipped_gains = np.clip(log_likelihood_gains, -MAX_STRETCH_GAIN, MAX_STRETCH_GAIN)
     scatter = float(np.std(clipped_gains, ddof=1)) * len(log_likelihood_gains) ** 0.5
-    return (float(np.sum(clipped_gains))
-            / max(scatter, 1e-9) if np.sum(log_likelihood_gains) > 0.0 else 0.0)
+    return (float(np.sum(clipped_gains)) / max(scatter, 1e-9) if np.sum(log_likelihood_gains) > 0.0
+            else 0.0)
 
 
 def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[float]:
@@ -797,6 +779,6 @@ def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[flo
         added = before - off
         score, information = (np.bincount(stretch, each) for each in (added * off, added ** 2))
         size = 1.0 - score / np.maximum(information.sum() - information, 1e-300)
-        found.append(prediction_sigmas(0.5 * np.bincount(
-            stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
+        found.append(prediction_sigmas(
+            0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
     return found

@@ -241,9 +241,9 @@ class Spans:
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
         rate = np.asarray(self.channels.rate)
-        return np.column_stack([
-            -self.span_integrals(rate), -self.span_integrals(np.ones_like(rate)),
-            np.concatenate([self._rate_changes(), np.zeros(len(self.rests))])])
+        return np.column_stack(
+            [-self.span_integrals(rate), -self.span_integrals(np.ones_like(rate)),
+             np.concatenate([self._rate_changes(), np.zeros(len(self.rests))])])
 
     def _rate_changes(self) -> Array:
         """
@@ -272,8 +272,7 @@ class Spans:
         if cause.cause == 'reference_once_per_rev':
             heading = np.asarray(channels.heading)
             return np.column_stack(
-                [self.span_changes(np.sin(heading)),
-                 self.span_changes(np.cos(heading))])
+                [self.span_changes(np.sin(heading)), self.span_changes(np.cos(heading))])
         if cause.cause == 'reference_slip':
             late = np.asarray(channels.time) >= cause.shapes[0]
             return self.span_changes(late.astype(float))[:, None]
@@ -282,9 +281,9 @@ class Spans:
             assert self.log.time is not None and self.log.output is not None
             change = np.gradient(self.log.output, self.log.time)
             return -self.span_changes(change)[:, None]
-        return np.column_stack([
-            -self.span_integrals(np.asarray(each))
-            for each in CATALOGUE[cause.cause].columns(channels, *cause.shapes)])
+        return np.column_stack(
+            [-self.span_integrals(np.asarray(each))
+             for each in CATALOGUE[cause.cause].columns(channels, *cause.shapes)])
 
     def point_rates(self) -> Array:
         """Return the rate at the points, rad/s, shape (n + 1,)."""
@@ -359,8 +358,8 @@ class SpanFit:
         deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
         half = float(student.ppf(0.975, freedom)) * deviation
         prior = self.spans.treatment.prior
-        return (min(half, NORMAL_QUANTILE_975
-                    * prior[value_index]) if value_index < len(prior) else half)
+        return (min(half, NORMAL_QUANTILE_975 * prior[value_index]) if value_index < len(prior)
+                else half)
 
     @property
     def scale_held(self) -> bool:
@@ -402,8 +401,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     }.get(kind, COURSE_TREATMENT)
     if prior is not None:
         scale, bias, delay = treatment.prior
-        treatment = replace(treatment, prior=(min(scale, float(prior[0])),
-                                              min(bias, float(prior[1])), delay))
+        treatment = replace(treatment,
+                            prior=(min(scale, float(prior[0])), min(bias, float(prior[1])), delay))
     time, output = log.time - log.time[0], bridge_gaps(log.output)
     white = white_noise_deviation(log.output)
     reference, noisier = log.reference_heading, 0.0
@@ -429,19 +428,18 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
                  2.0 * float(np.median(np.diff(time))))
     # a gap begins a new point
     number = np.floor((stamps - stamps[0]) / length + 1e-6)
-    place = np.cumsum((np.diff(number, prepend=number[0]) > 0.0)
-                      | (np.diff(stamps, prepend=stamps[0]) > length))
+    place = np.cumsum(
+        (np.diff(number, prepend=number[0]) > 0.0) | (np.diff(stamps, prepend=stamps[0]) > length))
     if not treatment.averages_span:
         known = known[np.diff(place, prepend=-1) > 0]
         place = np.arange(len(known))
     count = np.bincount(place)
     channels = replace(channels_from_log(log), rate=output, time=time,
                        heading=integrate_trapezoidal(time, output))
-    return Spans(log, channels, at[known], place,
-                 np.bincount(place, at[known]) / count,
-                 np.bincount(place, reference[known]) / count, _find_rests(time, output,
-                                                                           known), treatment,
-                 _walk_bounds(log, white, treatment), noisier, uses_code_changes=by_code)
+    return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
+                 np.bincount(place, reference[known]) / count, _find_rests(time, output, known),
+                 treatment, _walk_bounds(log, white, treatment), noisier,
+                 uses_code_changes=by_code)
 
 
 def _walk_bounds(log: Log, white: float, treatment: ReferenceTreatment) -> tuple[float, float]:
@@ -539,8 +537,8 @@ def _point_variances(left: Array) -> Array:
     point = np.concatenate([[0.0], np.cumsum(left)])
     off = np.abs(point - median_filter(point, 9, mode='nearest'))
     # a monotonic drift is equal to its median
-    size = 1.4826 * max(float(np.median(off)), float(np.median(np.abs(np.diff(point, 2))))
-                        / math.sqrt(6.0)) + 1e-9
+    size = 1.4826 * max(float(np.median(off)),
+                        float(np.median(np.abs(np.diff(point, 2)))) / math.sqrt(6.0)) + 1e-9
     return np.clip(off / (3.0 * size), 1.0, _MAX_POINT_DEVIATION) ** 2
 
 
@@ -552,13 +550,13 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: 
     rest_durations = np.array(
         [spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
     low, high = spans.treatment.walk_range
-    parts = [replace(part, diagonal=np.concatenate([
-        part.diagonal, rest_durations if part.off_diagonal is None else 0.0 * rest_durations]),
-        off_diagonal=None if part.off_diagonal is None
-        else np.concatenate([part.off_diagonal, 0.0 * rest_durations]))
-        for part in heading_noise(spans.time, spans.point_rates(), point_variances,
-                                  angle_random_walk=(low * least, high * most))
-        if spans.treatment.errs_as_heading or part.name == 'angle_random_walk']
+    parts = [replace(part, diagonal=np.concatenate(
+        [part.diagonal, rest_durations if part.off_diagonal is None else 0.0 * rest_durations]),
+                     off_diagonal=None if part.off_diagonal is None
+                     else np.concatenate([part.off_diagonal, 0.0 * rest_durations]))
+             for part in heading_noise(spans.time, spans.point_rates(), point_variances,
+                                       angle_random_walk=(low * least, high * most))
+             if spans.treatment.errs_as_heading or part.name == 'angle_random_walk']
     waves, shared = _wander_columns(spans)
     deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
     fit = fit_noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
@@ -566,8 +564,8 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: 
     values[2] += spans.delay
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
                    np.ones(len(values)), prior)
-    covariance, effective, freedom = _cluster_robust_covariance(whiten_regression(done, causes),
-                                                                fit)
+    covariance, effective, freedom = _cluster_robust_covariance(
+        whiten_regression(done, causes), fit)
     return replace(done, covariance=covariance, effective_stretches=effective, freedom=freedom)
 
 
@@ -592,8 +590,8 @@ def _cluster_robust_covariance(data: WhitenedRegression,
     inside = stretch < data.stretch_count
     scores = np.array([np.bincount(stretch, part * left) for part in influence.T])
     number = float(stretch.max()) + 1.0
-    variances = np.maximum(np.diag(fit.covariance), np.sum(scores ** 2, axis=1) * number / max(
-        number - 1.0, 0.5))
+    variances = np.maximum(np.diag(fit.covariance),
+                           np.sum(scores ** 2, axis=1) * number / max(number - 1.0, 0.5))
     effective = _effective_clusters(stretch[inside], data.design[inside, :count])
     freedom = np.maximum(effective - 1.0, 1.0)
     for cluster in data.row_sectors:
@@ -692,22 +690,18 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     """
     spans, noise_fit = fit.spans, noise_fit or fit
     waves, shared = _wander_columns(noise_fit.spans)
-    sizes = {
-        part.name: noise_fit.fit.sizes[part.name][2] if use_max_random_walk
-        and part.name == 'rate_random_walk' else noise_fit.fit.likeliest_sizes[part.name]
-        for part in shared
-    }
+    sizes = {part.name: noise_fit.fit.sizes[part.name][2] if use_max_random_walk
+             and part.name == 'rate_random_walk' else noise_fit.fit.likeliest_sizes[part.name]
+             for part in shared}
     variance = np.sum([sizes[part.name] ** 2 * part.variance for part in shared], axis=0)
     columns = np.column_stack([design_matrix(spans, causes), waves])
     width = columns.shape[1] - waves.shape[1]
     prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
     prior[:3, :3] = np.diag(1.0 / fit.prior)
     prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
-    clusters = [
-        np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
-        for each in (spans.stretch_numbers,
-                     *([spans.shaft_sectors] if spans.uses_code_changes else []))
-    ]
+    clusters = [np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
+                for each in (spans.stretch_numbers,
+                             *([spans.shaft_sectors] if spans.uses_code_changes else []))]
     return WhitenedRegression(
         np.append(noise_fit.fit.whiten(spans.observed), np.zeros(len(prior))),
         np.concatenate([noise_fit.fit.whiten(columns), prior]), clusters[0], tuple(clusters[1:]),

@@ -44,8 +44,7 @@ _PARAMETER_UNITS = {
     'unit_error': ('', 1.0),
     'outliers': ('', 1.0),
     'stuck_samples': ('', 1.0),
-    'dropped_samples': ('', 1.0)
-}
+    'dropped_samples': ('', 1.0)}
 #: (unit, value below which a finer unit is used, finer unit, factor to it).
 _FINER_UNITS = (('s', 0.5, 'ms', 1e3), ('%', 0.01, 'ppm', 1e4))
 _RADIANS = re.compile(r'(/?)rad([²³]?)')
@@ -113,10 +112,10 @@ def format_quantity(estimate: Estimate, parameter: str = '') -> Quantity:
     value, low, high = (number / 10.0 ** power for number in numbers)
     width = high - low
     # two digits of the half-width of the interval
-    decimals = (min(max(0, 1 - math.floor(math.log10(0.5 * width))), 8)
-                if 0.0 < width < math.inf else None)
-    interval = (f'{_format_fixed(low, decimals)} to {_format_fixed(high, decimals)}'
-                if width > 0.0 else '')
+    decimals = (min(max(0, 1 - math.floor(math.log10(0.5 * width))), 8) if 0.0 < width < math.inf
+                else None)
+    interval = (f'{_format_fixed(low, decimals)} to {_format_fixed(high, decimals)}' if width > 0.0
+                else '')
     return Quantity(_format_fixed(value, decimals), interval, _power_suffix(power), unit)
 
 
@@ -234,10 +233,9 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         up_to = 'up to ' if len(unexplained) > 1 and most >= 1e-3 else ''
         variables = join_list([readable_name(each.along)
                                for each in unexplained[:_MAX_NAMED_CAUSES]])
-        parts.append(
-            f'along {variables} by '
-            f'{"something" if parts else "structure"} that no cause in the catalogue '
-            f'explains ({up_to}{_format_share(most)} of the variance of the residual)')
+        parts.append(f'along {variables} by '
+                     f'{"something" if parts else "structure"} that no cause in the catalogue '
+                     f'explains ({up_to}{_format_share(most)} of the variance of the residual)')
     return f'Simulation and measurement differ {", and ".join(parts)}.', _gain_sentence(diagnosis)
 
 
@@ -246,8 +244,8 @@ def _cause_list_phrase(findings: Sequence[Finding]) -> str:
         shown = [readable_name(each.effect) + (' (or {})'.format(
             join_list([readable_name(name) for name in each.ambiguous_with], 'or'))
             if each.ambiguous_with else '') for each in findings[:_MAX_NAMED_CAUSES]]
-        more = ([f'{len(findings) - _MAX_NAMED_CAUSES} more']
-                if len(findings) > _MAX_NAMED_CAUSES else [])
+        more = ([f'{len(findings) - _MAX_NAMED_CAUSES} more'] if len(findings) > _MAX_NAMED_CAUSES
+                else [])
         return f'{len(findings)} causes: {join_list(shown + more)}'
     (found,) = findings
     size = next(iter(parameter_quantities(found).values()), None)
@@ -312,8 +310,7 @@ def is_in_extended_model(found: Finding, diagnosis: Diagnosis) -> bool:
     return is_model_extended(diagnosis) and any(
         alone or all(found.parameters[shape.name].estimate == value
                      for shape, value in zip(term.effect.nonlinear_parameters, term.values)
-                     if shape.name in found.parameters)
-        for term in diagnosis.model.terms
+                     if shape.name in found.parameters) for term in diagnosis.model.terms
         if term.effect.name == found.effect and term not in diagnosis.before.terms)
 
 
@@ -322,8 +319,8 @@ def _gain_sentence(diagnosis: Diagnosis) -> str:
     if not is_model_extended(diagnosis) and (gain is None or gain.models.get('given')
                                              == gain.models.get('extended')):
         return 'No extended model is offered: the model is unchanged.'
-    model = ('The extended model' if is_model_extended(diagnosis) else
-             f'The model, {_model_values_phrase(diagnosis.model)} alone,')
+    model = ('The extended model' if is_model_extended(diagnosis)
+             else f'The model, {_model_values_phrase(diagnosis.model)} alone,')
     if gain is None:
         return 'An extended model is offered; its gain was not measured.'
     if gain.heading is None:
@@ -420,8 +417,7 @@ def noise_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     def format_value(value: float, name: str) -> str:
         return format_amount(value, _NOISE_UNITS[name], name) if value else 'none'
     return [(readable_name(name), format_value(getattr(diagnosis.noise, name), name),
-             format_value(getattr(diagnosis.simulated, name), name))
-            for name in _NOISE_UNITS]
+             format_value(getattr(diagnosis.simulated, name), name)) for name in _NOISE_UNITS]
 
 
 def causes_by_reason(cannot_show: Mapping[str, str]) -> dict[str, list[str]]:
@@ -444,21 +440,22 @@ def terminal_lines(diagnosis: Diagnosis) -> Iterator[str]:
         yield ''
         yield _wrap_line(f'{mark}{readable_name(found.effect)}{": " if parameters else ""}'
                          f'{", ".join(parameters)}', len(mark))
-        for text in (' '.join([
-                *cause_sentences(found), *certainty_sentences(found),
-                detectability_sentence(found)
-        ]), alternatives_sentence(found), remedy_sentence(found, diagnosis)):
+        for text in (' '.join([*cause_sentences(found), *certainty_sentences(found),
+                               detectability_sentence(found)]), alternatives_sentence(found),
+                     remedy_sentence(found, diagnosis)):
             if text:
                 yield _wrap_line(' ' * len(mark) + text, len(mark))
-    for title, items in (
-            ('Structure that no cause explains:', map(structure_sentence, diagnosis.unexplained)),
-            ('Shares of the mean square heading error over 60 s'
-             + (', above 100 % where causes cancel each other:'
-                if max(diagnosis.heading_shares.values(), default=0.0) > 1.0 else ':'),
-             [f'{name}: {share}' for name, share in heading_share_rows(diagnosis)]),
-            ('These data cannot show:', [f'{join_list(names)}: {reason}' for reason, names
-                                         in causes_by_reason(diagnosis.cannot_show).items()]),
-            ('Remarks:', map(as_sentence, diagnosis.remarks))):
+    for title, items in (('Structure that no cause explains:',
+                          map(structure_sentence, diagnosis.unexplained)),
+                         ('Shares of the mean square heading error over 60 s'
+                          + (', above 100 % where causes cancel each other:'
+                             if max(diagnosis.heading_shares.values(), default=0.0) > 1.0
+                             else ':'),
+                          [f'{name}: {share}' for name, share in heading_share_rows(diagnosis)]),
+                         ('These data cannot show:',
+                          [f'{join_list(names)}: {reason}'
+                           for reason, names in causes_by_reason(diagnosis.cannot_show).items()]),
+                         ('Remarks:', map(as_sentence, diagnosis.remarks))):
         if texts := list(items):
             yield from ('', title, *(_wrap_line(f'- {text}', 2) for text in texts))
 

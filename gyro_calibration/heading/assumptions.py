@@ -132,8 +132,8 @@ class TemperatureCorrection:
         """Return the change of the bias, rad/s, and the signed distance, K of the coefficient."""
         steps = (temperature - self.start_temperature) / _TEMPERATURE_STEP
         below = math.floor(steps)
-        (first, near), (last, far), part = (
-            self._change_at_step(below), self._change_at_step(below + 1), steps - below)
+        (first, near), (last, far), part = (self._change_at_step(below),
+                                            self._change_at_step(below + 1), steps - below)
         return first + part * (last - first), near + part * (far - near)
 
     def changes_at(self, temperature: Array) -> tuple[Array, Array]:

@@ -222,9 +222,8 @@ class BiasTable:
             self._held_entries.clear()
             self._add_entry(given)
             return ''
-        self._held_entries = [
-            *(each for each in self._held_entries if self._is_consistent(each, given)), given
-        ]
+        self._held_entries = [*(each for each in self._held_entries
+                                if self._is_consistent(each, given)), given]
         off = (f'{(bias - before) / DEGREE:.4f} deg/s off what is known at '
                f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
         if len(self._held_entries) < _JUMP_ESTIMATES:
@@ -266,10 +265,10 @@ class BiasTable:
         """Return both as one entry at the time of the newer, with the older aged until then."""
         older = entry.variance + self._wander_variance(given.time - entry.time)
         weight = float(older / (older + given.variance))
-        return replace(given, bias=entry.bias + weight * (given.bias - entry.bias),
-                       variance=max(weight * given.variance, 2.0 * _MIN_VARIANCE),
-                       temperature=entry.temperature
-                       + weight * (given.temperature - entry.temperature))
+        return replace(
+            given, bias=entry.bias + weight * (given.bias - entry.bias),
+            variance=max(weight * given.variance, 2.0 * _MIN_VARIANCE),
+            temperature=entry.temperature + weight * (given.temperature - entry.temperature))
 
     def _drop_oldest_entry(self) -> None:
         """Drop the oldest entry of the fullest bin, and the jumps that no entry precedes."""
@@ -397,9 +396,8 @@ class BiasTable:
         alike = np.exp(
             -np.abs(_pairwise_differences(temperatures)) / self._prior.correlation_length)
         fixed = (_covariance_of_differences(self._wander_variance(age), wander)
-                 + np.diag(variances)
-                 + self._prior.ageing ** 2 / _YEAR * alike * np.minimum(age[:, None], age)
-                 + self._jump_covariance(runs))
+                 + np.diag(variances) + self._prior.ageing ** 2 / _YEAR * alike * np.minimum(
+                     age[:, None], age) + self._jump_covariance(runs))
         by_run = (self._prior.turn_on ** 2
                   * _covariance_of_differences(2.0 * (runs != self.run), 2.0 * runs_apart))
         return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
@@ -494,9 +492,8 @@ def _bin_number(entry: Entry) -> int:
 def _is_possible(entry: Entry) -> bool:
     """Tell whether this may be a bias of a gyro; nan never is."""
     temperature, time = _clip_to_range(entry.temperature, entry.time)
-    return (entry.temperature == temperature and entry.time == time
-            and abs(entry.bias) <= 1e4 and _MIN_VARIANCE <= entry.variance <= 1e8
-            and 0 <= entry.run <= 1e9)
+    return (entry.temperature == temperature and entry.time == time and abs(entry.bias) <= 1e4
+            and _MIN_VARIANCE <= entry.variance <= 1e8 and 0 <= entry.run <= 1e9)
 
 
 def _clip_to_range(temperature: float, time: float) -> tuple[float, float]:
@@ -528,8 +525,8 @@ def propagate_calibration(calibration: SelfCalibration, table: BiasTable, age: f
     if calibration.covariance is None:
         return _move_calibration(calibration, table, time, temperature)
     (a, c), (_, own) = calibration.covariance
-    bias, variance, weight = table.combine_with_calibration(calibration, age, time, temperature,
-                                                            this_run)
+    bias, variance, weight = table.combine_with_calibration(
+        calibration, age, time, temperature, this_run)
     moved = replace(calibration, bias=bias, covariance=((a, weight * c), (weight * c, variance)))
     return PropagatedCalibration(
         moved, bias - calibration.bias, variance - own,

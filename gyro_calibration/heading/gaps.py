@@ -163,15 +163,14 @@ class Intervals:
         """Find the usual interval: the median, unless the stamps come in bursts."""
         self._until_update = max(len(self._history) // 4, _MIN_INTERVALS)
         steps = sorted(self._history)
-        middle = self._even_interval = self.usual_interval = max(steps[len(steps) // 2],
-                                                                 MIN_SAMPLE_INTERVAL)
+        middle = self._even_interval = self.usual_interval = max(
+            steps[len(steps) // 2], MIN_SAMPLE_INTERVAL)
         if (sum(steps) > _BURST_MEAN_RATIO * middle * len(steps)
                 or bisect_left(steps, _BURST_RATIO * middle) > _MIN_BURST_SHARE * len(steps)):
             # the longest may be gaps
             self._even_interval = steps[-1 - len(steps) // 100]
-            self.usual_interval = max(
-                sum(min(step, self._even_interval) for step in steps) / len(steps),
-                MIN_SAMPLE_INTERVAL)
+            self.usual_interval = max(sum(min(step, self._even_interval)
+                                          for step in steps) / len(steps), MIN_SAMPLE_INTERVAL)
         self._gap_limit = self._even_interval + (_GAP_RATIO - 1.0) * self.usual_interval
 
 
@@ -207,9 +206,8 @@ class _Level:
         if self._block_count > 0:
             self.step_square += self._weight * (step * step - self.step_square)
         if self._block_count > 1:
-            self.curvature_square += (self._weight *
-                                      (0.25 *
-                                       (step - self._last_step) ** 2 - self.curvature_square))
+            self.curvature_square += (
+                self._weight * (0.25 * (step - self._last_step) ** 2 - self.curvature_square))
         self._last_mean, self._last_step, self._block_count = mean, step, self._block_count + 1
         if self._block_count % 2:
             self._odd_mean = mean
@@ -312,9 +310,8 @@ class GapModel:
         if self._steps and self._squares < MAX_RATE ** 2:
             weight = self._duration / (_MEMORY_DURATION + self._duration)
             self._step_square += weight * (self._squares / self._steps - self._step_square)
-            self._curvature_square += weight * (
-                max(0.5 *
-                    (self._squares - self._products) / self._steps, 0.0) - self._curvature_square)
+            self._curvature_square += weight * (max(0.5 * (self._squares - self._products)
+                                                    / self._steps, 0.0) - self._curvature_square)
         for level in self._levels:
             if mean is None:
                 break
@@ -322,27 +319,22 @@ class GapModel:
         self._begin_block()
 
     def _make_gap(self, lost: int, interval: float, step: float) -> Gap:
-        usual, step, interval = (
-            self.intervals.usual_interval, min(abs(step), MAX_RATE), min(interval, MAX_GAP))
+        usual, step, interval = (self.intervals.usual_interval, min(abs(step), MAX_RATE),
+                                 min(interval, MAX_GAP))
         surplus = min(lost * usual, interval)
         ends = self.noise.angle_random_walk ** 2 / usual
         noise = ends * (surplus * (0.5 * surplus + usual) + 0.5 * self._lost_duration * surplus)
         # a step larger than those before may have occurred at any time within the gap
-        new_step_square = max(
-            step * step - _NEW_STEP_RATIO ** 2 *
-            (_interpolate_power_law(self._steps_by_length(), interval, 2.0) + 2.0 * ends), 0.0)
-        return Gap(
-            lost, surplus, interval ** 2 *
-            (_interpolate_power_law(self._curvatures_by_length(), 0.5 * interval, 4.0)
-             + new_step_square / 12.0), noise)
+        new_step_square = max(step * step - _NEW_STEP_RATIO ** 2 * (
+            _interpolate_power_law(self._steps_by_length(), interval, 2.0) + 2.0 * ends), 0.0)
+        return Gap(lost, surplus, interval ** 2 * (_interpolate_power_law(
+            self._curvatures_by_length(), 0.5 * interval, 4.0) + new_step_square / 12.0), noise)
 
     def _curvatures_by_length(self) -> list[tuple[float, float]]:
         """Return lengths, s, and the variance by curvature without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual_interval
-        points = [
-            (usual,
-             _POINT_VARIANCE_SHARE * max(self._curvature_square - 1.5 * density / usual, 0.0))
-        ]
+        points = [(usual, _POINT_VARIANCE_SHARE * max(
+            self._curvature_square - 1.5 * density / usual, 0.0))]
         return points + [(each.length, _MEAN_VARIANCE_SHARE * each.without_noise(density)[0])
                          for each in self._levels[usual > 0.5 * _BLOCK_DURATION:]]
 

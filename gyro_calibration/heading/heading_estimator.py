@@ -142,8 +142,8 @@ class HeadingEstimator:
         self._temperature_time, self._follows_temperature = -math.inf, False
         self._calibrated_this_run = self._age_changed = False
         self.rate = self.corrected_rate = 0.0
-        self.last_compensated, self.restart_count = (CompensatedSamples(
-            0.0, 0.0, 0.0, False, False), 0)
+        self.last_compensated, self.restart_count = (
+            CompensatedSamples(0.0, 0.0, 0.0, False, False), 0)
         self._time, self._elapsed, self._heading_before_resets = -math.inf, 0.0, 0.0
         self._refused_count, self.refused_temperature_count = 0, 0
         self._stretch: _RestStretch | None = None
@@ -201,8 +201,8 @@ class HeadingEstimator:
         self._age_changed = self._age_changed or (old and abs(step) > _AGE_TOLERANCE)
         if self._calibrated_this_run and calibration is not None and calibration.time:
             then = datetime.fromisoformat(calibration.time) + timedelta(seconds=step)
-            self.model = with_self_calibration(self.model, replace(
-                calibration, time=then.isoformat(timespec='seconds')))
+            self.model = with_self_calibration(
+                self.model, replace(calibration, time=then.isoformat(timespec='seconds')))
 
     # The calibration at the start
 
@@ -213,9 +213,9 @@ class HeadingEstimator:
                                     0.0) if is_fresh else self._propagated_model(now))
         self.covariance = uncertain_covariance(self.current_model, self._assumptions)
         temperature = self.model.reference_temperature
-        sensitivity_slope = None if self.current_model.needs_history else np.subtract(*(
-            self._uncertain_sensitivity(rate, rate, temperature, None, 0.0)
-            for rate in (DEGREE, 0.0))) / DEGREE
+        sensitivity_slope = None if self.current_model.needs_history else np.subtract(
+            *(self._uncertain_sensitivity(rate, rate, temperature, None, 0.0)
+              for rate in (DEGREE, 0.0))) / DEGREE
         if self._tracker is None:
             self._tracker = HeadingTracker(self.current_model.noise, self.covariance,
                                            self._settings, age, self._keeps_steps,
@@ -225,8 +225,8 @@ class HeadingEstimator:
                                           sensitivity_slope)
         self._start_time = now
         self._start_correction(now)
-        self._unknown_since = (self._time
-                               if is_fresh and not self._follows_temperature else math.inf)
+        self._unknown_since = (self._time if is_fresh and not self._follows_temperature
+                               else math.inf)
         self._bias_shift, self._unobserved_distance, self._age_changed = 0.0, 0.0, False
         self._sensitivity: Array = np.zeros(len(self.covariance))
         self._rest_sensitivity: Array = self._sensitivity
@@ -252,8 +252,8 @@ class HeadingEstimator:
 
         """
         here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
-        before = (None if around is None else replace(
-            around, temperature=self.last_compensated.temperature))
+        before = (None if around is None
+                  else replace(around, temperature=self.last_compensated.temperature))
         held = (compensate(self.current_model, 0.0, self.last_compensated.temperature,
                            before).model_rate)
         self._bias_shift = float(here) - float(held)
@@ -308,8 +308,8 @@ class HeadingEstimator:
 
     def bias_age(self, now: float) -> float:
         """Return the age of the variance of the bias, s, which a propagated one includes."""
-        return (self.age(now) if self.current_model.self_calibration is None else max(
-            now - self._start_time, 0.0))
+        return (self.age(now) if self.current_model.self_calibration is None
+                else max(now - self._start_time, 0.0))
 
     @property
     def current_calibration(self) -> SelfCalibration:
@@ -375,9 +375,9 @@ class HeadingEstimator:
             self._refused_count += 1
             return ''
         last, self._time = self._time, time
-        known_again, goes_on = (not self._follows_temperature
-                                and self._known_temperature is not None, self._calibrated_this_run
-                                and last > -math.inf)
+        known_again, goes_on = (
+            not self._follows_temperature and self._known_temperature is not None,
+            self._calibrated_this_run and last > -math.inf)
         if self._age_changed or known_again and not goes_on:
             self._restart(now)
         around = (self._follow_channels(time - last, force, supply)
@@ -432,8 +432,9 @@ class HeadingEstimator:
     def _uncertain_sensitivity(self, output: float, rate: float, temperature: Number,
                                around: Channels | None, distance: float) -> Array:
         """Return the sensitivity of the rate to each uncertain value, shape (m,)."""
-        return uncertain_sensitivity(self.current_model, rate_sensitivity(
-            self.current_model, output, rate, temperature, around), distance)
+        return uncertain_sensitivity(
+            self.current_model,
+            rate_sensitivity(self.current_model, output, rate, temperature, around), distance)
 
     def _bias_change(self, time: float) -> tuple[float, float]:
         """Return the change of the bias with temperature, rad/s, and the distance, K."""
@@ -546,22 +547,22 @@ class HeadingEstimator:
             else:
                 change[:], distance[:] = self._bias_change(self._time)
         calibration = used.self_calibration
-        rate = np.asarray(result.rate) - change * (
-            1.0 if calibration is None else calibration.scale)
+        rate = np.asarray(result.rate) - change * (1.0 if calibration is None
+                                                   else calibration.scale)
         still = self._rest_sensitivities(time, output, result, distance)
         found[:, :5] = tracker.follow(time, rate,
                                       self._motion_sensitivities(time, output, result, distance),
                                       wheels, still, still)
-        found[:, 5], found[:, 6], found[:, 7] = (
-            rate, result.temperature_clipped, result.beyond_range)
+        found[:, 5], found[:, 6], found[:, 7] = (rate, result.temperature_clipped,
+                                                 result.beyond_range)
         self.last_compensated = CompensatedSamples(
             *(float(np.asarray(values)[-1]) if np.ndim(values) else values
               for values in vars(result).values()))
         self.corrected_rate, self.rate = float(rate[-1]), float(found[-1, 2])
         self._sensitivity = tracker.sensitivity
         interval = np.diff(time, prepend=last)
-        moving = np.flatnonzero((found[:, 4] < 0.5) | (interval < 0.0)
-                                | (interval > self._settings.maximum_gap))
+        moving = np.flatnonzero(
+            (found[:, 4] < 0.5) | (interval < 0.0) | (interval > self._settings.maximum_gap))
         first = int(moving[-1]) + 1 if len(moving) else 0
         if first:
             self._end_rest()

@@ -134,8 +134,8 @@ class HeadingState:
         seen, _, grown = self._padded_transition(rate_integral)
         seen = seen.copy()
         seen[len(seen) - len(rate_integral.sensitivity):] = -rate_integral.sensitivity
-        white = (0.0 if rate_integral.is_unobserved else self.noise.angle_random_walk ** 2
-                 * rate_integral.duration)
+        white = (0.0 if rate_integral.is_unobserved
+                 else self.noise.angle_random_walk ** 2 * rate_integral.duration)
         return (seen, float(grown[HEADING_INDEX, HEADING_INDEX]) + white
                 + rate_integral.lost_variance + rate_integral.extra_noise_variance)
 
@@ -171,9 +171,9 @@ class HeadingState:
         """
         step = step or self.transition(rate_integral)
         gain_direction = self.covariance @ step.observation
-        variance = (float(step.observation @ gain_direction
-                          + step.process_noise[HEADING_INDEX, HEADING_INDEX])
-                    + rate_integral.wander_variance)
+        variance = float(
+            step.observation @ gain_direction
+            + step.process_noise[HEADING_INDEX, HEADING_INDEX]) + rate_integral.wander_variance
         innovation = rate_integral.angle - float(step.observation @ self.mean)
         covariance = self.covariance
         if rate_integral.wander_variance:
@@ -227,11 +227,10 @@ class HeadingState:
     def condition_on_heading(self, heading: float, variance: float) -> HeadingState:
         """Return the state given a later estimate of its heading, rad, and variance, rad²."""
         own = self.covariance[HEADING_INDEX, HEADING_INDEX]
-        gain = (self.covariance[HEADING_INDEX] / own if own > 0.0 else 0.0
-                * self.covariance[HEADING_INDEX])
-        return replace(
-            self, mean=self.mean + gain * (heading - self.mean[HEADING_INDEX]),
-            covariance=self.covariance + (variance - own) * np.outer(gain, gain))
+        gain = (self.covariance[HEADING_INDEX] / own if own > 0.0
+                else 0.0 * self.covariance[HEADING_INDEX])
+        return replace(self, mean=self.mean + gain * (heading - self.mean[HEADING_INDEX]),
+                       covariance=self.covariance + (variance - own) * np.outer(gain, gain))
 
     def with_heading(self, heading: float, variance: float = 0.0) -> HeadingState:
         """Return the state with another heading, rad, and its variance, rad²."""
@@ -266,12 +265,12 @@ def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, varianc
     whole[flicker, flicker] = flicker_variances
     if age is not None:
         within, shared = averaged_process_moments(constants)
-        whole[WALK_INDEX, WALK_INDEX] = (noise.rate_random_walk ** 2 *
-                                         (age + BIAS_AVERAGING_TIME / 3.0))
+        whole[WALK_INDEX, WALK_INDEX] = (
+            noise.rate_random_walk ** 2 * (age + BIAS_AVERAGING_TIME / 3.0))
         whole[-1, -1] = (max(whole[-1, -1] - noise.allan_floor ** 2, 0.0)
                          + flicker_variances * np.sum(within))
-        whole[-1, flicker] = whole[flicker,
-                                   -1] = (-flicker_variances * shared * np.exp(-age / constants))
+        whole[-1, flicker] = whole[flicker, -1] = (
+            -flicker_variances * shared * np.exp(-age / constants))
     return HeadingState(noise, mean, whole)
 
 
@@ -303,13 +302,12 @@ def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:
 def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
                        value_count: int) -> tuple[Array, Array, Array]:
     """Return `_wander` or `_unseen` with room for the values of a calibration."""
-    seen, kept, grown = (_unobserved_transition if is_unobserved else _wander_transition)(noise,
-                                                                                          duration)
+    seen, kept, grown = (_unobserved_transition if is_unobserved else _wander_transition)(
+        noise, duration)
     whole = np.zeros((len(kept) + value_count, len(kept) + value_count))
     whole[:len(kept), :len(kept)] = grown
-    return (np.concatenate([seen,
-                            np.zeros(value_count)]), np.concatenate([kept,
-                                                                     np.ones(value_count)]), whole)
+    return (np.concatenate([seen, np.zeros(value_count)]),
+            np.concatenate([kept, np.ones(value_count)]), whole)
 
 
 def _wander_transition(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
@@ -374,10 +372,9 @@ def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: 
         transition[HEADING_INDEX] -= step.observation
         shared = state.covariance @ transition.T
     smoother_gain = shared @ _pseudo_inverse(after.covariance)
-    return replace(
-        start, mean=start.mean + smoother_gain @ (later.mean - after.mean),
-        covariance=start.covariance
-        + smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T)
+    return replace(start, mean=start.mean + smoother_gain @ (later.mean - after.mean),
+                   covariance=start.covariance
+                   + smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T)
 
 
 def _pseudo_inverse(covariance: Array) -> Array:

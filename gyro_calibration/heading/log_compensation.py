@@ -74,9 +74,9 @@ class LogCompensation:
             return self._compensate(log, None)
         compensated, sensitivities = zip(*(self._compensate_part(part)
                                            for part in self._split_by_reference(log)))
-        joined = {each.name: np.concatenate([
-            np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
-            for each in fields(CompensatedSamples)}
+        joined = {each.name: np.concatenate(
+            [np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
+                  for each in fields(CompensatedSamples)}
         return CompensatedSamples(**joined), np.concatenate(sensitivities, axis=1)
 
     def true_time(self, time: Array) -> Array:
@@ -242,8 +242,8 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
 def _remove_spikes(time: Array, rate: Array) -> Array:
     """Return rates with the outliers of the tracker interpolated, shape (n,)."""
     jumps = np.abs(np.diff(rate)) > MAX_RATE_STEP + MAX_ACCELERATION * np.diff(time)
-    back = (np.abs(rate[2:] - rate[:-2]) <= MAX_RATE_STEP + MAX_ACCELERATION *
-            (time[2:] - time[:-2]))
+    back = (np.abs(rate[2:] - rate[:-2]) <= MAX_RATE_STEP
+            + MAX_ACCELERATION * (time[2:] - time[:-2]))
     spikes = np.flatnonzero(jumps[:-1] & back) + 1
     if not len(spikes):
         return rate
@@ -277,9 +277,9 @@ def smooth_track(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
                 float(here.mean[HEADING_INDEX]),
                 float(here.covariance[HEADING_INDEX, HEADING_INDEX]))
     ends = np.array([time[0], *(step.end_time for step in steps)])
-    heading, variance = np.array([(state.mean[HEADING_INDEX], state.covariance[HEADING_INDEX,
-                                                                               HEADING_INDEX])
-                                  for state in states]).T
+    heading, variance = np.array(
+        [(state.mean[HEADING_INDEX], state.covariance[HEADING_INDEX, HEADING_INDEX])
+         for state in states]).T
     turned = integrate(time, _remove_spikes(time, rate))
     rested = np.array([step.is_resting for step in steps] or [False])
     resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]

@@ -150,8 +150,8 @@ class EnergyDetector:
         """Begin with an empty window."""
         self.noise_factor = 1.0
         self._noise = noise
-        self._false_alarm_chance = (false_alarms /
-                                    (_TEST_COUNT * 3600.0 / WINDOW_DURATION * _OVERLAP_FACTOR))
+        self._false_alarm_chance = (
+            false_alarms / (_TEST_COUNT * 3600.0 / WINDOW_DURATION * _OVERLAP_FACTOR))
         self._sample_false_alarms = false_alarms / _OVERLAP_FACTOR
         self._blocks: deque[Block] = deque()
         self._energy_decile, self._difference_decile = _LowestDecile(), _LowestDecile()
@@ -265,9 +265,8 @@ class RestScatter:
 
     """
 
-    counts: Array = field(default_factory=lambda: np.append(
-        _PRIOR_RESTS,
-        np.full(len(SCATTER_RATIOS) - 1, _PRIOR_STRAIGHT_DRIVES / (len(SCATTER_RATIOS) - 1))))
+    counts: Array = field(default_factory=lambda: np.append(_PRIOR_RESTS, np.full(
+        len(SCATTER_RATIOS) - 1, _PRIOR_STRAIGHT_DRIVES / (len(SCATTER_RATIOS) - 1))))
 
     def probabilities(self, likelihood: Array) -> Array:
         """Return the probability of each scatter, shape (k,)."""
@@ -393,11 +392,12 @@ class EvenSamples:
         self.block_starts = [0, *self.block_stops[:-1]]
         self.whole_blocks = range(bool(begun), whole)
         moving = self._integrate_sensitivity(self.motion_sensitivity)
-        self.sensitivity_integrals = moving, (moving if given.rest_sensitivity
-                                              is given.motion_sensitivity else
-                                              self._integrate_sensitivity(self.rest_sensitivity))
-        sums = [self._sum_by_blocks(values).tolist() for values in (
-            self.intervals, self.angles, self.rate, self.rate * self.rate, steps * steps)]
+        self.sensitivity_integrals = (moving,
+                                      (moving if given.rest_sensitivity is given.motion_sensitivity
+                                       else self._integrate_sensitivity(self.rest_sensitivity)))
+        sums = [self._sum_by_blocks(values).tolist()
+                for values in (self.intervals, self.angles, self.rate, self.rate * self.rate,
+                               steps * steps)]
         self._pending_retention = 1.0 - self.intervals / SETTLING_TIME
         sums.insert(2, np.multiply.reduceat(self._pending_retention, self.block_starts).tolist())
         self.block_sums = list(zip(*sums))
@@ -441,16 +441,14 @@ class EvenSamples:
             epoch = self.epochs[-1]
             epoch.end_index = end
             if end > max(epoch.start_index, 0):
-                self.used_sensitivity[epoch.start_index + 2:end
-                                      + 2] = (self.rest_sensitivity if epoch.is_resting else
-                                              self.motion_sensitivity)[epoch.start_index + 1:end
-                                                                       + 1]
+                self.used_sensitivity[epoch.start_index + 2:end + 2] = (
+                    self.rest_sensitivity if epoch.is_resting
+                    else self.motion_sensitivity)[epoch.start_index + 1:end + 1]
 
     def fill_results(self, usual_intervals: Array) -> None:
         """Compute the results of the epochs; `usual_intervals` has a row for each sample."""
-        found, interval = (self.results,
-                           np.clip(np.minimum(self.intervals, usual_intervals),
-                                   MIN_SAMPLE_INTERVAL, None))
+        found, interval = self.results, np.clip(np.minimum(self.intervals, usual_intervals),
+                                                MIN_SAMPLE_INTERVAL, None)
         moving = list[Epoch]()
         for epoch in self.epochs:
             here = slice(max(epoch.start_index, 0), epoch.end_index)
@@ -464,9 +462,9 @@ class EvenSamples:
                               / (WINDOW_DURATION if epoch.is_resting else interval[here]))
             found[here, 4] = epoch.is_resting
             if epoch.is_resting:
-                found[here, :3] = epoch.heading, (
-                    float(drift.covariance[HEADING_INDEX, HEADING_INDEX])
-                    + epoch.pending ** 2), 0.0
+                found[here, :3] = (epoch.heading,
+                                   (float(drift.covariance[HEADING_INDEX, HEADING_INDEX])
+                                    + epoch.pending ** 2), 0.0)
                 continue
             moving.append(epoch)
             found[here, 2] = self.rate[here] + rows @ values - offset
@@ -496,5 +494,5 @@ class EvenSamples:
         rows = np.concatenate(
             [np.arange(max(epoch.start_index, 0), epoch.end_index) for epoch in epochs])
         block = np.searchsorted(places, rows, side='right') - 1
-        self.results[rows, 1] += known[block] + np.array(white)[block] * (
-            until[rows] - until[places[block]])
+        self.results[rows, 1] += (known[block]
+                                  + np.array(white)[block] * (until[rows] - until[places[block]]))

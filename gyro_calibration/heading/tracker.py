@@ -174,10 +174,8 @@ class HeadingTracker:
         self._bias_sensitivity: Array | None = None
         self._cached_rate_error, self._cached_bias = 0.0, (0.0, 0.0)
         self._still_sensitivity: Array | None = None
-        self._gaps, self._energy, self._detector_settings = (GapModel(noise),
-                                                             EnergyDetector(
-                                                                 noise, settings.false_alarms),
-                                                             (noise, settings.false_alarms))
+        self._gaps, self._energy, self._detector_settings = GapModel(
+            noise), EnergyDetector(noise, settings.false_alarms), (noise, settings.false_alarms)
         self.intervals = self._gaps.intervals
         self._initialize_state(noise, covariance, 0.0, 0.0, age)
         self.configure(settings)
@@ -305,13 +303,13 @@ class HeadingTracker:
                 self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
             # the jump is permanent; its time between the samples is not known
-            self._block_integral.lost_variance += ((0.5 * (spike[1] - self._last_sample[1]) *
-                                                    (spike[0] - self._last_sample[0])) ** 2)
+            self._block_integral.lost_variance += (
+                (0.5 * (spike[1] - self._last_sample[1]) * (spike[0] - self._last_sample[0])) ** 2)
             # a rate between two jumps within 2 s may be erroneous
             begun, before = self._before_last_jump
             if 0.0 < spike[0] - begun < _MIN_REST_DURATION:
-                self._block_integral.lost_variance += (((self._last_sample[1] - before) *
-                                                        (spike[0] - begun)) ** 2)
+                self._block_integral.lost_variance += (
+                    ((self._last_sample[1] - before) * (spike[0] - begun)) ** 2)
             self._before_last_jump = self._last_sample[:2]
             self._take_sample(*spike)
         elif spike is not None:
@@ -355,8 +353,8 @@ class HeadingTracker:
                 self._open_integral + self._block_integral, self._new_integral(), None)
             if self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
                 self._advance_state()
-        self.rate = (0.0 if self.is_resting or filtered != rate else rate
-                     - self._rate_error(sensitivity))
+        self.rate = (0.0 if self.is_resting or filtered != rate
+                     else rate - self._rate_error(sensitivity))
         if not -math.inf < self.heading + self.rate < math.inf:
             self._rebuild_state()
         message, self._rebuild_message = self._rebuild_message, ''
@@ -407,9 +405,9 @@ class HeadingTracker:
         intervals = np.diff(time, prepend=self._last_sample[0])
         with np.errstate(invalid='ignore'):
             steps = np.abs(np.diff(rate, prepend=self._last_sample[1]))
-            even = ((np.abs(rate) < MAX_RATE) & (intervals >= 0.0)
-                    & (intervals <= self._settings.maximum_gap)
-                    & (steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals))
+            even = (np.abs(rate) < MAX_RATE) & (intervals >= 0.0) & (
+                intervals <= self._settings.maximum_gap) & (
+                    steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals)
         return len(even) if even.all() else int(np.argmin(even))
 
     def _follow_even_samples(self, given: Samples, begin: int, end: int, found: Array) -> int:
@@ -420,8 +418,7 @@ class HeadingTracker:
         count = len(usual) - bool(lost)
         if count:
             piece = EvenSamples(given, slice(begin, begin + count), self._last_sample,
-                                self._block.duration, self.is_resting,
-                                found[begin:begin + count])
+                                self._block.duration, self.is_resting, found[begin:begin + count])
             self._gaps.add_many(piece.intervals, piece.rate, self._last_sample[1])
             if not self._block.duration:
                 piece.epochs.append(self._new_epoch(-1))
@@ -477,8 +474,8 @@ class HeadingTracker:
         part.sensitivity = piece.sensitivity_integrals[self.is_resting][number]
         if self.is_resting != piece.last_at_rest:
             assert self._last_sample is not None
-            part.sensitivity = (part.sensitivity + piece.half_intervals[begin] *
-                                (self._last_sample[3] - rows[begin - 1]))
+            part.sensitivity = (part.sensitivity + piece.half_intervals[begin]
+                                * (self._last_sample[3] - rows[begin - 1]))
             piece.last_at_rest = self.is_resting
         block.duration, block.count = part.duration, end - begin
         turned = self._corrected_angle(part)
@@ -584,9 +581,8 @@ class HeadingTracker:
         """Hold the last blocks, which may be the begin of a rest."""
         self._recent_blocks.append(part)
         self._held_integral += part
-        while (len(self._recent_blocks) > 2
-               and self._held_integral.duration - self._recent_blocks[0].duration
-               >= self._quiet_duration - TIME_TOLERANCE):
+        while (len(self._recent_blocks) > 2 and self._held_integral.duration
+               - self._recent_blocks[0].duration >= self._quiet_duration - TIME_TOLERANCE):
             self._held_integral -= self._recent_blocks.popleft()
 
     def _held_rest_integral(self) -> RateIntegral:
@@ -598,12 +594,11 @@ class HeadingTracker:
         if (self._held_integral.duration < self._quiet_duration - TIME_TOLERANCE
                 or len(self._recent_blocks) < 2):
             return False
-        most = (self._sigmas[self._quiet_duration] *
-                (1.0 if self._quiet_duration == WINDOW_DURATION else 0.5))
-        stands = abs(
-            self._normalized_innovation(self._state,
-                                        self._with_still_sensitivity(self._held_rest_integral()),
-                                        _WHEEL_BIAS_CHANGE if wheels is False else 0.0)) < most
+        most = self._sigmas[self._quiet_duration] * (1.0 if self._quiet_duration == WINDOW_DURATION
+                                                     else 0.5)
+        stands = abs(self._normalized_innovation(
+            self._state, self._with_still_sensitivity(self._held_rest_integral()),
+            _WHEEL_BIAS_CHANGE if wheels is False else 0.0)) < most
         if (not stands and self._quiet_duration > WINDOW_DURATION
                 and not self._accept_slow_turn_as_bias()):
             self._enter_motion(self._quiet_duration)
@@ -675,13 +670,9 @@ class HeadingTracker:
             limit = _NOISE_TOLERANCE ** 2 * scatter_threshold(
                 lag, last.innovation_count - before.innovation_count, self._settings.false_alarms)
             if last.innovation_square_sum - before.innovation_square_sum > limit:
-                self._revert_to_motion(
-                    lag,
-                    max(
-                        self._snapshots, key=lambda each:
-                        (last.innovation_square_sum - each.innovation_square_sum -
-                         SCATTER_ONSET_THRESHOLD *
-                         (last.innovation_count - each.innovation_count))))
+                self._revert_to_motion(lag, max(self._snapshots, key=lambda each: (
+                    last.innovation_square_sum - each.innovation_square_sum
+                    - SCATTER_ONSET_THRESHOLD * (last.innovation_count - each.innovation_count))))
                 return
 
     def _snapshot_before(self, lag: float) -> Snapshot | None:
@@ -704,9 +695,8 @@ class HeadingTracker:
             True, self._zero_integral, 0.0)
         self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
-        self._snapshots = [
-            Snapshot(self._state, self._zero_integral, self.deleted_heading, len(self.steps))
-        ]
+        self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
+                                    len(self.steps))]
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
@@ -762,8 +752,7 @@ class HeadingTracker:
             [self._normalized_innovation(snapshot.state, block) for block in blocks])
         at_rest = np.cumsum(squares)[:-1]
         moving = np.maximum((squares.sum() - at_rest) / np.arange(len(blocks) - 1, 0, -1), 1.0)
-        last = int(np.argmin(at_rest + np.arange(len(blocks) - 1, 0, -1)
-                             * (1.0 + np.log(moving))))
+        last = int(np.argmin(at_rest + np.arange(len(blocks) - 1, 0, -1) * (1.0 + np.log(moving))))
         if not last:
             return snapshot, turn
         quiet = sum(blocks[1:last], blocks[0])
@@ -784,8 +773,8 @@ class HeadingTracker:
         least = (self._sigmas[MEAN_LAGS[-1]]
                  * math.sqrt(snapshot.state.expected_rest_angle(longest)[1]) / MEAN_LAGS[-1])
         rate = (turn.angle - snapshot.state.expected_rest_angle(turn)[0]) / turn.duration
-        return (SlowTurn(snapshot, rate, turn
-                         + self._zero_integral) if abs(rate) < _SLOW_TURN_FACTOR * least else None)
+        return (SlowTurn(snapshot, rate, turn + self._zero_integral)
+                if abs(rate) < _SLOW_TURN_FACTOR * least else None)
 
     def _restart_after_gap(self, interval: float, fastest: float, may_have_turned: bool) -> str:
         """
@@ -807,9 +796,8 @@ class HeadingTracker:
         if interval > 0.0:
             self.intervals.count_lost(interval)
         lost = (fastest * duration) ** 2 + may_have_turned * math.tau ** 2
-        self._propagate_state(
-            replace(self._zero_integral, duration=duration, lost_variance=lost,
-                    is_unobserved=True), self._last_time)
+        self._propagate_state(replace(self._zero_integral, duration=duration, lost_variance=lost,
+                                      is_unobserved=True), self._last_time)
         self._adopt_state()
         return (f'no samples for {interval:.3f} s' if interval > 0.0
                 else f'the stamp jumps back by {-interval:.3f} s')
@@ -841,17 +829,15 @@ class HeadingTracker:
         squared = (turn.angle - expected) ** 2 / variance
         ratios = 1.0 + SCATTER_RATIOS * white / variance
         likelihood = before.log_likelihood - 0.5 * (squared / ratios + np.log(ratios))
-        turn.wander_variance = (
-            0.0 if self._wheels_stand else
-            float(self._rest_scatter.probabilities(likelihood) @ SCATTER_RATIOS) * white)
+        turn.wander_variance = 0.0 if self._wheels_stand else float(
+            self._rest_scatter.probabilities(likelihood) @ SCATTER_RATIOS) * white
         self._propagate_state(turn,
                               self._last_time - self._block_integral.duration - remaining.duration)
         self._rest_integral += turn
-        self._snapshots.append(
-            Snapshot(self._state, self._rest_integral,
-                     self.deleted_heading - self._corrected_angle(self._block_integral),
-                     len(self.steps), before.innovation_square_sum + squared,
-                     before.innovation_count + 1, likelihood))
+        self._snapshots.append(Snapshot(
+            self._state, self._rest_integral,
+            self.deleted_heading - self._corrected_angle(self._block_integral), len(self.steps),
+            before.innovation_square_sum + squared, before.innovation_count + 1, likelihood))
         del self._snapshots[:-_MAX_SNAPSHOTS]
 
     def _propagate_state(self, turn: RateIntegral, end: float) -> None:
@@ -859,8 +845,8 @@ class HeadingTracker:
         turn = turn if self.is_resting else self._with_unbiased_sensitivity(turn)
         if self._keeps_steps:
             self.steps.append(TrackStep(self._state, turn, self.is_resting, end))
-        self._state = (self._state.advance_at_rest(turn)
-                       if self.is_resting else self._state.propagate(turn))
+        self._state = (self._state.advance_at_rest(turn) if self.is_resting
+                       else self._state.propagate(turn))
 
     def _with_unbiased_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity for the rates without their bias."""
@@ -892,9 +878,9 @@ class HeadingTracker:
         self._error_sensitivity = self._bias_sensitivity = None
         self._bias_margin = _BIAS_MARGIN_SIGMAS * self.bias[1]
         self._open_variance, self._state_version = None, self._state_version + 1
-        estimate = float(self._state.mean[HEADING_INDEX]) + (
-            0.0 if self.is_resting else self._corrected_angle(self._open_integral
-                                                              + self._block_integral))
+        estimate = (float(self._state.mean[HEADING_INDEX])
+                    + (0.0 if self.is_resting
+                       else self._corrected_angle(self._open_integral + self._block_integral)))
         self._pending_correction = estimate - self.heading
         self._last_finite_heading = (self.heading,
                                      float(self._state.covariance[HEADING_INDEX, HEADING_INDEX]))
@@ -941,8 +927,8 @@ class HeadingTracker:
     @property
     def sensitivity(self) -> Array:
         """Return that of the last sample."""
-        return (self._zero_integral.sensitivity
-                if self._last_sample is None else self._last_sample[3])
+        return (self._zero_integral.sensitivity if self._last_sample is None
+                else self._last_sample[3])
 
     def bias_for(self, sensitivity: Array) -> tuple[float, float]:
         """Return the same for another sensitivity, (m,), as of samples at another temperature."""

@@ -47,8 +47,8 @@ def test_an_answer_is_scored_from_its_file(folder, tmp_path, capsys):
     answers = tmp_path / 'answers.json'
     right = {'causes': [{'effect': truth['causes'][0]['name']}]}
     for given, expected in ({'0000': right}, 1), ({}, 0):
-        answers.write_text(json.dumps({'schema': 'gyro_calibration_bench/answers/1',
-                                       'answers': given}))
+        answers.write_text(
+            json.dumps({'schema': 'gyro_calibration_bench/answers/1', 'answers': given}))
         capsys.readouterr()
         assert main(['score', str(folder), str(answers), '--json']) == 0
         counts = json.loads(capsys.readouterr().out)['separated']['right']

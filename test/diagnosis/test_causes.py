@@ -59,10 +59,10 @@ def test_a_reference_is_a_column_of_a_log():
 
 
 #: Words of the experiment for each pair of twins, in their order.
-WANTED = dict(zip(LOOK_ALIKES, [
-    'heat and cool', 'heat and cool', 'rest for', 'whole turns', 'at eight speeds', 'motor',
-    'axis up, level, down', 'beyond', 'quick reversals', 'abrupt changes', 'abrupt changes',
-    'again', 'again', 'step the supply', 'axis up', 'whole turns']))
+WANTED = dict(zip(LOOK_ALIKES, ['heat and cool', 'heat and cool', 'rest for', 'whole turns',
+                                'at eight speeds', 'motor', 'axis up, level, down', 'beyond',
+                                'quick reversals', 'abrupt changes', 'abrupt changes', 'again',
+                                'again', 'step the supply', 'axis up', 'whole turns']))
 
 
 @pytest.fixture(name='laid', scope='module')

@@ -84,8 +84,8 @@ def test_a_value_beside_a_model_is_what_comes_on_top_of_it():
 # little to hold out
 
 PARTLY = {'nothing that is held out': [lambda time: (time < 40.0) | (time >= 295.0)],
-          'one log within what is held out': [lambda time: time >= 0.0,
-                                              lambda time: (time >= 51.0) & (time < 96.0)]}
+          'one log within what is held out': [
+              lambda time: time >= 0.0, lambda time: (time >= 51.0) & (time < 96.0)]}
 
 
 @pytest.mark.parametrize('known', PARTLY.values(), ids=PARTLY)

@@ -61,8 +61,8 @@ def any_generator(request):
 def swing(generator, count=6000, noise=WHITE, scale=1.01, offset=2e-3):
     """Return a log of a gyro that swings and rests, 100 samples a second."""
     time = np.arange(count) * INTERVAL
-    rate = np.sin(0.9 * time + generator.uniform(0.0, 6.0)) * np.clip(3.0 * np.sin(0.11 * time),
-                                                                      0.0, 1.0)
+    rate = np.sin(
+        0.9 * time + generator.uniform(0.0, 6.0)) * np.clip(3.0 * np.sin(0.11 * time), 0.0, 1.0)
     return Log(output=scale * rate + offset + simulate_noise(noise, count, INTERVAL, generator),
                time=time, reference_rate=rate)
 
@@ -429,9 +429,8 @@ def test_one_value_that_comes_often_makes_no_quantization(share, generator):
     for _ in range(20):
         often, values = generator.random(6000) < share, generator.standard_normal(6000)
         assert find_codes(np.where(often, 0.0, values)).step == 0.0
-        assert find_codes(np.where(often, 0.0,
-                                   np.round(values / 0.1) * 0.1)).step == pytest.approx(
-                                       0.1, rel=1e-9)
+        assert find_codes(np.where(
+            often, 0.0, np.round(values / 0.1) * 0.1)).step == pytest.approx(0.1, rel=1e-9)
 
 
 GOOD = swing(np.random.default_rng(1))

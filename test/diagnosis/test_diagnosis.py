@@ -76,9 +76,8 @@ def names_of(found):
 # one effect of each kind, some together, and none
 
 TOGETHER = [('bias_temperature', 'cubic_nonlinearity'), ('warm_up', 'heading_sensitivity'),
-            ('time_offset', 'scale_factor_asymmetry'),
-            ('interference_tone', 'thermal_lag'), ('outliers', 'vibration_rectification'),
-            ('reference_once_per_rev', 'bias_step'),
+            ('time_offset', 'scale_factor_asymmetry'), ('interference_tone', 'thermal_lag'),
+            ('outliers', 'vibration_rectification'), ('reference_once_per_rev', 'bias_step'),
             ('bandwidth', 'supply_sensitivity', 'saturation')]
 #: Named in other tests, below, in test_search.py and in test_extended_model.py.
 ELSEWHERE = ('angle_random_walk', 'dead_zone', 'dropped_samples', 'quantization',
@@ -98,8 +97,8 @@ def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
     assert how.is_right, told(log, found)
     # an encoder blurs where a zone ends by more than the noise does
     ends_blurred = name == 'dead_zone' and 'encoder_step' in reference
-    assert ends_blurred or all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(
-        log, found)
+    assert ends_blurred or all(held(log.truth.gyro.causes, found.findings,
+                                    4.0).values()), told(log, found)
     for measure, (mine, oracle) in won(log, found).items():
         # gains are compared where they exceed the scatter by noise and encoder steps; the oracle
         # knows the rate of the temperature, which a thermometer of 1/16 K shows in leaps
@@ -143,8 +142,8 @@ def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
 def test_what_the_catalogue_does_not_have_is_reported_as_unexplained(name):
     log, = hidden_in([name], 5.0, list(OUTSIDE_CATALOGUE).index(name), reference=REFERENCES[0])
     found = diagnosis_of([log], np.random.default_rng(0))
-    assert found.verdict == 'unexplained' and judged_diagnosis(log, found).is_right, told(
-        log, found)
+    assert found.verdict == 'unexplained' and judged_diagnosis(log,
+                                                               found).is_right, told(log, found)
 
 
 @pytest.mark.evidence
@@ -246,8 +245,8 @@ def test_a_step_that_happens_with_a_change_of_temperature_is_a_step_where_the_ot
     found = diagnosis_of(logs, np.random.default_rng(0))
     assert judged_diagnosis(logs[0], found).is_right, told(logs[0], found)
     named = {name for each in found.findings for name in (each.effect, *each.ambiguous_with)}
-    assert not {name for name in named if CAUSES[name].along.startswith('temperature')}, told(
-        logs[0], found)
+    assert not {name for name in named
+                if CAUSES[name].along.startswith('temperature')}, told(logs[0], found)
 
 
 def test_a_temperature_effect_that_repeats_is_named():
@@ -261,9 +260,8 @@ def test_an_effect_of_the_motion_is_found_in_several_logs_together():
     logs = hide(['cubic_nonlinearity'], 5.0, np.random.default_rng(3), noise='mixed', runs=3,
                 **SHORT)
     found = diagnosis_of(logs, np.random.default_rng(0))
-    assert (judged_diagnosis(logs[0], found).is_right
-            and all(judged_diagnosis(logs[0], found).interval_holds.values())), told(
-                logs[0], found)
+    assert (judged_diagnosis(logs[0], found).is_right and all(
+        judged_diagnosis(logs[0], found).interval_holds.values())), told(logs[0], found)
 
 
 # against a model
@@ -332,7 +330,7 @@ def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path
 
 
 def test_noise_is_found_against_a_model_only():
-    assert ({name for name, cause in CAUSES.items() if cause.origin == 'noise'}
-            <= set(MODEL_FINDINGS))
+    assert ({name
+             for name, cause in CAUSES.items() if cause.origin == 'noise'} <= set(MODEL_FINDINGS))
     log, = hidden_in(['angle_random_walk'], 20.0, 1, 'white', REFERENCES[0])
     assert names_of(diagnosis_of([log], np.random.default_rng(0), with_model=False)) == []

@@ -112,9 +112,9 @@ def test_the_extended_model_says_what_model_and_finding_say_together(own, found,
         channels.with_rate(rate, rate)) == pytest.approx(together, abs=1e-12))
     # how well the error is known is what the model, the bias and the finding say of it
     columns = np.array([rate, *(outcome.causes[0].candidate.columns(laid))])
-    own_rows, rows = (np.array([row + 0.0 * rate for each in terms
-                                for row in each.sensitivity(channels)])
-                      for terms in (model.terms, new.terms))
+    own_rows, rows = (
+        np.array([row + 0.0 * rate for each in terms for row in each.sensitivity(channels)])
+        for terms in (model.terms, new.terms))
     variance = np.einsum('in,ij,jn->n', columns, outcome.covariance, columns) + 1e-10
     variance += np.einsum('in,ij,jn->n', own_rows, model.covariance, own_rows)
     assert np.einsum('in,ij,jn->n', rows, new.covariance,
@@ -141,8 +141,8 @@ def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, 
 
 
 def test_a_second_tone_is_not_reported_as_in_the_model():
-    slow, fast = term('interference_tone', 1.7, 1e-3, 0.0), term('interference_tone', 3.1, 1e-3,
-                                                                 0.0)
+    slow, fast = term('interference_tone', 1.7, 1e-3,
+                      0.0), term('interference_tone', 3.1, 1e-3, 0.0)
     model = replace(MODEL, terms=(*LINEAR, slow), covariance=None)
     log = drive(slow, fast)
     found = diagnosed(log, model)
@@ -186,8 +186,9 @@ def test_a_model_that_is_right_is_left_as_it_is_to_the_letter():
 def test_what_is_wrong_with_the_record_alone_leaves_the_model_as_it_is():
     log = drive()
     kept = np.delete(np.arange(len(log)), [1000, 2000, 2001, 3000])
-    fewer = Log(**{name: getattr(log, name)[kept] for name in (
-        'time', 'output', 'temperature', 'reference_rate', 'reference_heading')})
+    fewer = Log(
+        **{name: getattr(log, name)[kept]
+           for name in ('time', 'output', 'temperature', 'reference_rate', 'reference_heading')})
     found = diagnosed(fewer, MODEL)
     assert (names(found) == ['dropped_samples'] and found.model is MODEL
             and 'the model is unchanged' in headline(found)[1])
@@ -284,8 +285,8 @@ def test_a_log_without_motion_says_nothing_of_rates(swing):
 def test_an_output_of_the_other_sense_is_the_only_finding_and_the_model_stays_as_it_is():
     log, model = drive(gyro=GyroModel(LINEAR[:1])), GyroModel(LINEAR[:1], noise=NOISE)
     found = diagnosed(replace(log, output=-log.output), model)
-    assert found.verdict == 'mismatched' and names(found) == ['unit_error'
-                                                              ] and found.model is model
+    assert found.verdict == 'mismatched' and names(
+        found) == ['unit_error'] and found.model is model
     assert '--invert' in found.findings[0].remedy
 
 

@@ -73,9 +73,8 @@ def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
     found = diagnose([log], np.random.default_rng(0))
     (finding,) = found.findings
     failed = [gate.name for gate in found.gates if gate.passed is False]
-    assert (
-        found.verdict == 'mismatched' and finding.remedy and failed[0] in FAILED.get(wrong, 'unit')
-    ), (failed, finding.evidence)
+    assert (found.verdict == 'mismatched' and finding.remedy
+            and failed[0] in FAILED.get(wrong, 'unit')), (failed, finding.evidence)
     assert (found.to_dict()['gates'][-1]['passed'] is False
             and found.to_dict()['findings'][0]['remedy'] == finding.remedy)
     assert finding.remedy in ' '.join(' '.join(terminal_lines(found)).split())
@@ -88,11 +87,8 @@ def test_a_gyro_that_follows_passes_all_gates(noise):
 
 def test_a_late_reference_passes_all_gates():
     log = drive(2, 1.0 * DEGREE)
-    assert all(
-        gate.passed
-        for gate in check_gates(
-            replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading)))
-    )
+    assert all(gate.passed for gate in check_gates(
+        replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading))))
 
 
 def test_a_gyro_at_rest_beside_a_noisy_reference_passes_the_gates():

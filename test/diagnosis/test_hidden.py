@@ -69,8 +69,7 @@ def test_nothing_of_the_package_is_imported():
                  for alias in node.names}
         roots |= {node.module.split('.')[0] for node in nodes if isinstance(node, ast.ImportFrom)}
         assert roots <= {'__future__', 'collections', 'dataclasses', 'gzip', 'io', 'math',
-                         'gyro_calibration_bench', 'numpy', 'pathlib', 'scipy',
-                         'typing'}, path
+                         'gyro_calibration_bench', 'numpy', 'pathlib', 'scipy', 'typing'}, path
 
 
 def allan_variance(rate, interval, size):
@@ -87,9 +86,8 @@ def allan_variance(rate, interval, size):
                          ids=['white', 'walk', 'flicker'])
 def test_the_noise_has_the_allan_variance_of_ieee_952(generator, figures, expected, tolerance):
     interval = 0.1
-    records = [
-        np.sum(generate_noise(figures, 20_000, interval, generator), axis=0) for _ in range(40)
-    ]
+    records = [np.sum(generate_noise(figures, 20_000, interval, generator), axis=0)
+               for _ in range(40)]
     for size in (16, 64, 128):
         found = np.mean([allan_variance(each, interval, size) for each in records])
         assert found == pytest.approx(expected(size * interval), rel=tolerance)
@@ -128,10 +126,8 @@ def test_a_detectable_effect_is_found_with_the_promised_scatter_and_power(genera
     metric = InformationMetric([each], figures)
     column = effect_errors(FORMS[name], 1.0, cause.shapes, [each])
     hidden, scale = cause.size * column[0] + 0.01 + 0.02 * each.rate, 1e-9 + abs(cause.size)
-    noises = [
-        hidden + np.sum(generate_noise(figures, len(each.time), each.interval, generator), axis=0)
-        for _ in range(150)
-    ]
+    noises = [hidden + np.sum(generate_noise(figures, len(each.time), each.interval, generator),
+                              axis=0) for _ in range(150)]
     gram = metric.gram([column, *([noise] for noise in noises)])
     estimates = gram[0, 1:] / gram[0, 0]
     assert np.std(estimates) / scale == pytest.approx(cause.standard_deviation / scale, rel=0.25)
@@ -175,8 +171,8 @@ def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
         effect_errors(ALL[name], cause.size, cause.shapes, [each])[0], abs=1e-12)
     assert log.columns['gyro_rad_s'] == pytest.approx(truth.rate + truth.added_rate + truth.noise,
                                                       abs=1e-12)
-    assert InformationMetric([each], truth.gyro.figures).norm([truth.added_rate]) == pytest.approx(
-        3.0 * DETECTION_SIGMAS, rel=1e-3)
+    assert InformationMetric([each], truth.gyro.figures).norm(
+        [truth.added_rate]) == pytest.approx(3.0 * DETECTION_SIGMAS, rel=1e-3)
 
 
 def test_the_heading_is_the_integral_of_the_rate_and_rest_is_rest(generator):
@@ -288,12 +284,8 @@ def left_over(hidden_name, other, log, sessions, twins):
     if ALL[other].is_linear:
         phases = ([{'phase': 0.0}, {'phase': 0.5 * math.pi}]
                   if other in ('heading_sensitivity', 'reference_once_per_rev') else [{}])
-        columns = [
-            effect_errors(ALL[other], 1.0, {
-                **shapes,
-                **phase
-            }, sessions) for phase in phases
-        ]
+        columns = [effect_errors(ALL[other], 1.0, {**shapes, **phase}, sessions)
+                   for phase in phases]
         gram = metric.gram([hidden, *columns], known)
         scale = np.sqrt(np.diag(gram))
         gram = gram / np.outer(scale, scale)
@@ -324,8 +316,8 @@ def test_twins_are_alike_and_then_parted(generator, pair, first):
 def test_what_is_outside_the_catalogue_is_mostly_not_explained_by_it(generator):
     causes = [hide([name], 3.0, generator, noise='white', **COARSE)[0].truth[name]
               for name in OUTSIDE_CATALOGUE]
-    assert np.mean([cause.likeness < 0.3 for cause in causes]) > 0.6, [(cause.name, cause.likeness)
-                                                                       for cause in causes]
+    assert np.mean([cause.likeness < 0.3
+                    for cause in causes]) > 0.6, [(cause.name, cause.likeness) for cause in causes]
     assert all(cause.likeness <= cause.likeness_of_three + 0.02 for cause in causes)
 
 

@@ -153,8 +153,7 @@ def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
         use(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=heading))
 
 
-def test_turns_in_gaps_or_between_slow_samples_are_no_wrapped_heading(
-):
+def test_turns_in_gaps_or_between_slow_samples_are_no_wrapped_heading():
     lost = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + 2.0 * np.pi * (TIME > 32.0))
     refuse_unusable(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=lost))
     slow = np.arange(1000) * 1.0

@@ -55,8 +55,8 @@ def drive(seed, duration=240.0, hidden=lambda time, rate, heading, temperature: 
         [1.0], [1.0, -np.exp(-1.0 / (3.0 * RATE))], generator.standard_normal(len(time)))
     slip = wanders * np.sqrt(2.0 / (3.0 * RATE)) * 0.4 * DEGREE * (1.0 + 2.0 * np.abs(rate))
     fixes = np.arange(0.0, duration, 0.2)
-    course = np.interp(
-        fixes + DELAY, time, heading + slip) + 0.3 * DEGREE * generator.standard_normal(len(fixes))
+    course = (np.interp(fixes + DELAY, time, heading + slip)
+              + 0.3 * DEGREE * generator.standard_normal(len(fixes)))
     course = np.interp(time, fixes, course)
     for lost in generator.uniform(10.0, duration - 20.0, 3):
         course[(time > lost) & (time < lost + 5.0)] = np.nan
@@ -75,8 +75,8 @@ def value(model, name):
 def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed):
     found = diagnosed(drive(seed))
     named = {each.effect: each for each in found.findings if each.status == 'established'}
-    assert found.reference.kind == 'course' and set(named) <= {'time_offset'
-                                                               }, terminal_lines(found)
+    assert found.reference.kind == 'course' and set(
+        named) <= {'time_offset'}, terminal_lines(found)
     assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.03 * DEGREE)
     assert value(found.model, 'scale_factor_error') == pytest.approx(SCALE, abs=0.012)
     assert named['time_offset'].parameters['time_offset'].estimate == pytest.approx(
@@ -174,12 +174,8 @@ def test_the_kind_of_a_reference_is_given_or_found():
                                       classify_reference(exact)))
 
 
-ERRING = [
-    ImperfectReference('rate', 0.1),
-    ImperfectReference('rate', 0.5),
-    ImperfectReference('capture', 0.05),
-    ImperfectReference('encoder', 0.5)
-]
+ERRING = [ImperfectReference('rate', 0.1), ImperfectReference('rate', 0.5),
+          ImperfectReference('capture', 0.05), ImperfectReference('encoder', 0.5)]
 
 
 def established(hidden):
@@ -225,8 +221,8 @@ def test_motion_capture_that_was_smoothed_and_an_encoder_with_late_stamps_are_no
         float(np.std(smooth.reference_heading - hidden.truth.heading)), rel=0.4)
     assert not is_reference_limiting(log, classify_reference(log))
     late = 0.01 * generator.uniform(-1.0, 1.0, len(log))
-    jitter = replace(log, reference_heading=log.reference_heading + 0.0055 * DEGREE * np.rint(
-        late * hidden.truth.rate / (0.0055 * DEGREE)))
+    jitter = replace(log, reference_heading=log.reference_heading
+                     + 0.0055 * DEGREE * np.rint(late * hidden.truth.rate / (0.0055 * DEGREE)))
     assert (classify_reference(jitter).kind == 'encoder'
             and is_reference_limiting(jitter, classify_reference(jitter)))
 
@@ -296,8 +292,8 @@ def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always
     generator, time = np.random.default_rng(3), np.arange(0.0, 300.0, 0.02)
     heading = np.interp(time, [100.0, 104.0, 200.0, 204.0], [0.0, 2.0, 2.0, -1.0])
     walk = 0.8 * DEGREE / 60.0 / np.sqrt(0.02)
-    log = Log(time=time, output=np.gradient(heading, time)
-              + walk * generator.standard_normal(len(time)),
+    log = Log(time=time,
+              output=np.gradient(heading, time) + walk * generator.standard_normal(len(time)),
               reference_heading=np.floor(heading / 0.002) * 0.002)
     assert (classify_reference(log).kind == 'encoder'
             and is_reference_limiting(log, classify_reference(log)))
@@ -371,8 +367,8 @@ def test_odometry_that_begins_after_the_gyro_is_no_course(begins, ends):
     heading = np.interp(at, time, np.cumsum(rate) * 0.01)
     log = Log(output=1.02 * np.interp(time - 0.02, time, rate) + BIAS_TRUE
               + 1e-3 * generator.standard_normal(len(time)), time=time,
-              reference_heading=interpolate_with_gaps(time, at, heading + 3e-4
-                                                      * generator.standard_normal(len(at))))
+              reference_heading=interpolate_with_gaps(
+                  time, at, heading + 3e-4 * generator.standard_normal(len(at))))
     assert np.isnan(log.reference_heading[[0, -1]]).all()
     reference = classify_reference(log)
     assert reference.kind == 'motion_capture' and 'lost' not in reference.evidence

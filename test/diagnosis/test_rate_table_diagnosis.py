@@ -59,9 +59,8 @@ def gyro(name, size):
     """Return a gyro with bias, scale factor and one effect; temperature counts from 25 degC."""
     terms = {term.effect.name: term for term in LINEAR}
     known = terms[name].values[-1] if name in terms else 0.0
-    values = {
-        'sine_response': (size, 1.0)
-    }.get(name) or (*[25.0] * len(STATIC_EFFECTS[name].nonlinear_parameters), known + size)
+    values = {'sine_response': (size, 1.0)}.get(
+        name) or (*[25.0] * len(STATIC_EFFECTS[name].nonlinear_parameters), known + size)
     return GyroModel(tuple({**terms, name: Term(STATIC_EFFECTS[name], values)}.values()))
 
 
@@ -242,8 +241,8 @@ def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_f
     certain = np.zeros((np.count_nonzero(fit.scatter.inliers), 1))
     probes = dwell_fit._structure_curves(table)
     found = dwell_fit.find_structure(fit, 1e-3, certain)[0][0]
-    monkeypatch.setattr(dwell_fit, '_structure_curves',
-                        lambda dwells: {found.along: probes[found.along]})
+    monkeypatch.setattr(dwell_fit,
+                        '_structure_curves', lambda dwells: {found.along: probes[found.along]})
     alone = dwell_fit.find_structure(fit, 1e-3, certain)[0][0]
     tried = sum(columns.shape[1] > 0 for columns in probes.values())
     assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
@@ -268,8 +267,8 @@ def test_an_outlying_dwell_is_compared_with_what_the_others_foretell_of_it():
     line, covariance = np.polyfit(table.rate[~last], (table.output - table.rate)[~last], 1,
                                   cov='unscaled')
     off = (table.output - table.rate)[12] - np.polyval(line, table.rate[12])
-    deviation = 0.03 * DEGREE * np.sqrt(1.0 + [table.rate[12],
-                                               1.0] @ covariance @ [table.rate[12], 1.0])
+    deviation = 0.03 * DEGREE * np.sqrt(
+        1.0 + [table.rate[12], 1.0] @ covariance @ [table.rate[12], 1.0])
     # The scatter of 12 dwells is found about a parabola: their temperature rises as the rate does.
     assert found.p_value == pytest.approx(13 * 2.0 * student.sf(abs(off) / deviation, 9))
 
@@ -326,8 +325,9 @@ def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
 
 def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data):
     found = diagnose_table(recorded_table(data), None)
-    assert [members(finding) for finding in found.findings] == [
-        {'sine_response', 'cubic_nonlinearity'}, {'scale_factor_temperature'}]
+    assert [members(finding)
+            for finding in found.findings] == [{'sine_response', 'cubic_nonlinearity'},
+                                               {'scale_factor_temperature'}]
     assert (found.gain.rate.before == pytest.approx(0.67 * DEGREE, rel=0.03)
             and found.gain.rate.after < 0.051 * DEGREE)
     assert '186 deg/s' in found.findings[0].separate_by

@@ -131,10 +131,10 @@ def trace():
 
 def unexplained():
     """Return a diagnosis where something along the heading has no name."""
-    return replace(adequate(), unexplained=(Unexplained('heading', 0.12, 1e-7),
-                                            Unexplained('rate', 0.03, 2e-4)),
-                   curves=[curve('heading', 'rad', HEADING, 0.08 * DEGREE * np.sin(3.0 * HEADING),
-                                 0.0)])
+    return replace(
+        adequate(),
+        unexplained=(Unexplained('heading', 0.12, 1e-7), Unexplained('rate', 0.03, 2e-4)),
+        curves=[curve('heading', 'rad', HEADING, 0.08 * DEGREE * np.sin(3.0 * HEADING), 0.0)])
 
 
 def no_gain():
@@ -250,8 +250,7 @@ def test_the_page_refers_to_nothing_outside_and_allows_itself_no_network(made):
         assert tag not in ('img', 'link', 'iframe', 'object', 'embed', 'base', 'form', 'a')
         assert not {'src', 'href', 'srcset', 'action', 'style'} & set(attributes)
         assert not any(name.startswith('on') for name in attributes)
-    policy, = [attributes['content']
-               for _, attributes in elements if attributes.get('http-equiv')]
+    policy, = [attributes['content'] for _, attributes in elements if attributes.get('http-equiv')]
     assert policy.startswith("default-src 'none';")
 
 
@@ -362,8 +361,9 @@ def test_an_estimate_is_written_with_the_digits_that_its_interval_leaves(value, 
 
 def test_noise_is_in_the_units_of_data_sheets():
     for unit, of_people in (('rad/√s', 'deg/√h'), ('rad/s/√s', 'deg/h/√h')):
-        assert display_unit(unit) == (
-            of_people, pytest.approx(180.0 / np.pi * (60.0 if unit == 'rad/√s' else 60.0 ** 3)))
+        assert display_unit(
+            unit) == (of_people,
+                      pytest.approx(180.0 / np.pi * (60.0 if unit == 'rad/√s' else 60.0 ** 3)))
 
 
 @pytest.mark.parametrize('probability, words',
@@ -502,8 +502,9 @@ def test_the_page_fits_each_screen_and_opens_without_complaint_and_network(
     for width, height in SCREENS.values():
         browser.show(path, width, height)
         methods = [event.get('method') for event in browser.events]
-        asked = [event['params']['request']['url'] for event, method
-                 in zip(browser.events, methods) if method == 'Network.requestWillBeSent']
+        asked = [event['params']['request']['url']
+                 for event, method in zip(browser.events, methods)
+                 if method == 'Network.requestWillBeSent']
         assert not {'Runtime.exceptionThrown', 'Log.entryAdded',
                     'Runtime.consoleAPICalled'} & set(methods)
         assert asked == [path.as_uri()]

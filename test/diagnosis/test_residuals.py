@@ -45,13 +45,11 @@ def inside(log, generator):
     """Return which bins of all curves but the spectrum are within their bands, and how many."""
     laid = replay(log, np.ones(len(log.time), dtype=bool), generator)
     found = FittedValues(fit_causes(build_problem([laid]), []), (laid,))
-    shown = [
-        each for each in residual_curves(unbiased_residuals(found), found)
-        if each.along != 'frequency'
-    ]
+    shown = [each for each in residual_curves(unbiased_residuals(found), found)
+             if each.along != 'frequency']
     off = np.concatenate([np.abs(each.after) / each.deviation for each in shown])
-    assert ({'time', 'rate', 'heading', 'temperature', 'specific_force'}
-            <= {each.along for each in shown})
+    assert ({'time', 'rate', 'heading', 'temperature',
+             'specific_force'} <= {each.along for each in shown})
     return np.count_nonzero(off < 1.96), len(off)
 
 

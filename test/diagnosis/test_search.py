@@ -138,11 +138,11 @@ def test_a_shape_that_is_fitted_stays_within_what_a_model_may_hold():
 
 def test_a_shape_at_its_bound_has_a_deviation():
     rate = np.sin(0.7 * TIME) * np.sin(0.11 * TIME)
-    whole = build_problem([laid(Log(output=rate + NOISE * np.random.default_rng(
-        0).standard_normal(len(rate)), time=TIME, reference_rate=rate))])
-    assert ((0, -1) in fit_causes(whole,
-                                  [SelectedCause(effect_candidate('time_offset', 1.0),
-                                                 (1.0, ))]).column_owners)
+    whole = build_problem(
+        [laid(Log(output=rate + NOISE * np.random.default_rng(0).standard_normal(len(rate)),
+                  time=TIME, reference_rate=rate))])
+    assert ((0, -1) in fit_causes(
+        whole, [SelectedCause(effect_candidate('time_offset', 1.0), (1.0, ))]).column_owners)
 
 
 def test_what_a_tone_changes_by_with_its_frequency_is_its_derivative_in_a_long_log():
@@ -154,8 +154,8 @@ def test_what_a_tone_changes_by_with_its_frequency_is_its_derivative_in_a_long_l
     column = done.columns[done.column_owners.index((0, -1))] * done.problem.deviation
     phase = Candidate('', (), lambda replayed: (
         2.0 * np.pi * replayed.channels.time * np.cos(2.0 * np.pi * frequency * time),))
-    assert (column == pytest.approx(
-        candidate_transforms(phase, [each])[0], abs=0.02 * np.abs(column).max()))
+    assert (column == pytest.approx(candidate_transforms(phase, [each])[0],
+                                    abs=0.02 * np.abs(column).max()))
 
 
 @pytest.mark.parametrize('name, shape', [('dead_zone', 'dead_zone'), ('bias_step', 'step_time')])
@@ -169,9 +169,8 @@ def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
                         (size.interval[1] - size.interval[0]) / 3.92)
     assert 0.0 < abs(size.estimate - truth) + deviation < 5.0 * deviation, size
     assert held([cause], [finding], 4.0) == {name: True}
-    places = [
-        (term.effect.name, value) for term in found.model.terms for value in term.fitted_indices
-    ]
+    places = [(term.effect.name, value) for term in found.model.terms
+              for value in term.fitted_indices]
     if name == 'bias_step':  # it happens once
         assert (name, 0) not in places
         return
@@ -238,16 +237,15 @@ def test_a_step_is_found_between_the_places_that_are_tried_in_many_logs():
     time = TIME[:2000]
     replays = [laid(resting(6e-4 * (time >= 50.0) * (run == 1), time, run)) for run in range(5)]
     _, named = found_in(replays)
-    assert ([(known.candidate.cause, known.candidate.log_index) for known in named
-             ] == [('bias_step', 1)])
+    assert ([(known.candidate.cause, known.candidate.log_index)
+             for known in named] == [('bias_step', 1)])
     assert named[0].candidate.shapes[0] == pytest.approx(50.0, abs=1.0)
 
 
 def test_steps_are_looked_for_in_each_of_many_logs():
     each = laid(resting(time=TIME[:2000]))
-    assert {
-        known.log_index for known in propose_candidates(70 * [each]) if known.cause == 'bias_step'
-    } == set(range(70))
+    assert {known.log_index for known in propose_candidates(70 * [each])
+            if known.cause == 'bias_step'} == set(range(70))
 
 
 def test_what_a_log_cannot_show_is_not_searched_for():

@@ -18,8 +18,7 @@ def test_parts_of_unknown_number_stay_within_their_step():
     steps = ProgressSteps(lambda share, words: told.append((share, words)), {
         'a': 1,
         'b': 8,
-        'c': 1
-    })
+        'c': 1})
     steps.begin('a')
     steps.begin('b')
     for number in range(40):

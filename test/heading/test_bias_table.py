@@ -177,8 +177,8 @@ def test_many_jumps_and_runs_leave_a_table_that_works():
             table.add(20.0 + run % 7, 1.0 * DEGREE * run, WHITE, DAY * run + 60.0 * number)
         table.begin_run()
     assert len(table.entries) == MAX_ENTRIES and 0 < len(table.jumps) <= MAX_ENTRIES
-    assert np.isfinite(table.predict(generator.uniform(20.0, 27.0), DAY *
-                                     (MAX_ENTRIES + 10))).all()
+    assert np.isfinite(
+        table.predict(generator.uniform(20.0, 27.0), DAY * (MAX_ENTRIES + 10))).all()
 
 
 def test_the_oldest_entry_of_the_fullest_bin_is_dropped():
@@ -211,8 +211,8 @@ def test_what_no_gyro_has_is_not_used(given):
 
 def test_a_model_that_compensates_leaves_less_inside_its_range_and_as_much_outside():
     known, plain = BiasTable(COMPENSATED), BiasTable(MODEL)
-    inside, outside = (known.bias_difference(15.0, 35.0,
-                                             0.0)[1], known.bias_difference(40.0, 60.0, 0.0)[1])
+    inside, outside = (known.bias_difference(15.0, 35.0, 0.0)[1],
+                       known.bias_difference(40.0, 60.0, 0.0)[1])
     of_plain = plain.bias_difference(40.0, 60.0, 0.0)[1]
     assert (math.sqrt(inside / of_plain) == pytest.approx(Prior().compensated_share, rel=1e-6)
             and 1.0 < outside / of_plain < 2.5)
@@ -268,8 +268,9 @@ def test_age_and_distance_are_reported_where_they_matter(age, temperature, words
 
 
 def test_a_table_moves_a_calibration_to_the_temperature_of_now_and_keeps_its_covariance_one():
-    history = simulate(np.random.default_rng(3),
-                       lambda temperature: 0.05 * DEGREE * (temperature - 20.0), outliers=0.0)
+    history = simulate(
+        np.random.default_rng(3), lambda temperature: 0.05 * DEGREE * (temperature - 20.0),
+        outliers=0.0)
     table = learned(history, 6)
     high = max(each.temperature for each in table.entries)
     now = propagate_calibration(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0,
@@ -321,8 +322,8 @@ def test_a_table_survives_a_restart(tmp_path):
     table.run = again.run
     assert (said == '' and again.run == 5
             and [each.name for each in path.parent.iterdir()] == ['table.yaml'])
-    assert again.predict(22.0, time + DAY) == pytest.approx(
-        table.predict(22.0, time + DAY), rel=1e-3)
+    assert again.predict(22.0,
+                         time + DAY) == pytest.approx(table.predict(22.0, time + DAY), rel=1e-3)
     assert 'rad/s' in path.read_text() and '1970-01-04T10:' in path.read_text()
 
 
@@ -397,8 +398,8 @@ def test_the_digest_tells_models_apart_as_same_effects_does():
               replace(COMPENSATED, terms=(Term(CATALOGUE['bias_temperature'], (25.0, 2e-4)),)),
               replace(COMPENSATED, terms=(Term(CATALOGUE['bias'], (1e-4,)),))]
     for first in models:
-        assert [model_digest(first) == model_digest(other) for other in models] == [
-            have_same_effects(first, other) for other in models]
+        assert [model_digest(first) == model_digest(other)
+                for other in models] == [have_same_effects(first, other) for other in models]
     assert model_digest(MODEL) != model_digest(replace(MODEL, gyro={'serial_number': '7'}))
 
 
@@ -416,8 +417,8 @@ def test_a_clock_that_is_set_moves_all_dates_since_the_table_began_and_no_others
     assert ([each.run for each in table.entries] == [0, 1, 2, 3]
             and not table.is_write_due(begin + 1e4))
     table.shift_clock(step)
-    assert [each.time for each in table.entries] == [
-        1.6e9, begin + step, begin + step + 60.0, begin + step + 240.0]
+    assert [each.time for each in table.entries] == [1.6e9, begin + step, begin + step + 60.0,
+                                                     begin + step + 240.0]
     assert [each.time for each in table.jumps] == [1.6e9, begin + step + 120.0]
     assert table.is_write_due(begin + step + 1e4), 'what is in the file has the old dates'
     table.add(20.0, 2.0 * DEGREE, WHITE, begin + step + 420.0)
@@ -434,10 +435,8 @@ def test_it_is_written_seldom_and_only_when_it_learned():
     table.mark_written(0.0)
     assert not table.is_write_due(MIN_WRITE_INTERVAL, ending=True)
     table.add(25.0, 0.0, WHITE, 60.0)
-    assert [
-        table.is_write_due(now)
-        for now in (60.0, MIN_WRITE_INTERVAL - 1.0, MIN_WRITE_INTERVAL, -MIN_WRITE_INTERVAL)
-    ] == [False, False, True, True]
+    assert [table.is_write_due(now) for now in (60.0, MIN_WRITE_INTERVAL - 1.0, MIN_WRITE_INTERVAL,
+                                                -MIN_WRITE_INTERVAL)] == [False, False, True, True]
     assert table.is_write_due(60.0, ending=True)
 
 

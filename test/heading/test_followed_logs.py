@@ -45,13 +45,13 @@ def drive(seconds, seed, coefficient=0.0, bias=0.005):
         length = int(generator.integers(100, 800))
         kind, part = generator.random(), np.arange(length) * INTERVAL
         rate[begin:begin + length] = (
-            generator.uniform(-60.0, 60.0) * np.sin(math.pi * part / part[-1]) ** 2 if kind < 0.4
-            else 0.3 * np.sin(6.0 * part) if kind < 0.6
-            else 0.0 * part)[:len(time) - begin] * DEGREE
+            (generator.uniform(-60.0, 60.0) * np.sin(math.pi * part / part[-1]) ** 2 if kind < 0.4
+             else 0.3 * np.sin(6.0 * part) if kind < 0.6 else 0.0 * part)[:len(time) - begin]
+            * DEGREE)
         begin += length
     temperature = 25.0 + 20.0 * np.minimum(time / seconds / 0.7, 1.0)
-    output = rate + bias + coefficient * (temperature - 25.0) + simulate_noise(
-        NOISE, len(time), INTERVAL, generator)
+    output = (rate + bias + coefficient * (temperature - 25.0)
+              + simulate_noise(NOISE, len(time), INTERVAL, generator))
     return time, rate, output, temperature
 
 
@@ -128,13 +128,12 @@ def test_compensate_and_the_node_give_the_same_heading_while_the_gyro_warms_up(t
     time, rate, output, temperature = drive(300.0, 3, 0.02 * DEGREE)
     rig = Rig(tmp_path, model=MODEL, stationary_method='rest')
     node = rig.feed(output, INTERVAL, temperature)
-    write_log(tmp_path / 'log.csv', Log(
-        output=output, time=BEGIN + INTERVAL + time, temperature=temperature))
+    write_log(tmp_path / 'log.csv',
+              Log(output=output, time=BEGIN + INTERVAL + time, temperature=temperature))
     columns = {}
     for words in ('--rest', '--hindsight'):
         assert main(['compensate', str(tmp_path / 'log.csv'), '--model',
-                     str(tmp_path / 'model.yaml'), '--out', str(tmp_path / 'out.csv'),
-                     words]) == 0
+                     str(tmp_path / 'model.yaml'), '--out', str(tmp_path / 'out.csv'), words]) == 0
         others = read_log(tmp_path / 'out.csv').others
         columns[words] = {name: np.array(values, float) for name, values in others.items()}
     np.testing.assert_allclose(columns['--rest']['heading_rad'],
@@ -165,8 +164,8 @@ def test_a_log_at_once_takes_a_third_of_the_operations_of_single_samples():
 
 @pytest.mark.parametrize('interval', [0.01, 0.02])
 def test_a_single_absurd_sample_is_no_turn(interval):
-    tracker, generator = HeadingTracker(NOISE, np.zeros((0, 0)), Settings()), (
-        np.random.default_rng(5))
+    tracker, generator = HeadingTracker(NOISE, np.zeros((0, 0)),
+                                        Settings()), (np.random.default_rng(5))
     rates = 0.3 + NOISE.angle_random_walk / math.sqrt(interval) * generator.standard_normal(1000)
     rates[500] = 30.0
     for index, rate in enumerate(rates.tolist()):

@@ -62,8 +62,8 @@ def recording(request, data):
 def follow(fit, time, output, heading):
     """Return error of the heading and its stated deviation, rad, without the last second."""
     turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
-    turned = (np.interp(time + fit.time_offset, time, turned)
-              - np.interp(max(fit.time_offset, 0.0), time, turned))
+    turned = np.interp(time + fit.time_offset, time,
+                       turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
     known = (quadratic_form(fit.covariance, np.array([heading, time]))
              / (1.0 + fit.scale_factor_error) ** 2)
     variance = known + NOISE.heading_variance(time) + fit.start_heading_deviation ** 2
@@ -184,8 +184,8 @@ def test_an_asymmetry_is_inside_what_is_allowed_for():
     time = np.arange(0.0, 20.0, 0.01)
     rate = 300.0 * DEGREE * np.sign(np.sin(2.0 * math.pi * time + 0.1))
     fit = add_asymmetry_variance(ScaleBiasFit(0.0, 0.0, np.zeros((2, 2))), rate)
-    assert (math.sqrt(fit.covariance[1, 1]) == pytest.approx(ASYMMETRY_DEVIATION * 300.0 * DEGREE,
-                                                             rel=0.01))
+    assert (math.sqrt(
+        fit.covariance[1, 1]) == pytest.approx(ASYMMETRY_DEVIATION * 300.0 * DEGREE, rel=0.01))
     resting = add_asymmetry_variance(ScaleBiasFit(0.0, 0.0, np.zeros((2, 2))),
                                      np.where(time < 10.0, 0.0, rate))
     assert resting.covariance[1, 1] < 0.3 * fit.covariance[1, 1]
@@ -206,9 +206,8 @@ def test_a_gyro_that_samples_unevenly_is_believed_its_stamps():
     output = (1.02 * CALIBRATION_MOTION.rate_at(time)
               + 0.05 * DEGREE * generator.standard_normal(len(time)))
     assert np.abs(even_times(time) - time).max() > 0.01
-    fit = self_calibrate(
-        time, output, motion_from_headings(np.arange(2001) * 0.01,
-                                           CALIBRATION_MOTION.heading_at(np.arange(2001) * 0.01)))
+    fit = self_calibrate(time, output, motion_from_headings(
+        np.arange(2001) * 0.01, CALIBRATION_MOTION.heading_at(np.arange(2001) * 0.01)))
     assert fit.scale_factor_error == pytest.approx(0.02, abs=3e-4)
 
 

@@ -331,8 +331,8 @@ def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(ter
     before = gyro.go(4.0, 0.3, None).error
     assert not gyro.live.tracker.is_resting
     gyro.go(40.0, 0.3, 35.0)
-    assert abs(gyro.error - before) < 2.0 * DEGREE, (
-        'what the table knows of 10 K makes 12 degrees of it')
+    assert abs(gyro.error
+               - before) < 2.0 * DEGREE, ('what the table knows of 10 K makes 12 degrees of it')
 
 
 def test_the_longer_no_temperature_came_since_a_calibration_the_less_its_bias_is_known():
@@ -373,9 +373,8 @@ def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
     warm = replace(CALIBRATED, bias=0.4 * DEGREE, temperature=35.0)
     assert (not describe_change(live.current_calibration, warm, NOISE, 300.0)
             and describe_change(CALIBRATED, warm, NOISE, 300.0))
-    assert (bool(
-        describe_change(live.current_calibration, replace(warm, bias=0.1 * DEGREE), NOISE,
-                        300.0)) == known)
+    assert (bool(describe_change(live.current_calibration, replace(warm, bias=0.1 * DEGREE), NOISE,
+                                 300.0)) == known)
 
 
 def test_a_model_without_a_calibration_claims_no_scale():

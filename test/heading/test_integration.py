@@ -127,8 +127,8 @@ def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
 def test_the_rest_test_takes_noise_for_rest():
     time = np.arange(20001) * INTERVAL
     rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    assert (filter_rates(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate)
-            != 0.0).mean() < 0.01
+    assert (filter_rates(Threshold(angle_random_walk=XV3500.angle_random_walk), time,
+                         rate) != 0.0).mean() < 0.01
 
 
 def test_a_cleared_window_knows_nothing_of_before():
@@ -180,5 +180,5 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
     tracker.finish()
     assert math.sqrt(tracker.variance) == pytest.approx(deviation[-1], rel=1e-3)
-    assert (tracker.deleted_heading == pytest.approx(
-        integrate(time, rate)[-1] - heading[-1], abs=1e-5))
+    assert (tracker.deleted_heading == pytest.approx(integrate(time, rate)[-1] - heading[-1],
+                                                     abs=1e-5))

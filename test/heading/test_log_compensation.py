@@ -25,14 +25,11 @@ import numpy as np
 from operations import operations
 import pytest
 
-VALUES = {
-    'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05),
-    'thermal_lag': (120.0, -2e-3),
-    'thermal_hysteresis': (10.0, 2e-3, 3e-4), 'warm_up': (300.0, 0.004), 'rate_ramp': (2e-7,),
-    'bias_step': (200.0, -1e-3),
-    'acceleration_sensitivity': (1e-4,), 'vibration_rectification': (1.0, 2e-4),
-    'supply_sensitivity': (5.0, 4e-4),
-    'interference_tone': (0.07, 3e-4, -2e-4)}
+VALUES = {'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05),
+          'thermal_lag': (120.0, -2e-3), 'thermal_hysteresis': (10.0, 2e-3, 3e-4),
+          'warm_up': (300.0, 0.004), 'rate_ramp': (2e-7,), 'bias_step': (200.0, -1e-3),
+          'acceleration_sensitivity': (1e-4,), 'vibration_rectification': (1.0, 2e-4),
+          'supply_sensitivity': (5.0, 4e-4), 'interference_tone': (0.07, 3e-4, -2e-4)}
 HEADING = {'heading_sensitivity': (1e-3, -5e-4)}
 TIME = np.arange(0.0, 900.0, 0.05) + np.random.default_rng(0).uniform(0.0, 0.02, 18000)
 
@@ -47,11 +44,10 @@ def drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
     log = Log(output=rate, time=TIME, temperature=30.0 + 15.0 * np.abs(1.0 - TIME / 300.0),
               reference_rate=rate, reference_heading=integrate(TIME, rate),
               supply=5.0 + 0.2 * np.sin(TIME / 40.0),
-              specific_force=(np.where(TIME > 400.0, 2.0, 0.1)
-                              * np.random.default_rng(1).standard_normal(len(TIME))))
-    return replace(
-        log, output=simulate_gyro_output(model, TIME,
-                                         channels_from_log(log).with_rate(rate, rate)))
+              specific_force=(np.where(TIME > 400.0, 2.0,
+                                       0.1) * np.random.default_rng(1).standard_normal(len(TIME))))
+    return replace(log, output=simulate_gyro_output(model, TIME,
+                                                    channels_from_log(log).with_rate(rate, rate)))
 
 
 @pytest.mark.parametrize('size', [1, 700, 5000])
@@ -89,8 +85,7 @@ def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_block
     log = drive(model)
     turned = replace(log, reference_heading=1.5 + log.reference_heading)
     output = simulate_gyro_output(
-        model, TIME,
-        channels_from_log(turned).with_rate(log.reference_rate, log.reference_rate))
+        model, TIME, channels_from_log(turned).with_rate(log.reference_rate, log.reference_rate))
     lost = (TIME > 0.1) & (TIME < 0.2) | (TIME > 100.0) & (TIME < 400.1) | (TIME > 800.0)
     log = replace(turned, output=output,
                   reference_heading=np.where(lost, np.nan, turned.reference_heading))
@@ -104,10 +99,8 @@ def test_before_its_first_value_a_reference_heading_is_that_value():
     model = model_of(HEADING)
     log = drive(model, lambda time: 0.0 * time)
     heading = np.full(len(TIME), 1.5)
-    output = simulate_gyro_output(
-        model, TIME,
-        channels_from_log(replace(log, reference_heading=heading)).with_rate(
-            log.reference_rate, log.reference_rate))
+    output = simulate_gyro_output(model, TIME, channels_from_log(
+        replace(log, reference_heading=heading)).with_rate(log.reference_rate, log.reference_rate))
     late = replace(log, output=output, reference_heading=np.where(TIME < 5.0, np.nan, heading))
     assert compensate_log(model, late) == pytest.approx(log.reference_rate, abs=1e-10)
 
@@ -147,10 +140,10 @@ def test_the_verb_compensates_by_the_surroundings_of_a_log(tmp_path, run):
                         '--out', tmp_path / 'out.csv')
     done = read_log(tmp_path / 'out.csv')
     assert code == 0 and 'no reference heading' not in text
-    assert np.array(done.others['rate_rad_s'], float) == pytest.approx(
-        done.reference_rate, abs=1e-10)
-    assert np.array(done.others['heading_rad'], float) == pytest.approx(
-        done.reference_heading, abs=1e-7)
+    assert np.array(done.others['rate_rad_s'],
+                    float) == pytest.approx(done.reference_rate, abs=1e-10)
+    assert np.array(done.others['heading_rad'],
+                    float) == pytest.approx(done.reference_heading, abs=1e-7)
 
 
 def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(tmp_path, run):
@@ -162,8 +155,9 @@ def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(tmp_path, run):
     write_log(tmp_path / 'log.csv', replace(log, supply=None, reference_heading=None))
     code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
                         '--out', tmp_path / 'out.csv')
-    assert code == 0 and all(words in text for words in (
-        'no supply voltage', 'no reference heading', 'saturation: An output at the limit'))
+    assert code == 0 and all(words in text
+                             for words in ('no supply voltage', 'no reference heading',
+                                           'saturation: An output at the limit'))
 
 
 @pytest.mark.parametrize('name, value',
@@ -175,9 +169,8 @@ def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_t
     rate = np.sin(1.3 * time)
     log = Log(output=rate, time=time + 50.0, reference_rate=rate,
               reference_heading=(1.0 - np.cos(1.3 * time)) / 1.3)
-    log = replace(
-        log, output=simulate_gyro_output(model, time,
-                                         channels_from_log(log).with_rate(rate, rate)))
+    log = replace(log, output=simulate_gyro_output(model, time,
+                                                   channels_from_log(log).with_rate(rate, rate)))
     write_model(tmp_path / 'model.yaml', model)
     write_log(tmp_path / 'log.csv', log)
     code, *_ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',

@@ -81,8 +81,8 @@ def by_least_squares(start, parts, resting):
         transition, new = np.diag(step.retention), step.process_noise.copy()
         push = np.zeros(size)
         if rest:
-            measured.append((step.observation, part.angle, step.process_noise[HEADING_INDEX,
-                                                                              HEADING_INDEX]))
+            measured.append(
+                (step.observation, part.angle, step.process_noise[HEADING_INDEX, HEADING_INDEX]))
             new[HEADING_INDEX] = new[:, HEADING_INDEX] = 0.0
         else:
             measured.append(None)
@@ -104,8 +104,8 @@ def by_least_squares(start, parts, resting):
     for row, (k, (seen, _, _)) in zip(rows, known):
         row[k * size:(k + 1) * size] = seen
     left = np.array([turned for _, (_, turned, _) in known]) - rows @ mean.ravel()
-    gain = whole @ rows.T @ np.linalg.inv(
-        rows @ whole @ rows.T + np.diag([variance for _, (_, _, variance) in known]))
+    gain = whole @ rows.T @ np.linalg.inv(rows @ whole @ rows.T
+                                          + np.diag([variance for _, (_, _, variance) in known]))
     return ((mean.ravel() + gain @ left)[HEADING_INDEX::size],
             np.diagonal(whole - gain @ rows @ whole)[HEADING_INDEX::size])
 
@@ -120,11 +120,11 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
     mean, variance = by_least_squares(start, parts, resting)
     later = smooth_states(states, parts, resting)
     assert states[-1].mean[HEADING_INDEX] == pytest.approx(mean[-1], abs=1e-9)
-    assert (states[-1].covariance[HEADING_INDEX,
-                                  HEADING_INDEX] == pytest.approx(variance[-1], rel=1e-6))
+    assert (states[-1].covariance[HEADING_INDEX, HEADING_INDEX]
+            == pytest.approx(variance[-1], rel=1e-6))
     assert [state.mean[HEADING_INDEX] for state in later] == pytest.approx(mean, abs=1e-8)
-    assert [state.covariance[HEADING_INDEX, HEADING_INDEX] for state in later] == pytest.approx(
-        variance, rel=1e-4, abs=1e-12)
+    assert [state.covariance[HEADING_INDEX, HEADING_INDEX]
+            for state in later] == pytest.approx(variance, rel=1e-4, abs=1e-12)
 
 
 def test_one_long_turn_is_as_many_short_ones():
@@ -134,8 +134,8 @@ def test_one_long_turn_is_as_many_short_ones():
     for _ in range(30):
         by_parts, whole = by_parts.propagate(part), whole + part
     assert by_parts.mean == pytest.approx(start.propagate(whole).mean, abs=1e-12)
-    assert (by_parts.covariance == pytest.approx(
-        start.propagate(whole).covariance, rel=1e-6, abs=1e-18))
+    assert (by_parts.covariance == pytest.approx(start.propagate(whole).covariance, rel=1e-6,
+                                                 abs=1e-18))
 
 
 def test_the_variance_after_a_calibration_is_that_of_the_noise():
@@ -210,8 +210,8 @@ def test_a_slow_turn_that_lasts_is_followed(slow, wheels):
         time, true, heading, rate = gyro(motion, np.random.default_rng(seed))
         found = follow(time, rate, wheels=None if wheels is None else list(true > 0.0))
         errors.append((found.heading[-1] - heading[-1]) / math.sqrt(found.variance[-1]))
-        assert np.abs(np.diff(found.heading)).max() < 10.0 * DEGREE * INTERVAL, (
-            'the heading jumped')
+        assert np.abs(
+            np.diff(found.heading)).max() < 10.0 * DEGREE * INTERVAL, ('the heading jumped')
     assert np.abs(errors).max() < 4.0, errors
 
 
@@ -290,8 +290,7 @@ def test_a_gap_and_a_jump_of_the_clock_leave_the_heading_where_it_was():
 
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
-def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(
-        noise, later):
+def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, later):
     tracker, generator, still = (HeadingTracker(noise, KNOWN, Settings(), 3600.0),
                                  np.random.default_rng(11), np.array([0.0, -1.0]))
     headings, variances = [], []
@@ -422,11 +421,12 @@ def test_errors_are_as_large_as_stated_and_hindsight_and_rests_help(drives):
         generator = np.random.default_rng(seed)
         time, _, heading, rate = gyro(random_drive(generator, 300.0), generator)
         live, later = follow(time, rate), follow(time, rate, hindsight=True)
-        squares.append([np.mean((each.heading - heading)[1000::500] ** 2
-                                / each.variance[1000::500]) for each in (live, later)])
+        squares.append(
+            [np.mean((each.heading - heading)[1000::500] ** 2 / each.variance[1000::500])
+             for each in (live, later)])
         sizes.append([np.abs(each - heading).mean()
                       for each in (integrate(time, rate), live.heading, later.heading)])
-    assert np.mean(squares, axis=0) == pytest.approx(np.ones(2),
-                                                     abs=4.0 * math.sqrt(2.0 / drives) / 2.0)
+    assert np.mean(squares,
+                   axis=0) == pytest.approx(np.ones(2), abs=4.0 * math.sqrt(2.0 / drives) / 2.0)
     pure, live, later = np.mean(sizes, axis=0)
     assert later < live < 0.9 * pure, (pure, live, later)
