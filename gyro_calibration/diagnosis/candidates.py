@@ -157,8 +157,8 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
         yield effect_candidate('warm_up', time_constant)
     for run, each in enumerate(replays):
-        begin, spacing = (float(each.channels.time[each.valid][0]),
-                          step_time_spacing(each, len(replays)))
+        begin = float(each.channels.time[each.valid][0])
+        spacing = step_time_spacing(each, len(replays))
         for number in range(1, _step_times_per_log(len(replays)) + 1):
             yield effect_candidate('bias_step', begin + number * spacing, log_index=run)
     if 'temperature' in has:
@@ -364,7 +364,7 @@ def _rotation_terms(variables: Mapping[str, Variable]) -> Iterator[Candidate]:
 
 def _harmonic_columns(number: int, factor_variable: Variable | None) -> ColumnFunction:
     def columns(each: Replay) -> Sequence[Array]:
-        phase, factor = (number * each.channels.heading,
-                         1.0 if factor_variable is None else factor_variable(each))
+        phase = number * each.channels.heading
+        factor = 1.0 if factor_variable is None else factor_variable(each)
         return factor * np.sin(phase), factor * np.cos(phase)
     return columns

@@ -360,8 +360,8 @@ def _combined_covariance(model: GyroModel, fit: Calibration,
         return None
     known = np.zeros((0, 0)) if model.covariance is None else model.covariance
     both, places = block_diag(known, found), []
-    of_model, of_fit = (_covariance_indices(model.terms, 0),
-                        _covariance_indices(fit.terms, len(known)))
+    of_model = _covariance_indices(model.terms, 0)
+    of_fit = _covariance_indices(fit.terms, len(known))
     for term in terms:
         places += of_fit.get(term.effect.name, []) or of_model[term.effect.name]
     return both[np.ix_(places, places)]
@@ -388,8 +388,8 @@ _MAX_CURVE_COLUMNS = 9
 _MIN_DWELLS_PER_COLUMN = 4
 #: Least part of the columns of a curve that is independent of the model.
 _MIN_INDEPENDENT_SHARE = 1e-3
-RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = ('rate', 'temperature', 'rate_times_temperature',
-                                            'order_of_dwells', 'sweep')
+RATE, TEMPERATURE, PRODUCT = 'rate', 'temperature', 'rate_times_temperature'
+ORDER, SWEEP = 'order_of_dwells', 'sweep'
 SINGLE_RATES = 'single_rates'
 #: Least number of sweeps that repeat a rate for a column of that rate.
 _MIN_REPEATING_SWEEPS = 4
@@ -481,8 +481,8 @@ def _structure_curves(dwells: Dwells) -> Mapping[str, Array]:
         SWEEP: _sweep_columns(dwells)}
     if (dwells.temperature is not None and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD):
         probes[TEMPERATURE] = _spline_columns(dwells.temperature, slow)
-        rate, temperature = (_scale_to_unit_range(dwells.rate),
-                             _scale_to_unit_range(dwells.temperature))
+        rate = _scale_to_unit_range(dwells.rate)
+        temperature = _scale_to_unit_range(dwells.temperature)
         probes[PRODUCT] = np.column_stack([rate ** i * temperature ** j
                                            for i in (1, 2, 3) for j in range(1, min(slow, 2) + 1)]
                                           or [np.zeros((len(dwells), 0))])

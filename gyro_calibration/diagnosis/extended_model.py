@@ -61,8 +61,8 @@ def extend_model(model: GyroModel | None, fit: FittedValues, quality: Sequence[D
     bias_deviation : standard deviation of the bias, rad/s
 
     """
-    given, names = (model or GyroModel(),
-                    {name for each in findings for name in (each.effect, *each.ambiguous_with)})
+    given = model or GyroModel()
+    names = {name for each in findings for name in (each.effect, *each.ambiguous_with)}
     fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
               or any(each.candidate.cause in CATALOGUE and fit.is_included(place)
                      for place, each in enumerate(fit.causes)))
@@ -238,9 +238,8 @@ def _align_reference(old: Term, new: Term) -> list[Term]:
     if new.effect.name not in _COMPENSATING_EFFECTS or new.values[0] == old.values[0]:
         return [new]
     begin, value = old.values[0], new.values[1]
-    offset, compensating_effect, aligned = (begin - new.values[0],
-                                            _COMPENSATING_EFFECTS[new.effect.name],
-                                            Term(new.effect, (begin, value)))
+    offset, compensating_effect = begin - new.values[0], _COMPENSATING_EFFECTS[new.effect.name]
+    aligned = Term(new.effect, (begin, value))
     if new.effect is BIAS_TEMPERATURE_QUADRATIC:
         return [aligned, Term(compensating_effect, (begin, 2.0 * offset * value)),
                 Term(BIAS, (offset ** 2 * value, ))]
@@ -286,8 +285,8 @@ def _extended_covariance(model: GyroModel, new: Sequence[Term],
     """
     if model.terms and model.covariance is None:
         return None
-    values, deviations = (_fitted_values(_merge_terms(model.terms, new)),
-                          np.sqrt(np.diag(term_covariance)))
+    values = _fitted_values(_merge_terms(model.terms, new))
+    deviations = np.sqrt(np.diag(term_covariance))
     changes = np.zeros((len(values), len(term_covariance)))
     for place in np.flatnonzero(deviations).tolist():
         changes[:, place] = (_fitted_values(

@@ -241,8 +241,8 @@ def _refuse_copy(log: Log, output: Array) -> None:
         if np.count_nonzero(known) < MIN_TABLE_ROWS or not np.ptp(rate[known]) > 0.0:
             continue
         slope, offset = np.polyfit(rate[known], output[known], 1)
-        off, spread = (float(np.std(output[known] - slope * rate[known] - offset)),
-                       float(np.std(output[known])))
+        off = float(np.std(output[known] - slope * rate[known] - offset))
+        spread = float(np.std(output[known]))
         printed = math.hypot(find_codes(output[known]).step, slope * find_codes(rate[known]).step)
         if (off < _COPY_RESIDUAL_SHARE * spread
                 or off < 0.5 * printed < _MAX_PRINT_STEP_SHARE * spread):
@@ -463,8 +463,8 @@ def compare_headings(log: Log) -> Agreement | None:
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 2 * _MIN_SPANS or np.isfinite(log.output).sum() < 2 * _MIN_SPANS:
         return None
-    reference, turned = (reference_angle(log),
-                         integrate_trapezoidal(log.time, bridge_gaps(log.output)))
+    reference = reference_angle(log)
+    turned = integrate_trapezoidal(log.time, bridge_gaps(log.output))
     span = max((log.time[-1] - log.time[0]) / _SPAN_COUNT,
                4.0 * float(np.median(np.diff(log.time))))
     number = np.floor((log.time[known] - log.time[0]) / span)

@@ -201,8 +201,8 @@ def _candidate_evidence(by_noise: NoiseLikelihood, marginalization: Marginalized
                         candidate_index: int, group: list[int]) -> Array:
     if marginalization.unidentifiable[candidate_index]:
         return np.full(len(by_noise.residual_squares), -np.inf)
-    information, scores = (marginalization.conditional_information[candidate_index],
-                           by_noise.candidate_scores[:, :, group])
+    information = marginalization.conditional_information[candidate_index]
+    scores = by_noise.candidate_scores[:, :, group]
     information = information + 1e-10 * np.eye(len(group)) * _diagonal(information)[:, None]
     if len(group) == 1:
         return _average_over_noises(by_noise, scores[..., 0] ** 2 / information[:, 0, 0],

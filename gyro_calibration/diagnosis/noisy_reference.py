@@ -90,10 +90,8 @@ _MAX_GYRO_LAG = 0.1
 _CURVE_BINS = 20
 #: Shares of the false-alarm rate: for the search for causes, for a delay, and, with a model, for
 #: bias and scale factor error. A delay between two clocks is usual and has a separate level.
-_SEARCH_ALARM_SHARE, _VALUE_ALARM_SHARES = (0.6, {
-    'bias': 0.05,
-    'scale_factor_error': 0.05,
-    'time_offset': 0.1})
+_SEARCH_ALARM_SHARE = 0.6
+_VALUE_ALARM_SHARES = {'bias': 0.05, 'scale_factor_error': 0.05, 'time_offset': 0.1}
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -260,8 +258,8 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
     fit = (extended if found_cause.is_established
            else fit_spans(extended.spans, [*extended.causes, found_cause.cause_term]))
-    name, known, places = (found_cause.cause_term.cause, CAUSES[found_cause.cause_term.cause],
-                           fit.value_slice(found_cause.cause_term))
+    name, known = found_cause.cause_term.cause, CAUSES[found_cause.cause_term.cause]
+    places = fit.value_slice(found_cause.cause_term)
     values = fit.values[places]
     half = np.array([fit.half_width(place) for place in range(places.start, places.stop)])
     effect = CATALOGUE.get(name)

@@ -265,15 +265,15 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     # without causes that the model has already and that cannot be merged with those
     inside = FittedValues(fit_causes(search.problem, [each for each in named if each not in out])
                           if out else found.fit, found.replays, lasting_only=True)
-    plain, deviation = (FittedValues(fit_causes(search.problem, []), found.replays),
-                        _mean_bias_deviation(inside, noise))
+    plain = FittedValues(fit_causes(search.problem, []), found.replays)
+    deviation = _mean_bias_deviation(inside, noise)
     before = model or add_origin_notes(replace(add_causes(GyroModel(), plain, deviation),
                                                noise=noise), GyroModel(), quality)
     after = extend_model(model, inside, quality, findings, noise, deviation) if offered else before
     # Curves before the extension contain the best bias and scale factor error, unless these differ
     # significantly from those of the model.
-    left, shown = (model_residuals(found.replays) if changed else unbiased_residuals(plain),
-                   inside if offered else plain)
+    left = model_residuals(found.replays) if changed else unbiased_residuals(plain)
+    shown = inside if offered else plain
     of_heading = heading_error_shares(
         [found.heading_contributions(run, plain if model is None else None)
          for run in range(len(replays))],
@@ -524,8 +524,8 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: FittedVa
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     for name, why in refuted.items():
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
-    scale, own = (fit.scale_factor_error,
-                  {term.effect.name for term in ([] if model is None else model.terms)})
+    scale = fit.scale_factor_error
+    own = {term.effect.name for term in ([] if model is None else model.terms)}
     if is_scale_implausible(fit):
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
                f'{100.0 * scale.deviation:.1g} % is not added to the model: the motion is too '
@@ -636,8 +636,8 @@ def unexplained_structures(search: Search, fit: FittedValues,
         name = (CAUSES[known.candidate.cause].along if is_named(known.candidate)
                 else unnamed_variable(known.candidate))
         variables.setdefault(name, []).append(len(fit.causes) + place)
-    least, most = (_residual_variance(search, fit, causes),
-                   _residual_variance(search, fit, fit.causes))
+    least = _residual_variance(search, fit, causes)
+    most = _residual_variance(search, fit, fit.causes)
     structures = []
     for name, places in variables.items():
         without = _residual_variance(

@@ -290,8 +290,8 @@ def _term_with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[
 
 def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
     """Return the minimum detectable size of an effect, in the unit of its first value."""
-    change, level = (named.change_effect(effect),
-                     naming_level(named.false_alarm_rate, effect in NUISANCE_EFFECTS))
+    change = named.change_effect(effect)
+    level = naming_level(named.false_alarm_rate, effect in NUISANCE_EFFECTS)
     if effect in NUISANCE_EFFECTS:
         return _detectable_size(named.fit, effect, level)
     if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):

@@ -141,8 +141,8 @@ def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
     # The mean variance of a band is computed from some of its coefficients.
     few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int))
            for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
-    angle, step = (np.concatenate([part for part, _ in parts]),
-                   np.concatenate([np.full(len(part), step) for part, step in parts]))
+    angle = np.concatenate([part for part, _ in parts])
+    step = np.concatenate([np.full(len(part), step) for part, step in parts])
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
     relative = np.array([np.add.reduceat(
         shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen], first_of)
@@ -194,8 +194,8 @@ class RegressionFit:
         `evidence`.
 
         """
-        by_noise, best = (self.noise_likelihood,
-                          int(self.noise_likelihood.log_likelihood[0].argmax()))
+        by_noise = self.noise_likelihood
+        best = int(self.noise_likelihood.log_likelihood[0].argmax())
         _, logarithm = np.linalg.slogdet(self.marginalized.nuisance_information[best])
         return float(log_sum_exp(by_noise.log_likelihood)[0] + 0.5 * (
             logarithm - len(self.columns) * np.log(by_noise.residual_squares[0, best])))

@@ -530,9 +530,8 @@ def _interpolate_updates(time: Array, values: Array, step: float) -> Array:
     usual = float(np.median(np.diff(update_times)))
     held_updates = 1 + np.flatnonzero((np.diff(update_times) > _STANDSTILL_FACTOR * usual) & (
         np.abs(np.diff(update_values)) > _STANDSTILL_FACTOR * step))
-    update_times, update_values = (
-        np.insert(update_times, held_updates, update_times[held_updates] - usual),
-        np.insert(update_values, held_updates, update_values[held_updates - 1]))
+    update_times = np.insert(update_times, held_updates, update_times[held_updates] - usual)
+    update_values = np.insert(update_values, held_updates, update_values[held_updates - 1])
     return np.where(known, np.interp(time, update_times, update_values), np.nan)
 
 

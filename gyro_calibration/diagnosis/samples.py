@@ -277,8 +277,8 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
     width = local_code_steps(codes, comparison.output[:-1])
     chance, run_chance = _repeat_chances(change, expected, width, known)
     if band is not None:  # a sample in it repeats while the next is due in it
-        within, chances = (band.contains(comparison.output[:-1]),
-                           band.membership_chance(comparison)[1:])
+        within = band.contains(comparison.output[:-1])
+        chances = band.membership_chance(comparison)[1:]
         chance, run_chance = (np.where(within, np.maximum(each, chances), each)
                               for each in (chance, run_chance))
         width = np.where(within, 2.0 * band.half_width, width)
@@ -441,8 +441,8 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
     tested = valid & (np.count_nonzero(_neighbour_samples(~valid, NEIGHBOURS_PER_SIDE),
                                        axis=1) < NEIGHBOURS_PER_SIDE)
     outlying = _drop_long_runs((sigmas > limit) & tested)
-    count, near = (int(np.count_nonzero(outlying)), int(
-        np.count_nonzero((sigmas > _NEAR_OUTLIER_SIGMAS) & (sigmas <= limit) & tested)))
+    count = int(np.count_nonzero(outlying))
+    near = int(np.count_nonzero((sigmas > _NEAR_OUTLIER_SIGMAS) & (sigmas <= limit) & tested))
     if (not count or near > 0.5 * count + stats.poisson.isf(
             0.01, 2.0 * len(output) * stats.norm.sf(_NEAR_OUTLIER_SIGMAS))
             or _is_due_to_motion(outlying, expected_change, comparison)):

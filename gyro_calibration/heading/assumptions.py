@@ -124,16 +124,16 @@ class TemperatureCorrection:
         coefficient : standard deviation in which distances are counted, rad/s/K; above 0
 
         """
-        self._table, self.start_temperature, self._now, self._coefficient = (
-            deepcopy(table), begin, now, coefficient)
+        self._table, self.start_temperature, self._now = deepcopy(table), begin, now
+        self._coefficient = coefficient
         self._known_steps: dict[int, tuple[float, float]] = {0: (0.0, 0.0)}
 
     def change_at(self, temperature: float) -> tuple[float, float]:
         """Return the change of the bias, rad/s, and the signed distance, K of the coefficient."""
         steps = (temperature - self.start_temperature) / _TEMPERATURE_STEP
         below = math.floor(steps)
-        (first, near), (last, far), part = (self._change_at_step(below),
-                                            self._change_at_step(below + 1), steps - below)
+        (first, near), (last, far) = self._change_at_step(below), self._change_at_step(below + 1)
+        part = steps - below
         return first + part * (last - first), near + part * (far - near)
 
     def changes_at(self, temperature: Array) -> tuple[Array, Array]:

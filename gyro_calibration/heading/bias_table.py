@@ -426,8 +426,8 @@ class BiasTable:
 
     def mark_written(self, now: float) -> None:
         """Record that the table was written."""
-        self._written_entries, self._write_time, self._dates_changed = (
-            tuple(self.entries), now, False)
+        self._written_entries, self._write_time = tuple(self.entries), now
+        self._dates_changed = False
 
     def mark_write_failed(self, now: float) -> None:
         """Record that it could not be written; it is tried again later, and at the end."""

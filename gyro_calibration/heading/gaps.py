@@ -101,8 +101,8 @@ class Intervals:
         """Begin with nothing known."""
         self.usual_interval, self.lost_samples, self.longest_gap = math.inf, 0, 0.0
         self._history: deque[float] = deque(maxlen=_MAX_INTERVALS)
-        self._until_update, self._gap_limit, self._even_interval, self._late_samples = (
-            _MIN_INTERVALS, math.inf, math.inf, 0)
+        self._until_update, self._gap_limit = _MIN_INTERVALS, math.inf
+        self._even_interval, self._late_samples = math.inf, 0
 
     def add(self, interval: float) -> int:
         """Take the next interval, s; return how many samples are lost in it."""
@@ -241,8 +241,8 @@ class GapModel:
         self._lost_duration = self._last_step = 0.0
 
     def _begin_block(self) -> None:
-        self._duration, self._count, self._total, self._steps, self._squares, self._products = (
-            0.0, 0, 0.0, 0, 0.0, 0.0)
+        self._duration, self._count, self._total, self._steps, self._squares = 0.0, 0, 0.0, 0, 0.0
+        self._products = 0.0
 
     def add(self, interval: float, rate: float, rate_before: float,
             lost: int | None = None) -> Gap | None:
@@ -319,8 +319,8 @@ class GapModel:
         self._begin_block()
 
     def _make_gap(self, lost: int, interval: float, step: float) -> Gap:
-        usual, step, interval = (self.intervals.usual_interval, min(abs(step), MAX_RATE),
-                                 min(interval, MAX_GAP))
+        usual, step = self.intervals.usual_interval, min(abs(step), MAX_RATE)
+        interval = min(interval, MAX_GAP)
         surplus = min(lost * usual, interval)
         ends = self.noise.angle_random_walk ** 2 / usual
         noise = ends * (surplus * (0.5 * surplus + usual) + 0.5 * self._lost_duration * surplus)

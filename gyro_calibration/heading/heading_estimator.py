@@ -136,14 +136,14 @@ class HeadingEstimator:
         keep : the steps of the tracker, for `log_compensation.smooth_track`
 
         """
-        self._assumptions, self._settings, self._temperature_timeout, self._keeps_steps = (
-            assumptions, settings, temperature_timeout, keep)
+        self._assumptions, self._settings = assumptions, settings
+        self._temperature_timeout, self._keeps_steps = temperature_timeout, keep
         self.temperature: float | None = None
         self._temperature_time, self._follows_temperature = -math.inf, False
         self._calibrated_this_run = self._age_changed = False
         self.rate = self.corrected_rate = 0.0
-        self.last_compensated, self.restart_count = (
-            CompensatedSamples(0.0, 0.0, 0.0, False, False), 0)
+        self.last_compensated = CompensatedSamples(0.0, 0.0, 0.0, False, False)
+        self.restart_count = 0
         self._time, self._elapsed, self._heading_before_resets = -math.inf, 0.0, 0.0
         self._refused_count, self.refused_temperature_count = 0, 0
         self._stretch: _RestStretch | None = None
@@ -375,9 +375,8 @@ class HeadingEstimator:
             self._refused_count += 1
             return ''
         last, self._time = self._time, time
-        known_again, goes_on = (
-            not self._follows_temperature and self._known_temperature is not None,
-            self._calibrated_this_run and last > -math.inf)
+        known_again = not self._follows_temperature and self._known_temperature is not None
+        goes_on = self._calibrated_this_run and last > -math.inf
         if self._age_changed or known_again and not goes_on:
             self._restart(now)
         around = (self._follow_channels(time - last, force, supply)
@@ -553,8 +552,8 @@ class HeadingEstimator:
         found[:, :5] = tracker.follow(time, rate,
                                       self._motion_sensitivities(time, output, result, distance),
                                       wheels, still, still)
-        found[:, 5], found[:, 6], found[:, 7] = (rate, result.temperature_clipped,
-                                                 result.beyond_range)
+        found[:, 5], found[:, 6] = rate, result.temperature_clipped
+        found[:, 7] = result.beyond_range
         self.last_compensated = CompensatedSamples(
             *(float(np.asarray(values)[-1]) if np.ndim(values) else values
               for values in vars(result).values()))

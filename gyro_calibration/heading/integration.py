@@ -111,8 +111,8 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     end = np.arange(1, len(rate) + 1)
     begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
     # each window is summed by itself: one large value would ruin a running sum from there on
-    bounded, count, windows = (np.clip(rate, -MAX_RATE, MAX_RATE), end - begin,
-                               np.stack([begin, end], axis=1).ravel())
+    bounded, count = np.clip(rate, -MAX_RATE, MAX_RATE), end - begin
+    windows = np.stack([begin, end], axis=1).ravel()
     sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2]
                      for values in (bounded, bounded * bounded))
     mean = sums / count
@@ -186,16 +186,16 @@ class BlockIntegrator:
 
     def _filter_block(self, time: Array, rate: Array) -> Array:
         carried = len(self._window_samples[0])
-        time, rate = (np.concatenate([self._window_samples[0], time]),
-                      np.concatenate([self._window_samples[1], rate]))
+        time = np.concatenate([self._window_samples[0], time])
+        rate = np.concatenate([self._window_samples[1], rate])
         begin = np.searchsorted(time, time[-1] - self._settings.window, side='right')
         self._window_samples = time[begin:], rate[begin:]
         return filter_rates(self._settings, time, rate)[carried:]
 
     def _integrate_rows(self, time: Array, rows: Array) -> Array:
         carried = len(self._last_sample[0])
-        time, rows = (np.concatenate([self._last_sample[0], time]),
-                      np.hstack([self._last_sample[1], rows]))
+        time = np.concatenate([self._last_sample[0], time])
+        rows = np.hstack([self._last_sample[1], rows])
         grown = np.array(
             [integrate(time, row, begin) for row, begin in zip(rows, self._integrals)])
         self._last_sample, self._integrals = (time[-1:], rows[:, -1:]), grown[:, -1]

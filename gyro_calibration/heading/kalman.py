@@ -213,8 +213,8 @@ class HeadingState:
 
     def rate_error(self, sensitivity: Array) -> tuple[float, float]:
         """Return the error of the compensated rate, rad/s, and its variance; sensitivity (m,)."""
-        (offset, variance), (values, covariance, shared) = (
-            self.wander_rate, self.calibration_errors)
+        offset, variance = self.wander_rate
+        values, covariance, shared = self.calibration_errors
         return (offset - float(sensitivity @ values),
                 variance + float(sensitivity @ (covariance @ sensitivity - 2.0 * shared)))
 
@@ -360,8 +360,8 @@ def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: 
     if is_resting:
         after = state.update_at_rest(rate_integral).propagate_at_rest(rate_integral)
         expected, variance = state.expected_rest_angle(rate_integral)
-        gain_direction, variance = (state.covariance @ step.observation,
-                                    variance + rate_integral.wander_variance)
+        gain_direction = state.covariance @ step.observation
+        variance += rate_integral.wander_variance
         start = replace(
             state, mean=state.mean + gain_direction / variance * (rate_integral.angle - expected),
             covariance=state.covariance - np.outer(gain_direction, gain_direction) / variance)

@@ -108,8 +108,8 @@ class LogCompensation:
         if not len(known):
             return np.zeros(len(time), bool)
         rows, earlier = np.arange(len(time)), self._has_had_reference
-        before, after = (np.searchsorted(known, rows, 'right') - 1,
-                         np.searchsorted(known, rows, 'left'))
+        before = np.searchsorted(known, rows, 'right') - 1
+        after = np.searchsorted(known, rows, 'left')
         self._has_had_reference, inside = True, (before >= 0) & (after < len(known))
         lost = time[known[np.minimum(after, len(known) - 1)]] - time[known[np.maximum(before, 0)]]
         return (inside & (lost <= _MAX_INTERPOLATED_GAP)) | ((before < 0) & (not earlier))

@@ -374,11 +374,11 @@ class EvenSamples:
     def __init__(self, given: Samples, where: slice, last: tuple[float, float, float, Array],
                  begun: float, rested: bool, found: Array):
         """Begin after the last sample, with an elapsed duration of the first block, s."""
-        self._given, self._first, self.last_at_rest, self.results = (
-            given, where.start, rested, found)
+        self._given, self._first, self.last_at_rest = given, where.start, rested
+        self.results = found
         self.time, self.rate = given.time[where], given.rate[where]
-        self.motion_sensitivity, self.rest_sensitivity = (
-            given.motion_sensitivity[where], given.rest_sensitivity[where])
+        self.motion_sensitivity = given.motion_sensitivity[where]
+        self.rest_sensitivity = given.rest_sensitivity[where]
         count = len(self.time)
         self.intervals = np.diff(self.time, prepend=last[0])
         self.half_intervals, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
@@ -447,16 +447,16 @@ class EvenSamples:
 
     def fill_results(self, usual_intervals: Array) -> None:
         """Compute the results of the epochs; `usual_intervals` has a row for each sample."""
-        found, interval = self.results, np.clip(np.minimum(self.intervals, usual_intervals),
-                                                MIN_SAMPLE_INTERVAL, None)
+        found = self.results
+        interval = np.clip(np.minimum(self.intervals, usual_intervals), MIN_SAMPLE_INTERVAL, None)
         moving = list[Epoch]()
         for epoch in self.epochs:
             here = slice(max(epoch.start_index, 0), epoch.end_index)
             if here.stop <= here.start:
                 continue
             drift, rows = epoch.state, self.used_sensitivity[1:][here]
-            (offset, variance), (values, covariance, shared) = (
-                drift.wander_rate, drift.calibration_errors)
+            offset, variance = drift.wander_rate
+            values, covariance, shared = drift.calibration_errors
             found[here, 3] = (variance + ((rows @ covariance - 2.0 * shared) * rows).sum(axis=1)
                               + drift.noise.angle_random_walk ** 2
                               / (WINDOW_DURATION if epoch.is_resting else interval[here]))
@@ -468,8 +468,8 @@ class EvenSamples:
                 continue
             moving.append(epoch)
             found[here, 2] = self.rate[here] + rows @ values - offset
-            pending, turned = (np.empty(epoch.end_index - epoch.start_index),
-                               np.empty(epoch.end_index - epoch.start_index))
+            pending = np.empty(epoch.end_index - epoch.start_index)
+            turned = np.empty(epoch.end_index - epoch.start_index)
             inside = slice(epoch.start_index + 1, epoch.end_index)
             pending[0], pending[1:] = epoch.pending, self._pending_retention[inside]
             np.cumprod(pending, out=pending)

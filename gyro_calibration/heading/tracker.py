@@ -154,11 +154,11 @@ class HeadingTracker:
         """
         self._sensitivity_slope = sensitivity_slope
         self.heading = self.rate = self.deleted_heading = 0.0
-        self.is_resting, self.steps, self._keeps_steps, self._interval = (
-            False, list[TrackStep](), keeps_steps, math.inf)
+        self.is_resting, self.steps, self._keeps_steps = False, list[TrackStep](), keeps_steps
+        self._interval = math.inf
         self.recalibrations = list[tuple[int, HeadingState]]()
-        self._quiet_duration, self._held_integral, self._pending_correction = (
-            WINDOW_DURATION, RateIntegral(0.0, 0.0, np.zeros(0)), 0.0)
+        self._quiet_duration = WINDOW_DURATION
+        self._held_integral, self._pending_correction = RateIntegral(0.0, 0.0, np.zeros(0)), 0.0
         self._rest_blocks, self._wheels_stand = deque[RateIntegral](maxlen=_MAX_REST_BLOCKS), False
         self._open_variance: float | None = None
         self._suspected_turn: SlowTurn | None = None
@@ -174,8 +174,8 @@ class HeadingTracker:
         self._bias_sensitivity: Array | None = None
         self._cached_rate_error, self._cached_bias = 0.0, (0.0, 0.0)
         self._still_sensitivity: Array | None = None
-        self._gaps, self._energy, self._detector_settings = GapModel(
-            noise), EnergyDetector(noise, settings.false_alarms), (noise, settings.false_alarms)
+        self._gaps, self._energy = GapModel(noise), EnergyDetector(noise, settings.false_alarms)
+        self._detector_settings = (noise, settings.false_alarms)
         self.intervals = self._gaps.intervals
         self._initialize_state(noise, covariance, 0.0, 0.0, age)
         self.configure(settings)
@@ -221,8 +221,8 @@ class HeadingTracker:
         of the heading by it remain.
 
         """
-        heading, variance = (self.heading + self._pending_correction,
-                             self.variance - self._pending_correction ** 2)
+        heading = self.heading + self._pending_correction
+        variance = self.variance - self._pending_correction ** 2
         if self._keeps_steps and self._last_sample is not None:
             drift, turn = self._state, self._open_integral + self._block_integral
             self._propagate_state(
@@ -456,8 +456,8 @@ class HeadingTracker:
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
-        begin, end, moved = (piece.block_starts[number], piece.block_stops[number],
-                             piece.wheels_in_block(number))
+        begin, end = piece.block_starts[number], piece.block_stops[number]
+        moved = piece.wheels_in_block(number)
         driven = True in moved
         if self.is_resting:
             highest, lowest = piece.corrected_extremes(
@@ -503,14 +503,14 @@ class HeadingTracker:
     def _integrate(self, interval: float, last: tuple[float, float, float, Array]) -> None:
         """Integrate the heading up to the last sample."""
         assert self._last_sample is not None
-        (_, rate, filtered, sensitivity), (_, last_rate, last_filtered, last_sensitivity) = (
-            self._last_sample, last)
+        _, rate, filtered, sensitivity = self._last_sample
+        _, last_rate, last_filtered, last_sensitivity = last
         half = 0.5 * interval
         kept, last_kept = half * (filtered == rate), half * (last_filtered == last_rate)
         duration, turned = kept + last_kept, half * (filtered + last_filtered)
         if sensitivity is last_sensitivity:
-            seen, corrected = (duration * sensitivity,
-                               turned - duration * self._rate_error(sensitivity))
+            seen = duration * sensitivity
+            corrected = turned - duration * self._rate_error(sensitivity)
         else:
             seen = kept * sensitivity + last_kept * last_sensitivity
             corrected = (turned - duration * self._wander_rate
@@ -550,8 +550,8 @@ class HeadingTracker:
 
     def _decide_rest(self, quiet: bool | None, wheels: bool | None) -> None:
         """Decide on rest or motion at the end of a block."""
-        part, self._block_integral, self._open_variance = (
-            self._block_integral, self._new_integral(), None)
+        part, self._block_integral = self._block_integral, self._new_integral()
+        self._open_variance = None
         self._open_integral += part
         if self.is_resting:
             self._rest_blocks.append(part)
@@ -691,8 +691,8 @@ class HeadingTracker:
 
     def _enter_rest(self) -> None:
         """Begin a rest."""
-        self.is_resting, self._rest_integral, self._recognition_left = (
-            True, self._zero_integral, 0.0)
+        self.is_resting, self._rest_integral = True, self._zero_integral
+        self._recognition_left = 0.0
         self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
@@ -700,8 +700,8 @@ class HeadingTracker:
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
-        self.is_resting, self._quiet_duration, self._recent_blocks, self._held_integral = (
-            False, quiet_duration, deque[RateIntegral](), self._zero_integral)
+        self.is_resting, self._quiet_duration = False, quiet_duration
+        self._recent_blocks, self._held_integral = deque[RateIntegral](), self._zero_integral
 
     def _search_rest_again(self) -> None:
         """Restart the detection of rest; a rest may continue."""
@@ -725,8 +725,8 @@ class HeadingTracker:
                                 if lag >= MEAN_LAGS[0] and not scattered else None)
         if self._snapshots[-1].innovation_count and not self._wheels_stand:
             self._rest_scatter.learn(self._snapshots[-1])
-        self._state, self.deleted_heading, self._open_integral = (
-            snapshot.state, snapshot.deleted_heading, turn)
+        self._state, self.deleted_heading = snapshot.state, snapshot.deleted_heading
+        self._open_integral = turn
         del self.steps[snapshot.step_count:]
         self._enter_motion(max(lag, WINDOW_DURATION))
         self._advance_state()
@@ -759,8 +759,8 @@ class HeadingTracker:
         while self._snapshots[-1] is not snapshot:
             self._snapshots.pop()
         del self.steps[snapshot.step_count:]
-        self._state, self._rest_integral = (snapshot.state,
-                                            snapshot.rate_integral + self._zero_integral)
+        self._state = snapshot.state
+        self._rest_integral = snapshot.rate_integral + self._zero_integral
         self.deleted_heading = (snapshot.deleted_heading + quiet.angle
                                 - snapshot.state.expected_rest_angle(quiet)[0]
                                 + self._corrected_angle(self._block_integral))
@@ -895,8 +895,8 @@ class HeadingTracker:
         self._recognition_left, self._still_sensitivity, self._suspected_turn = 0.0, None, None
         if self._last_sample is not None:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
-        self._energy, self._block, self._wheels_moved = (
-            EnergyDetector(*self._detector_settings), Block(), False)
+        self._energy, self._block = EnergyDetector(*self._detector_settings), Block()
+        self._wheels_moved = False
         intervals, self._gaps = self.intervals, GapModel(self._model_noise)
         self.intervals = self._gaps.intervals = intervals
         self._filter.clear()

@@ -141,8 +141,8 @@ def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, 
 
 
 def test_a_second_tone_is_not_reported_as_in_the_model():
-    slow, fast = term('interference_tone', 1.7, 1e-3,
-                      0.0), term('interference_tone', 3.1, 1e-3, 0.0)
+    slow = term('interference_tone', 1.7, 1e-3, 0.0)
+    fast = term('interference_tone', 3.1, 1e-3, 0.0)
     model = replace(MODEL, terms=(*LINEAR, slow), covariance=None)
     log = drive(slow, fast)
     found = diagnosed(log, model)

@@ -112,8 +112,8 @@ def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
     for (name, size, instead), cause in zip(written, causes):
         assert agree(size, shown(cause)), (name, size, shown(cause))
         assert re.findall(r'`(\w+)`', instead) == cause['ambiguous_with']
-    left, parts = {each['along']: 100.0 * each['share_of_variance']
-                   for each in found['unexplained']}, dict(LEFT.get(recording, []))
+    left = {each['along']: 100.0 * each['share_of_variance'] for each in found['unexplained']}
+    parts = dict(LEFT.get(recording, []))
     assert set(left) == set(parts)
     for along, part in parts.items():
         (size,), _ = numbers(part)

@@ -43,8 +43,8 @@ def drive(seed, duration=240.0, hidden=lambda time, rate, heading, temperature: 
     rate, begin = np.zeros(len(time)), 0.0
     while begin < duration:
         begin += generator.exponential(4.0)
-        length, size = (generator.uniform(1.5, 5.0),
-                        generator.choice([-1.0, 1.0]) * generator.uniform(0.1, 0.9))
+        length = generator.uniform(1.5, 5.0)
+        size = generator.choice([-1.0, 1.0]) * generator.uniform(0.1, 0.9)
         turns = (time >= begin) & (time < begin + length)
         rate[turns] += size * np.sin(np.pi * (time[turns] - begin) / length) ** 2
         begin += length

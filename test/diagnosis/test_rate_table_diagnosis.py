@@ -258,8 +258,8 @@ def test_outlying_dwells_and_wrong_units_are_reported_and_not_fitted():
 
 
 def test_an_outlying_dwell_is_compared_with_what_the_others_foretell_of_it():
-    table, last = (Table(sweeps=1, rates=13).measure(GyroModel(LINEAR), np.random.default_rng(21)),
-                   np.arange(13) == 12)
+    table = Table(sweeps=1, rates=13).measure(GyroModel(LINEAR), np.random.default_rng(21))
+    last = np.arange(13) == 12
     table = replace(table, output=table.output + 0.4 * DEGREE * last)
     fit = fit_effects(table, [term.effect for term in LINEAR],
                       Scatter(0.03 * DEGREE, 0.0, 0.0, 0.0, ~last))

@@ -165,8 +165,8 @@ def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
     found = diagnosis_of([log], np.random.default_rng(0))
     finding = next(each for each in found.findings if each.effect == name)
     cause, size = log.truth[name], finding.parameters[shape]
-    truth, deviation = (cause.shapes.get(shape, cause.size),
-                        (size.interval[1] - size.interval[0]) / 3.92)
+    truth = cause.shapes.get(shape, cause.size)
+    deviation = (size.interval[1] - size.interval[0]) / 3.92
     assert 0.0 < abs(size.estimate - truth) + deviation < 5.0 * deviation, size
     assert held([cause], [finding], 4.0) == {name: True}
     places = [(term.effect.name, value) for term in found.model.terms

@@ -80,10 +80,10 @@ def test_outliers_are_held_back_and_reported():
         history, table = simulate(generator, cubic(generator)), BiasTable(MODEL)
         learn(table, replace(history, estimate=history.bias), 0)
         table.begin_run()
-        said, outlier = (np.array([bool(text) for text in learn(table, history, 1)]),
-                         history.outlier[1])
-        found, held, wrong, kept = (found + outlier.sum(), held + said[outlier].sum(),
-                                    wrong + said[~outlier].sum(), kept + (~outlier).sum())
+        said = np.array([bool(text) for text in learn(table, history, 1)])
+        outlier = history.outlier[1]
+        found, held = found + outlier.sum(), held + said[outlier].sum()
+        wrong, kept = wrong + said[~outlier].sum(), kept + (~outlier).sum()
     assert found >= 5 and held >= 0.8 * found and wrong <= 0.02 * kept
 
 
@@ -112,8 +112,8 @@ def test_a_single_run_at_one_temperature_determines_the_offset_alone():
 def test_the_variance_grows_with_the_distance_and_with_the_age():
     table = learned(
         simulate(np.random.default_rng(1), linear(np.random.default_rng(2)), runs=3), 3)
-    low, high = (min(each.temperature for each in table.entries),
-                 max(each.temperature for each in table.entries))
+    low = min(each.temperature for each in table.entries)
+    high = max(each.temperature for each in table.entries)
     by_distance = [table.predict(high + distance, 3 * DAY)[1]
                    for distance in (0.0, 3.0, 10.0, 30.0)]
     by_age = [table.predict(0.5 * (low + high), 3 * DAY + age)[1]
@@ -149,8 +149,8 @@ def test_a_jump_is_noticed_and_shifts_the_whole_curve():
     assert (['not used' in text for text in said] == [True, True, False, False, False]
             and 'jumped' in said[2] and not any(said[3:]))
     assert table.held_back_count == 0
-    here, there, time = (history.temperature[3, 20], float(history.temperature[:3].min()),
-                         history.time[3, 20])
+    here, there = history.temperature[3, 20], float(history.temperature[:3].min())
+    time = history.time[3, 20]
     bias, variance = table.predict(there, time)
     true = history.bias[3, 20] + history.curve(there) - history.curve(here)
     assert abs(bias - true) < 3.0 * math.sqrt(variance) and math.sqrt(variance) < 0.2 * DEGREE
@@ -211,8 +211,8 @@ def test_what_no_gyro_has_is_not_used(given):
 
 def test_a_model_that_compensates_leaves_less_inside_its_range_and_as_much_outside():
     known, plain = BiasTable(COMPENSATED), BiasTable(MODEL)
-    inside, outside = (known.bias_difference(15.0, 35.0, 0.0)[1],
-                       known.bias_difference(40.0, 60.0, 0.0)[1])
+    inside = known.bias_difference(15.0, 35.0, 0.0)[1]
+    outside = known.bias_difference(40.0, 60.0, 0.0)[1]
     of_plain = plain.bias_difference(40.0, 60.0, 0.0)[1]
     assert (math.sqrt(inside / of_plain) == pytest.approx(Prior().compensated_share, rel=1e-6)
             and 1.0 < outside / of_plain < 2.5)

@@ -164,8 +164,8 @@ def test_a_log_at_once_takes_a_third_of_the_operations_of_single_samples():
 
 @pytest.mark.parametrize('interval', [0.01, 0.02])
 def test_a_single_absurd_sample_is_no_turn(interval):
-    tracker, generator = HeadingTracker(NOISE, np.zeros((0, 0)),
-                                        Settings()), (np.random.default_rng(5))
+    tracker = HeadingTracker(NOISE, np.zeros((0, 0)), Settings())
+    generator = np.random.default_rng(5)
     rates = 0.3 + NOISE.angle_random_walk / math.sqrt(interval) * generator.standard_normal(1000)
     rates[500] = 30.0
     for index, rate in enumerate(rates.tolist()):

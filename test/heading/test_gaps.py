@@ -151,8 +151,8 @@ KNOWN = np.diag([1e-10, 1e-10])
 def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
     generator, time = np.random.default_rng(3), np.arange(0.0, 60.0, INTERVAL)
     true = np.where(time > 50.3, 0.5, 0.0)
-    rate, comes = (true + simulate_noise(WHITE, len(time), INTERVAL, generator),
-                   np.ones(len(time), bool))
+    rate = true + simulate_noise(WHITE, len(time), INTERVAL, generator)
+    comes = np.ones(len(time), bool)
     for begin, gap in ((10.0, 0.2), (20.0, 0.45), (30.0, 0.6), (40.0, 0.9), (50.0, 0.8)):
         comes[(time > begin) & (time < begin + gap)] = False
     found = track(time[comes], rate[comes], sensitivity_of(rate[comes]), WHITE, KNOWN, Settings())
@@ -166,8 +166,8 @@ def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
 @pytest.mark.parametrize('false_alarms', [0.0, 0.1])
 @pytest.mark.parametrize('gap', [0.5, 0.99, 1.01, 30.0, 86400.0])
 def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap, false_alarms):
-    tracker, lost, losses = (HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms)),
-                             round(gap / INTERVAL), 3)
+    tracker = HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms))
+    lost, losses = round(gap / INTERVAL), 3
     for index in range(400 * (losses + 1)):
         said = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
         assert bool(said) == (gap > 1.0 and index % 400 == 0 < index)
@@ -177,8 +177,8 @@ def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap
 
 
 def test_a_rest_that_goes_on_after_a_gap_takes_over_nothing_of_a_correction_that_waits():
-    tracker, still = (HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings()),
-                      np.array([0.0, -1.0]))
+    tracker = HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings())
+    still = np.array([0.0, -1.0])
     generator, headings = np.random.default_rng(4), []
     outputs = np.concatenate([np.full(1000, 0.1), np.zeros(3000)]) + 0.3 * DEGREE
     outputs += simulate_noise(WHITE, len(outputs), INTERVAL, generator)
@@ -197,8 +197,8 @@ def test_a_log_in_blocks_says_the_same_as_sample_by_sample():
     generator = np.random.default_rng(5)
     true = driven(30.0, generator)
     comes = kept(len(true), 0.05, 20, generator)
-    time, rate = ((np.arange(len(true)) * INTERVAL)[comes],
-                  (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes])
+    time = (np.arange(len(true)) * INTERVAL)[comes]
+    rate = (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes]
     tracked = track(time, rate, sensitivity_of(rate), WHITE, KNOWN, Settings(false_alarms=0.0))
     integrator, cuts = BlockIntegrator(Threshold(0.0), WHITE, KNOWN), np.array([100, 101, 900])
     split = (np.split(time, cuts), np.split(rate, cuts),

@@ -61,8 +61,8 @@ class Gyro:
 
     def __init__(self, live, seed=0, bias=0.1 * DEGREE, coefficient=0.0, now=NOW):
         self.live, self.time, self.now, self.turned = live, 0.0, now, 0.0
-        self._bias, self._coefficient, self._generator = (bias, coefficient,
-                                                          np.random.default_rng(seed))
+        self._bias, self._coefficient = bias, coefficient
+        self._generator = np.random.default_rng(seed)
         self.headings, self.said, self._rate = [], [], 0.0
 
     def go(self, seconds, rate=0.0, temperature=25.0, wheels=None):

@@ -128,8 +128,8 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
 
 
 def test_one_long_turn_is_as_many_short_ones():
-    start, part = (initial_state(XV3500, np.diag([1e-6, 1e-8]), age=100.0),
-                   RateIntegral(0.7, 0.1, np.array([-0.1, -0.7])))
+    start = initial_state(XV3500, np.diag([1e-6, 1e-8]), age=100.0)
+    part = RateIntegral(0.7, 0.1, np.array([-0.1, -0.7]))
     by_parts, whole = start, RateIntegral(0.0, 0.0, np.zeros(2))
     for _ in range(30):
         by_parts, whole = by_parts.propagate(part), whole + part
@@ -229,8 +229,8 @@ def test_a_bias_that_jumps_by_more_than_the_model_says_does_not_make_the_heading
 
 @pytest.mark.parametrize('after', [None, False], ids=['silent', 'standing'])
 def test_a_slow_turn_until_the_wheels_stop_is_no_bias(after):
-    tracker, turning = (HeadingTracker(XV3500, np.diag([0.03 ** 2, (0.5 * DEGREE) ** 2]),
-                                       Settings()), round(20.0 / INTERVAL))
+    tracker = HeadingTracker(XV3500, np.diag([0.03 ** 2, (0.5 * DEGREE) ** 2]), Settings())
+    turning = round(20.0 / INTERVAL)
     for index in range(2 * turning):
         rate = 0.2 * DEGREE if index < turning else 0.0
         tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]),
@@ -291,8 +291,8 @@ def test_a_gap_and_a_jump_of_the_clock_leave_the_heading_where_it_was():
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
 def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, later):
-    tracker, generator, still = (HeadingTracker(noise, KNOWN, Settings(), 3600.0),
-                                 np.random.default_rng(11), np.array([0.0, -1.0]))
+    tracker = HeadingTracker(noise, KNOWN, Settings(), 3600.0)
+    generator, still = np.random.default_rng(11), np.array([0.0, -1.0])
     headings, variances = [], []
     for index, bias in enumerate([0.05 * DEGREE] * 2400 + [later * DEGREE] * 2400):
         time = INTERVAL * index + 600.0 * (index >= 2400)
@@ -310,8 +310,8 @@ def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, la
 
 
 def test_the_first_rate_after_a_gap_or_a_jump_back_is_corrected_by_the_bias_estimate():
-    tracker, generator = (HeadingTracker(XV3500, np.diag([1e-6, (0.5 * DEGREE) ** 2]), Settings()),
-                          np.random.default_rng(12))
+    tracker = HeadingTracker(XV3500, np.diag([1e-6, (0.5 * DEGREE) ** 2]), Settings())
+    generator = np.random.default_rng(12)
     for index, true in enumerate([0.0] * 1200 + [0.2] * 200):
         rate = (true + 0.3 * DEGREE
                 + XV3500.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL))
