@@ -219,7 +219,7 @@ def main(arguments: list[str]) -> None:
         print('\n'.join(held(drives)))
         logs = ((f'{"town" if town else "small car"} {seed}',
                  simulated(np.random.default_rng([seed, town]), town)[0]) for town in (False, True)
-                for seed in range(drives // 4))
+                for seed in range(max(drives // 4, 1)))
     else:
         raise SystemExit(__doc__)
     rows = [row for name, log in logs for row in judged(name, log)]

@@ -358,9 +358,8 @@ def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
            'memory, MB |')
     yield '|---:|---:|---:|---:|---|'
     for count, fatal in ((logs, False), (logs // 10, True)):
-        given = (range(count) if not fatal
-                 else [-1 - number if number % (count // killed) == 7 else number
-                       for number in range(count)])
+        last = {(2 * each + 1) * count // (2 * killed) for each in range(killed * fatal)}
+        given = [-1 - number if number in last else number for number in range(count)]
         alone = [_alone()]
         begin = time.process_time()
         done_, lost, memory, used = 0, 0, [], {}
@@ -370,13 +369,13 @@ def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
                 done_ += not isinstance(found, WorkerLost)
                 if not isinstance(found, WorkerLost):
                     used[found[1]] = found[2]
-                if (done_ + lost) % (count // 4) == 0:
+                if (done_ + lost) % max(count // 4, 1) == 0:
                     memory.append(_memory())
         own = time.process_time() - begin
         alone.append(_alone())  # a busy machine is slower at one time than at another
         cost = [1e3 * each for each in (
             np.mean(alone), sum(used.values()) / count, own / count)]
-        yield (f'| {count} | {lost} | {done_} of {count - (killed if fatal else 0)} | '
+        yield (f'| {count} | {lost} | {done_} of {count - len(last)} | '
                f'{", ".join(f"{each:.2f}" for each in cost)} | '
                f'{", ".join(f"{each:.0f}" for each in memory)} |')
 

@@ -65,7 +65,7 @@ FITS = {'bias': of(BIAS), 'bias, scale factor': of(BIAS, SCALE_FACTOR_ERROR),
         '... and scale factor over temperature, sine': of(*THERMAL, SINE_RESPONSE),
         'polynomial 3,2': of(rate_temperature_polynomial(3, 2)),
         'polynomial 5,2': of(rate_temperature_polynomial(5, 2)),
-        **{f'default, {technology or "no technology said"}': chosen(technology)
+        **{f'default, {technology or "no technology given"}': chosen(technology)
            for technology in (None, *TECHNOLOGY_EFFECTS)}}
 
 
