@@ -130,7 +130,7 @@ class OctaveVariances:
 @lru_cache(maxsize=64)
 def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
                              process: GaussMarkov | None = None) -> Array:
-    """Return the covariances as forms of the squared coefficients, as `Octaves.forms`."""
+    """Return the covariances as forms of the squared coefficients, as `OctaveVariances.forms`."""
     forms = np.zeros((len(sizes),) * 2 + (len(NOISE_TERMS) + (process is not None),) * 2)
     for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
         form = covariance_form(samples, sizes[i], sizes[j], process)

@@ -211,7 +211,7 @@ def _calibrate_by_course(log: Log, time: Array, output: Array, motion: Motion, n
               f'as of a gyro of the technology {technology} (--technology); '
               'the intervals hold that')
     return EncoderCalibration(model, 'course', fit, drift, motion, before, after,
-                              _count_lost_samples(time), (remark, ))
+                              _count_lost_samples(time), (remark,))
 
 
 #: Fewer leave nothing over for two values, bias and scale factor error.

@@ -147,9 +147,11 @@ class CalibrationForecast:
         """
         self._noise, self._duration, self._drive_duration, self._rest_duration = (
             noise, duration, drive_duration, rest_duration)
-        time = (np.linspace(0.0, drive_duration,
-                            min(max(round(drive_duration), 1), _MAX_DRIVE_CELLS) + 1)[1:])
-        self._drive_columns = np.vstack([_repeated_heading(drive, time), time])
+        cells = min(max(round(drive_duration), 1), _MAX_DRIVE_CELLS)
+        time = np.linspace(0.0, drive_duration, cells + 1)[1:]
+        rounds = np.floor(time / drive.duration)  # the drive begins again where it ended
+        heading = rounds * drive.heading[-1] + drive.heading_at(time - rounds * drive.duration)
+        self._drive_columns = np.vstack([heading, time])
         self.floor = (math.sqrt(2.0 / math.pi) * noise.angle_random_walk
                       * float(np.sqrt(time).mean()))
         self._covariances: dict[int, _NoiseCovariances] = {}
@@ -279,12 +281,6 @@ def _block_weights(blocks: int, length: float) -> Array:
     rising = (np.arange(_CELLS_PER_BLOCK) + 0.5) / _CELLS_PER_BLOCK
     before, after = np.eye(blocks)[:-1], np.eye(blocks)[1:]
     return (np.kron(before, rising) + np.kron(after, rising[::-1])) * length / _CELLS_PER_BLOCK
-
-
-def _repeated_heading(drive: Motion, time: Array) -> Array:
-    """Return the heading, rad, of a drive that begins again where it ended."""
-    rounds = np.floor(time / drive.duration)
-    return rounds * drive.heading[-1] + drive.heading_at(time - rounds * drive.duration)
 
 
 @dataclass(frozen=True)

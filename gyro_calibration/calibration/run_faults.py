@@ -196,7 +196,7 @@ def _try_speeds(run: RunPieces, motion: Motion, largest_offset: float) -> Trials
     for speed in _TRIAL_SPEEDS[np.abs(np.log(_TRIAL_SPEEDS)) > _UNIT_LOG_TOLERANCE]:
         for offset in _trial_offsets(largest_offset)[::2]:
             yield run.fit_scale(run.reference_angle(motion, offset,
-                                                    float(speed)))[0], (float(speed), )
+                                                    float(speed)))[0], (float(speed),)
 
 
 def _try_late_starts(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:

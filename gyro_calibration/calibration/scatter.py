@@ -220,7 +220,7 @@ def _restricted_log_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
     """Return the restricted log-likelihood of the scatter, up to a constant."""
     deviation = scatter.deviation(dwells)
     sums = _SweepProducts.from_dwells(dwells, deviation, np.column_stack([columns, error]))
-    (gram, ), (of_sweeps, ) = sums.marginalized(
+    (gram,), (of_sweeps,) = sums.marginalized(
         np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
     factor = np.linalg.cholesky(gram[:-1, :-1])
     explained = solve_triangular(factor, gram[:-1, -1], lower=True)
@@ -324,8 +324,10 @@ class Uncertainty:
         sums = _SweepProducts.from_dwells(dwells, deviation,
                                           np.column_stack([columns / lengths, error]))
         dof = len(dwells) - len(lengths)
-        weights, offsets, covariances, sweep_scatter = _average_over_scatter(
-            sums, dof, _scatter_units(dwells, deviation))
+        # scatters of sweep bias and scale as large as a dwell's; zeros for few sweeps
+        units = (np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
+                 * (_count_scatter_terms(dwells) == 4))
+        weights, offsets, covariances, sweep_scatter = _average_over_scatter(sums, dof, units)
         return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), dof,
                    sweep_scatter)
 
@@ -351,12 +353,6 @@ class Uncertainty:
         covariance = np.tensordot(self.weights, self.covariances, axes=1)
         widening = high / 1.959964 / np.sqrt(np.diag(covariance))
         return covariance * np.outer(widening, widening)
-
-
-def _scatter_units(dwells: Dwells, deviation: Array) -> Array:
-    """Return scatters of sweep bias and scale as large as a dwell's; zeros for few sweeps."""
-    return (np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
-            * (_count_scatter_terms(dwells) == 4))
 
 
 def _average_over_scatter(sums: _SweepProducts, dof: int,

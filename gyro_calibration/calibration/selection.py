@@ -206,19 +206,15 @@ def _add_effects(fit: Calibration, candidates: Sequence[Effect],
                  significance: float) -> Calibration:
     """Add the effect that predicts left-out sweeps best, until none is supported."""
     while True:
-        new = [effect for effect in candidates if _can_add(effect, fit.effects)]
+        excluded = [*fit.effects, *(effect for pair in _CONFOUNDED_EFFECTS for effect in pair
+                                    if any(each in fit.effects for each in pair))]
         tried = [_try_fit(fit.dwells, _add_with_required(fit.effects, effect), fit.scatter)
-                 for effect in new]
+                 for effect in candidates if effect not in excluded]
         better = [each
                   for each in tried if each is not None and _is_supported(fit, each, significance)]
         if not better:
             return fit
         fit = min(better, key=Calibration.cross_validation_misfit)
-
-
-def _can_add(effect: Effect, effects: Sequence[Effect]) -> bool:
-    return effect not in effects and not any(
-        effect in pair and any(each in effects for each in pair) for pair in _CONFOUNDED_EFFECTS)
 
 
 def _add_with_required(effects: Sequence[Effect], effect: Effect) -> tuple[Effect, ...]:

@@ -110,7 +110,7 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
 def _error_per_turn(dwells: Dwells, error: Array, is_turn: Mask,
                     nearest: list[_SweepRest]) -> Array:
     """Return the integral over a turn of errors of a rate, less those at rest, rad (eq. 14)."""
-    bias = np.array([rest.weighted_error(error) for rest in nearest])
+    bias = np.array([rest.weights @ error[rest.dwells] for rest in nearest])
     return (error[is_turn] - bias) * 2.0 * math.pi / np.abs(dwells.rate[is_turn])
 
 
@@ -124,10 +124,6 @@ class _SweepRest:
     temperature: float
     dwells: Numbers
     weights: Array
-
-    def weighted_error(self, error: Array) -> float:
-        """Return the error at rest, rad/s, from that of all dwells, shape (n,)."""
-        return float(self.weights @ error[self.dwells])
 
 
 def _find_rests(dwells: Dwells) -> tuple[list[_SweepRest], str]:

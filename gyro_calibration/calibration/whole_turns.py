@@ -85,7 +85,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     time : s, shape (n,)
     rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
     turns : number, counter-clockwise positive; None for the nearest whole number, for a scale
-        factor error up to `COUNTED`
+        factor error up to `MAX_COUNTING_SCALE_ERROR`
     noise : of the gyro, if it is known; the standard deviations include the wander of the bias
     mark_deviation : standard deviation of the angle between the two rests on the mark, rad
     output : of the gyro before its model, where that differs, shape (n,)

@@ -67,7 +67,7 @@ def process_executors(workers: int, memory: float | None = None,
 
     def create(wanted: int) -> Executor:
         executors.append(
-            ProcessPoolExecutor(min(wanted, workers), context, _initialize_worker, (memory, )))
+            ProcessPoolExecutor(min(wanted, workers), context, _initialize_worker, (memory,)))
         return executors[-1]
     try:
         yield create

@@ -52,7 +52,7 @@ def z_axis_covariance(variance: float) -> tuple[float, ...]:
 
 
 #: Covariance of a quantity that the message does not report, and of one that is not measured.
-NOT_REPORTED_COVARIANCE, UNMEASURED_COVARIANCE = ((NOT_REPORTED, *8 * (0.0, )),
+NOT_REPORTED_COVARIANCE, UNMEASURED_COVARIANCE = ((NOT_REPORTED, *8 * (0.0,)),
                                                   z_axis_covariance(UNMEASURED_VARIANCE))
 
 #: Largest number of fields, depth of nesting, and length of a definition in characters.

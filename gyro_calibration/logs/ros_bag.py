@@ -13,7 +13,8 @@ ROS 2 recordings: messages read from a folder, an .mcap or a .db3 file, and writ
 
 The recording of a killed program lacks its closing part and index, so neither is used: records
 are read from the beginning up to the end, or to the point of truncation. No record may take more
-memory than `LARGEST`, and no file may expand to more than `GROWTH` times its size.
+memory than `MAX_RECORD_BYTES`, and no file may expand to more than `MAX_EXPANSION_RATIO` times its
+size.
 
 Existing libraries have no such limits: rosbags 0.11.9 takes 2.6 GB for a database of 12 kB with
 computed columns and 3.7 GB for an MCAP file of 131 kB, and refuses a truncated file. ROS 2 has no

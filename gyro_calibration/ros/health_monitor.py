@@ -245,7 +245,7 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     noise : of the model
     level : probability of each of the four false alarms
     step : quantization step of the output, rad/s; inf where the output never changed
-    bias_variance, age, is_announced : as in `HealthMonitor.examine`
+    bias_variance, age, is_announced : as in `HealthMonitor.examine_stretch`
 
     Returns
     -------

@@ -104,7 +104,7 @@ def test_each_effect_is_held_or_listed(simulator):
 
 
 def test_isaac_is_given_python():
-    model = GyroModel((term('bias', 1e-3), ), noise=NOISE)
+    model = GyroModel((term('bias', 1e-3),), noise=NOISE)
     text, left_out = export_model(
         simulator_parameters(model, 100.0, 25.0, 3600.0)[0], model, 'isaac')
     compile(text, 'isaac', 'exec')

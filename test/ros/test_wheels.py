@@ -64,8 +64,8 @@ def test_one_source_that_moves_is_enough_and_an_old_one_does_not_count(wheels):
 def test_only_the_sources_that_are_asked_count(wheels):
     wheels.add(ODOMETRY, velocity(), 10.0)
     wheels.add(COMMAND, velocity(1.0), 10.0)
-    assert (wheels.is_moving(10.1, (ODOMETRY, )) is False
-            and wheels.is_moving(10.1, (COMMAND, )) is True)
+    assert (wheels.is_moving(10.1, (ODOMETRY,)) is False
+            and wheels.is_moving(10.1, (COMMAND,)) is True)
     assert wheels.is_moving(10.1, ()) is None
 
 

@@ -140,7 +140,7 @@ def dwells_from_table(log: Log) -> Dwells:
              if names is None else number_named_sweeps([names[row] for row in rows]))
     return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows],
                   _read_deviation_column(log)[rows], sweep,
-                  tuple(f'row {row + 1}' for row in rows), (remark, ) if len(lost) else (),
+                  tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
                   tuple(np.split(rows, len(rows))))
 
 

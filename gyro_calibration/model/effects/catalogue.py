@@ -187,21 +187,21 @@ _FAST_REVERSALS = 'reverse quickly: a lag reduces the amplitude, a delay does no
 _SIGNAL_EFFECTS = (
     Effect(
         'bandwidth', 'The output follows the rate through a first-order lag.',
-        nonlinear_parameters=(Parameter('bandwidth', 's', bounds=(1e-7, 10.0)), ),
+        nonlinear_parameters=(Parameter('bandwidth', 's', bounds=(1e-7, 10.0)),),
         experiment=_FAST_REVERSALS, distortion=_filter_lag, stage='rate',
         not_compensated='The attenuation of fast motion remains: to undo it would amplify the '
         'noise.'),
     Effect(
         'time_offset', 'The stamps of the samples are late by a constant time.',
         nonlinear_parameters=(Parameter('time_offset', 's',
-                                        bounds=(-1.0, 1.0)), ), experiment=_FAST_REVERSALS,
+                                        bounds=(-1.0, 1.0)),), experiment=_FAST_REVERSALS,
         distortion=lambda signal, time, offset: _interpolate(time - offset, time, signal),
         stage='rate', correct_stamps=lambda time, offset: time - offset,
         not_compensated='It is compensated by shifting the stamps; the delay for a controller '
         'remains.'),
     Effect(
         'clock_rate', 'The clock of the gyro runs at a different rate than that of the reference.',
-        nonlinear_parameters=(Parameter('clock_rate', '1', bounds=(-0.1, 0.1)), ),
+        nonlinear_parameters=(Parameter('clock_rate', '1', bounds=(-0.1, 0.1)),),
         experiment='record a long log with quick motion at both ends',
         distortion=lambda signal, time, rate: _interpolate((1.0 + rate) * time, time, signal),
         stage='rate', correct_stamps=lambda time, rate: (1.0 + rate) * time,
@@ -209,8 +209,8 @@ _SIGNAL_EFFECTS = (
         'own '
         'clock, without this effect.'),
     Effect('dead_zone', 'The output stays zero while the rate is small.', frozenset({'rate'}),
-           (Parameter('amplitude', '1', default=1.0), ), lambda channels, dead_zone: (
-               (abs(channels.rate) < dead_zone) * -channels.rate, ),
+           (Parameter('amplitude', '1', default=1.0),), lambda channels, dead_zone: (
+               (abs(channels.rate) < dead_zone) * -channels.rate,),
            (Parameter('dead_zone', 'rad/s', bounds=(1e-7, 1.0)), ), 'sweep slowly through zero',
            not_compensated='An output of zero does not determine the rate within the zone.'))
 SATURATION = Effect(

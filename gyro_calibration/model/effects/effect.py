@@ -13,8 +13,8 @@ The records of an effect, its parameters and its input channels; and a first-ord
 
 An effect is a record and a model is a tuple of effects. Effects are combined in any way, since
 each only adds columns. Effects on the signal (a delay, a lag, rounding) are no function of one
-instant and add no column; they are simulated at their stage, and `undone` states what compensation
-leaves of them.
+instant and add no column; they are simulated at their stage, and `not_compensated` states what
+compensation leaves of them.
 
 A parameter with a default is a convention (a reference temperature, a centre, a scale) and is not
 fitted. One without a default is a property of the gyro, is fitted, and is part of the covariance.
