@@ -244,13 +244,13 @@ def _method_contradiction(found: Array) -> Contradiction:
                           'slow': 100.0 * increment_scale_error(CALIBRATION_MOTION),
                           'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0),
                           'late': explaining_delay()},
-                         "Part 2: the two methods differ by {turntable:.2f} % of the turntable's"
-                         ' SF. Fitting the gradient of a 2 deg encoder at 50 Hz errs by '
+                         "Part 2: the two methods differ by {turntable:.2f} % of the turntable's "
+                         'SF. Fitting the gradient of a 2 deg encoder at 50 Hz errs by '
                          '{solver:.4f} +- {solver_scatter:.4f} % only, the likelihood by '
                          '{likely:.4f} +- {likely_scatter:.4f} %; a delay of the gyro of '
                          '{late:.2f} s would explain the difference. In the reverse regression, '
-                         'of the gyro on the gradient, the steps of the encoder give an error of'
-                         ' {reverse:.1f} %, and of increments on a motion up to 45 deg/s one of '
+                         'of the gyro on the gradient, the steps of the encoder give an error of '
+                         '{reverse:.1f} %, and of increments on a motion up to 45 deg/s one of '
                          '{slow:.0f} %.')
 
 

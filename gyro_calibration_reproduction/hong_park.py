@@ -171,8 +171,8 @@ def _rectangle_rule() -> Contradiction:
                          'the heading and 0 % by the rate, which no consistent estimator can '
                          'give. The rectangle rule of eq. 4 explains it: on a turn at '
                          '{speed:.2f} rad/s for {turn:.2f} s at 20 Hz it errs by {s:.2f} % in s '
-                         'and {b:.2f} % in b, with the gyro one sample later by {late_s:.2f} and'
-                         ' {late_b:.2f} %, and the trapezoid rule by {trapezoid:.2f} %.')
+                         'and {b:.2f} % in b, with the gyro one sample later by {late_s:.2f} and '
+                         '{late_b:.2f} %, and the trapezoid rule by {trapezoid:.2f} %.')
 
 
 def _short_move() -> Contradiction:
@@ -194,8 +194,8 @@ def _exchanged_columns() -> Contradiction:
     exchanged = equation_8(CALIBRATION_MOTION, False)
     return Contradiction({'first': printed[0], 'second': printed[1], 'right_first': exchanged[0],
                           'right_second': exchanged[1]},
-                         'Eq. 8: the columns of the matrix are exchanged. The printed form gives'
-                         ' [s_bar, b_bar] = [{first:.4f}, {second:.4f}], the corrected form '
+                         'Eq. 8: the columns of the matrix are exchanged. The printed form gives '
+                         '[s_bar, b_bar] = [{first:.4f}, {second:.4f}], the corrected form '
                          '[{right_first:.4f}, {right_second:.4f}].')
 
 
@@ -234,8 +234,8 @@ def _bias_unit() -> Contradiction:
     drift = PRINTED_BIAS * DRIVE_DURATION
     return Contradiction({'drift': drift, 'mean': drift / 2.0, 'published': PURE_ROW[0],
                           'fits': drift / 60.0},
-                         'Section 4.2: b = 0.75 deg/s drifts by {drift:.0f} deg in 160 s, with a'
-                         ' mean of {mean:.0f} deg; table 1 has a mean error of {published:.2f} '
+                         'Section 4.2: b = 0.75 deg/s drifts by {drift:.0f} deg in 160 s, with a '
+                         'mean of {mean:.0f} deg; table 1 has a mean error of {published:.2f} '
                          'deg without any compensation; 0.75 deg/min drifts by {fits:.0f} deg.')
 
 
@@ -251,8 +251,8 @@ def _percentages() -> Contradiction:
 def _half_an_hour() -> Contradiction:
     drift = drift_in_half_an_hour()
     return Contradiction({'sum': sum(drift), 'squares': math.hypot(*drift)},
-                         'Section 1: 18 deg/h and 2.5 deg/sqrt(h) over 30 min give {sum:.1f} deg'
-                         ' as a sum. The paper calls it a standard deviation, which is '
+                         'Section 1: 18 deg/h and 2.5 deg/sqrt(h) over 30 min give {sum:.1f} deg '
+                         'as a sum. The paper calls it a standard deviation, which is '
                          '{squares:.1f} deg.')
 
 
@@ -351,9 +351,9 @@ def _noise_over_threshold(errors: Array) -> Contradiction:
                          'Eq. 12: 2.5 deg/sqrt(h) is {sigma:.3f} deg/s in a white sample at 100 '
                          'Hz, so 0.3 deg/s is {ratio:.2f} sigma, and {passes:.0f} % of the '
                          'samples of a robot at rest pass. In simulation the filter alone '
-                         'reduces the error by {single:.1f} %, not 53 %. On the mean of 0.2 s it'
-                         ' reduces it by {mean:.0f} %, the exact times of rest by {known:.0f} %,'
-                         ' and the filter with self-calibration by {both:.0f} %.')
+                         'reduces the error by {single:.1f} %, not 53 %. On the mean of 0.2 s it '
+                         'reduces it by {mean:.0f} %, the exact times of rest by {known:.0f} %, '
+                         'and the filter with self-calibration by {both:.0f} %.')
 
 
 def _slow_turns() -> Contradiction:

@@ -275,8 +275,8 @@ def _index() -> Contradiction:
                'cubic': columns_of_equation_10(p, p, p),
                'cubic_right': columns_of_equation_10(p, p, p + 1)}
     return Contradiction(numbers,
-                         'Eq. 10: the index i + (j-1)p is the same for several pairs of i and j.'
-                         ' With p = 3 and q = 2 it gives {printed:d} different columns of '
+                         'Eq. 10: the index i + (j-1)p is the same for several pairs of i and j. '
+                         'With p = 3 and q = 2 it gives {printed:d} different columns of '
                          '{right:d}, with p = q = 3 {cubic:d} of {cubic_right:d}; the index i + '
                          '(j-1)(p+1) gives all columns.')
 
@@ -288,9 +288,9 @@ def _data_sets() -> Contradiction:
     return Contradiction({'rates': rates, 'temperatures': temperatures,
                           'sets': rates * temperatures, 'step': 2.0 * FULL_SCALE / 10.0},
                          'Section 3.3: steps of 10 deg/s over +-100 deg/s give {rates:d} rates, '
-                         'and with {temperatures:d} temperatures {sets:d} data sets, not 121. 11'
-                         ' rates correspond to steps of {step:.0f} deg/s. p and q are numbers of'
-                         ' rates and temperatures there, and orders in eq. 10.')
+                         'and with {temperatures:d} temperatures {sets:d} data sets, not 121. 11 '
+                         'rates correspond to steps of {step:.0f} deg/s. p and q are numbers of '
+                         'rates and temperatures there, and orders in eq. 10.')
 
 
 def condition_numbers() -> tuple[float, float]:
@@ -344,10 +344,10 @@ def _regressor(generator: np.random.Generator) -> Contradiction:
             numbers[f'{name}_{kind}'] = regressor_error(deviation, averaged, generator) / DEGREE
     return Contradiction(numbers,
                          'Eq. 9: the regressor is the output, which contains the same noise as '
-                         'the error. With samples that scatter by {white:.4f} deg/s the error at'
-                         ' 100 deg/s is wrong by {white_single:.0e} deg/s, with means of 100 by '
-                         '{white_mean:.0e}; on a table that vibrates by {vibration:.0f} deg/s by'
-                         ' {vibration_single:.3f} and {vibration_mean:.4f} deg/s.')
+                         'the error. With samples that scatter by {white:.4f} deg/s the error at '
+                         '100 deg/s is wrong by {white_single:.0e} deg/s, with means of 100 by '
+                         '{white_mean:.0e}; on a table that vibrates by {vibration:.0f} deg/s by '
+                         '{vibration_single:.3f} and {vibration_mean:.4f} deg/s.')
 
 
 def extrapolation_errors(sine_constant: float,
