@@ -68,7 +68,7 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
-from diagnosed import diagnosis_of, judged_findings, won  # noqa: E402
+from diagnosed import diagnosis_of, judge_findings, won  # noqa: E402
 from gyro_calibration.diagnosis.findings import Finding  # noqa: E402
 from gyro_calibration_bench.cases import (  # noqa: E402
     Case,
@@ -116,7 +116,7 @@ def answered(case: Case, seed: int) -> Answer:
         reported_findings(found.findings), [each.along for each in found.unexplained])
     suspected = [] if found is None else [each.effect for each in found.findings
                                           if each not in findings]
-    how = judged_findings(hidden, findings, beyond, case.allowed)
+    how = judge_findings(hidden, findings, beyond, case.allowed)
     return Answer(str(case), case.table_row,
                   {cause.name: _told(cause) for cause in hidden.truth.gyro.causes},
                   [_answer(each) for each in findings], problem, seconds, how,

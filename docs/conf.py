@@ -47,12 +47,12 @@ html_css_files = ['tables.css']
 html_show_sourcelink = False
 
 
-def described(app, what, name, obj, options, lines):
+def describe_entries(app, what, name, obj, options, lines):
     """Put what docstrings write as `name : description` in the place of a description."""
-    lines[:] = [part for line in lines for part in _parted(line)]
+    lines[:] = [part for line in lines for part in _split_entry(line)]
 
 
-def _parted(line):
+def _split_entry(line):
     found = re.fullmatch(r'( *)(\w+(?:, \w+)*) : (.+)', line)
     # a blank between names would make the first of them the type of the last
     return ([found[1] + found[2].replace(', ', ','), f'{found[1]}    {found[3]}'] if found
@@ -61,4 +61,4 @@ def _parted(line):
 
 def setup(app):
     """Describe before napoleon (priority 500) reads the sections."""
-    app.connect('autodoc-process-docstring', described, priority=400)
+    app.connect('autodoc-process-docstring', describe_entries, priority=400)

@@ -91,8 +91,8 @@ class Case:
 
     def __str__(self) -> str:
         what = '+'.join(self.names) or ('random' if self.multiple else 'nothing')
-        beside = '' if self.look_alikes is None else f'({"|".join(self.look_alikes)})'
-        return (f'{self.part}/{what}{beside}/{self.multiple:g}/{self.noise}/{self.reference}/'
+        suffix = '' if self.look_alikes is None else f'({"|".join(self.look_alikes)})'
+        return (f'{self.part}/{what}{suffix}/{self.multiple:g}/{self.noise}/{self.reference}/'
                 f'{self.number}')
 
     @property
@@ -111,8 +111,8 @@ class Case:
     def table_row(self) -> str:
         """Return the row of the table that it belongs to."""
         if self.part == 'references':
-            kind, beside = self.reference, ', with a model' if self.noise == 'floor' else ''
-            return f'{kind}, ' + (f'{self.multiple:g} times' if self.names else 'nothing' + beside)
+            kind, suffix = self.reference, ', with a model' if self.noise == 'floor' else ''
+            return f'{kind}, ' + (f'{self.multiple:g} times' if self.names else 'nothing' + suffix)
         return {'nothing': f'nothing, {self.noise}',
                 'effects': f'one effect, {self.multiple:g} times',
                 'pairs': f'two effects, {self.multiple:g} times',

@@ -49,18 +49,18 @@ def diagnosis_of(hidden: Sequence[HiddenLog], generator: np.random.Generator,
                     model_of(hidden[0]) if wanted else None)
 
 
-def judged_findings(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str] = (),
-                    allowed: Collection[str] = ()) -> Judgement:
+def judge_findings(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str] = (),
+                   allowed: Collection[str] = ()) -> Judgement:
     """Compare findings with the truth."""
     return judge_answer(hidden.truth.gyro.causes, [answer_of_finding(each) for each in findings],
                         beyond, allowed)
 
 
-def judged_diagnosis(hidden: HiddenLog, found: Diagnosis,
-                     allowed: Collection[str] = ()) -> Judgement:
+def judge_diagnosis(hidden: HiddenLog, found: Diagnosis,
+                    allowed: Collection[str] = ()) -> Judgement:
     """Compare a diagnosis with the truth."""
-    return judged_findings(hidden, found.findings, [each.along for each in found.unexplained],
-                           allowed)
+    return judge_findings(hidden, found.findings, [each.along for each in found.unexplained],
+                          allowed)
 
 
 def held(causes: Iterable[Cause], findings: Sequence[Finding],
@@ -113,8 +113,8 @@ def _predicted(hidden: HiddenLog) -> np.ndarray:
     """Return the output to expect; that of a noisy gyro has no steps."""
     truth, gyro = hidden.truth, hidden.truth.gyro
     limit = gyro.size_of('saturation') or np.inf
-    return (np.clip(truth.rate + truth.added_rate, -limit, limit) *
-            (gyro.size_of('unit_error') or 1.0))
+    return np.clip(truth.rate + truth.added_rate, -limit, limit) * (
+        gyro.size_of('unit_error') or 1.0)
 
 
 def _squares(both: Sequence[Sequence[float]]) -> tuple[float, float]:

@@ -75,13 +75,13 @@ class InformationMetric:
         full = np.array([[_inner_product(a, b) for b in solved] for a in several])
         if not names:
             return full
-        beside = np.array(
+        coupling = np.array(
             [[_inner_product(self.nuisances[name], b) for b in solved] for name in names])
         among = np.array([[_inner_product(self.nuisances[a], self._solved[b]) for b in names]
                           for a in names])
         scale = np.sqrt(np.diag(among))
-        beside, among = beside / scale[:, None], among / np.outer(scale, scale)
-        return full - beside.T @ np.linalg.pinv(among, rcond=1e-12, hermitian=True) @ beside
+        coupling, among = coupling / scale[:, None], among / np.outer(scale, scale)
+        return full - coupling.T @ np.linalg.pinv(among, rcond=1e-12, hermitian=True) @ coupling
 
     def norm(self, columns: Columns, without: Sequence[str] = ()) -> float:
         """Return the length of what the nuisances do not explain, in standard deviations."""

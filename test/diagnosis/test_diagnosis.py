@@ -21,7 +21,7 @@ import itertools
 
 from chance import most, seeded
 from diagnosed import described as told
-from diagnosed import diagnosis_of, held, judged_diagnosis, log_of, model_of, won
+from diagnosed import diagnosis_of, held, judge_diagnosis, log_of, model_of, won
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
@@ -86,19 +86,19 @@ ELSEWHERE = ('angle_random_walk', 'dead_zone', 'dropped_samples', 'quantization'
 TRIED_ALONE = set(FORMS).difference(*TOGETHER, ELSEWHERE)
 
 
-@pytest.mark.parametrize('seed, name', evidence(lambda seed, name: name in TRIED_ALONE,
-                                                *enumerate(FORMS)), ids=FORMS)
+@pytest.mark.parametrize(
+    'seed, name', evidence(lambda seed, name: name in TRIED_ALONE, *enumerate(FORMS)), ids=FORMS)
 def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
     # figures of the noise are sized without the steps of an encoder, which hide them
     reference = turn(REFERENCES, 0 if FORMS[name].stage == 'noise' else seed)
     log, = hidden_in([name], 5.0, seed, reference=reference)
     found = diagnosis_of([log], np.random.default_rng(seed))
-    how = judged_diagnosis(log, found, ENCODER)
+    how = judge_diagnosis(log, found, ENCODER)
     assert how.is_right, told(log, found)
     # an encoder blurs where a zone ends by more than the noise does
     ends_blurred = name == 'dead_zone' and 'encoder_step' in reference
-    assert ends_blurred or all(held(log.truth.gyro.causes, found.findings,
-                                    4.0).values()), told(log, found)
+    assert ends_blurred or all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(
+        log, found)
     for measure, (mine, oracle) in won(log, found).items():
         # gains are compared where they exceed the scatter by noise and encoder steps; the oracle
         # knows the rate of the temperature, which a thermometer of 1/16 K shows in leaps
@@ -112,7 +112,7 @@ def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
 def test_effects_together_are_all_named(seed, names):
     log, = hidden_in(names, 5.0, seed)
     found = diagnosis_of([log], np.random.default_rng(seed))
-    assert judged_diagnosis(log, found, ENCODER).is_right, told(log, found)
+    assert judge_diagnosis(log, found, ENCODER).is_right, told(log, found)
 
 
 def test_a_coarse_output_and_another_effect_are_both_named():
@@ -122,28 +122,28 @@ def test_a_coarse_output_and_another_effect_are_both_named():
     assert {'quantization', 'scale_factor_temperature'} <= set(names_of(found)), told(log, found)
 
 
-@pytest.mark.parametrize('seed, reference', evidence(
-    lambda seed, reference: seed % 3 == reference,
-    *itertools.product(range(len(KINDS)), range(len(REFERENCES)))))
+@pytest.mark.parametrize('seed, reference',
+                         evidence(lambda seed, reference: seed % 3 == reference,
+                                  *itertools.product(range(len(KINDS)), range(len(REFERENCES)))))
 def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
     log, = hidden_in([], 0.0, seed, KINDS[seed], REFERENCES[reference])
     # every other log has a right model, so that bias, scale factor and noise must fit as well
     found = diagnosis_of([log], np.random.default_rng(seed),
                          with_model=bool((seed + reference) % 2))
-    assert judged_diagnosis(
+    assert judge_diagnosis(
         log, found, ENCODER).is_right and set(names_of(found)) <= set(ENCODER), told(log, found)
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
 
 
-@pytest.mark.parametrize('name', evidence(
-    lambda name: name in ('third_harmonic_of_heading', 'bias_pulse'),
-    ('third_harmonic_of_heading',), ('resonance_at_a_speed',), ('bias_pulse',),
-    ('supply_times_rate',)))
+@pytest.mark.parametrize('name',
+                         evidence(lambda name: name in ('third_harmonic_of_heading', 'bias_pulse'),
+                                  ('third_harmonic_of_heading',), ('resonance_at_a_speed',),
+                                  ('bias_pulse',), ('supply_times_rate',)))
 def test_what_the_catalogue_does_not_have_is_reported_as_unexplained(name):
     log, = hidden_in([name], 5.0, list(OUTSIDE_CATALOGUE).index(name), reference=REFERENCES[0])
     found = diagnosis_of([log], np.random.default_rng(0))
-    assert found.verdict == 'unexplained' and judged_diagnosis(log,
-                                                               found).is_right, told(log, found)
+    assert found.verdict == 'unexplained' and judge_diagnosis(log, found).is_right, told(
+        log, found)
 
 
 @pytest.mark.evidence
@@ -153,7 +153,7 @@ def test_random_effects_are_found():
         name = str(generator.choice(list(FORMS)))
         log, = hide([name], 5.0, generator, noise=str(generator.choice(KINDS)), **SHORT)
         found = diagnosis_of([log], generator)
-        wrong += [] if judged_diagnosis(log, found).is_right else [told(log, found)]
+        wrong += [] if judge_diagnosis(log, found).is_right else [told(log, found)]
     # right in 92 % at 5 times the minimum detectable effect (docs/benchmarks.md)
     assert len(wrong) <= most(16, 0.08), '\n'.join(wrong)
 
@@ -166,7 +166,7 @@ def test_random_effects_are_found():
 def test_a_wrong_reference_is_blamed_on_the_reference(name, reference):
     log, = hidden_in([name], 10.0, reference, 'mixed', REFERENCES[reference])
     found = diagnosis_of([log], np.random.default_rng(1))
-    assert judged_diagnosis(
+    assert judge_diagnosis(
         log, found, ENCODER).is_right and CAUSES[name].origin == 'reference', told(log, found)
     assert name not in {term.effect.name for term in found.model.terms}
 
@@ -194,7 +194,7 @@ def test_a_large_effect_brings_no_companions(name, seed):
     log, = hidden_in([name], 1.0, seed, 'mixed', REFERENCES[0],
                      fixed_parts=lambda sessions: {name: LARGE[name](sessions)})
     found = diagnosis_of([log], np.random.default_rng(seed))
-    assert judged_diagnosis(log, found).is_right, told(log, found)
+    assert judge_diagnosis(log, found).is_right, told(log, found)
     assert held(log.truth.gyro.causes, found.findings, 4.0).get(name, True), told(log, found)
 
 
@@ -207,7 +207,7 @@ def test_a_log_without_channels_says_what_it_cannot_show():
     needed = {name for name, cause in CAUSES.items()
               if cause.required_channels & {'temperature', 'supply', 'specific_force'}}
     assert needed <= set(found.cannot_show) and 'cubic_nonlinearity' not in found.cannot_show
-    assert judged_diagnosis(log, found).is_right, told(log, found)
+    assert judge_diagnosis(log, found).is_right, told(log, found)
 
 
 def test_a_log_of_a_gyro_at_rest_needs_no_reference():
@@ -216,10 +216,10 @@ def test_a_log_of_a_gyro_at_rest_needs_no_reference():
     rest = truth.prediction - (1.0 + truth.scale_factor_error) * truth.rate + truth.noise
     found = diagnose([replace(log_of(log), output=rest, reference_rate=None, moving=0.0 * rest)],
                      np.random.default_rng(0))
-    assert judged_diagnosis(
-        log, found).is_in_set and not judged_diagnosis(log, found).false_names, told(log, found)
-    assert {'cubic_nonlinearity', 'time_offset',
-            'reference_once_per_rev'} <= set(found.cannot_show)
+    assert judge_diagnosis(
+        log, found).is_in_set and not judge_diagnosis(log, found).false_names, told(log, found)
+    assert {'cubic_nonlinearity', 'time_offset', 'reference_once_per_rev'} <= set(
+        found.cannot_show)
 
 
 # several logs of one gyro
@@ -243,10 +243,10 @@ def test_a_step_that_happens_with_a_change_of_temperature_is_a_step_where_the_ot
     logs = recorded(['bias_step'], STEPS, 1,
                     {'bias_step': {'run': 0, 'step_time': STEPS[0] + 5.0}})
     found = diagnosis_of(logs, np.random.default_rng(0))
-    assert judged_diagnosis(logs[0], found).is_right, told(logs[0], found)
+    assert judge_diagnosis(logs[0], found).is_right, told(logs[0], found)
     named = {name for each in found.findings for name in (each.effect, *each.ambiguous_with)}
-    assert not {name for name in named
-                if CAUSES[name].along.startswith('temperature')}, told(logs[0], found)
+    assert not {name for name in named if CAUSES[name].along.startswith('temperature')}, told(
+        logs[0], found)
 
 
 def test_a_temperature_effect_that_repeats_is_named():
@@ -260,8 +260,8 @@ def test_an_effect_of_the_motion_is_found_in_several_logs_together():
     logs = hide(['cubic_nonlinearity'], 5.0, np.random.default_rng(3), noise='mixed', runs=3,
                 **SHORT)
     found = diagnosis_of(logs, np.random.default_rng(0))
-    assert (judged_diagnosis(logs[0], found).is_right and all(
-        judged_diagnosis(logs[0], found).interval_holds.values())), told(logs[0], found)
+    assert (judge_diagnosis(logs[0], found).is_right
+            and all(judge_diagnosis(logs[0], found).interval_holds.values())), told(logs[0], found)
 
 
 # against a model
@@ -308,8 +308,9 @@ def left_over(model, log):
     return np.var(log.output - simulated), np.var(compensate_log(model, log) - known)
 
 
-@pytest.mark.parametrize('seed, names', evidence(
-    lambda seed, names: seed in (1, 4), *enumerate(EXTENSIONS)), ids=map('+'.join, EXTENSIONS))
+@pytest.mark.parametrize('seed, names',
+                         evidence(lambda seed, names: seed in (1, 4), *enumerate(EXTENSIONS)),
+                         ids=map('+'.join, EXTENSIONS))
 def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path):
     def given(sessions):
         # as small as it is detectable, no motion tells a delay from a lag
@@ -319,8 +320,8 @@ def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path
     found, second = diagnosis_of([first], np.random.default_rng(0)), again(first, seed)
     (tmp_path / 'model.yaml').write_text(format_model(found.model))
     model = read_model(tmp_path / 'model.yaml')
-    assert set(names) <= {term.effect.name
-                          for term in model.terms} <= set(CATALOGUE), told(first, found)
+    assert set(names) <= {term.effect.name for term in model.terms} <= set(CATALOGUE), told(
+        first, found)
     noise = np.var(second.truth.noise)
     for before, after in zip(left_over(found.before, log_of(second)),
                              left_over(model, log_of(second))):
@@ -330,7 +331,7 @@ def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path
 
 
 def test_noise_is_found_against_a_model_only():
-    assert ({name
-             for name, cause in CAUSES.items() if cause.origin == 'noise'} <= set(MODEL_FINDINGS))
+    assert ({name for name, cause in CAUSES.items() if cause.origin == 'noise'}
+            <= set(MODEL_FINDINGS))
     log, = hidden_in(['angle_random_walk'], 20.0, 1, 'white', REFERENCES[0])
     assert names_of(diagnosis_of([log], np.random.default_rng(0), with_model=False)) == []

@@ -300,7 +300,7 @@ def left_over(hidden_name, other, log, sessions, twins):
 
 @pytest.mark.parametrize('pair', LOOK_ALIKES, ids='-'.join)
 @pytest.mark.parametrize('first', [True, False], ids=['first', 'second'])
-def test_twins_are_alike_and_then_parted(generator, pair, first):
+def test_twins_are_alike_and_then_distinguished(generator, pair, first):
     name, other = pair if first else reversed(pair)
     log = hide_look_alike(pair, name, generator, duration=600.0, sample_rate=20.0)
     assert left_over(name, other, log, [log.session], LOOK_ALIKES[pair]) < 3.0

@@ -12,7 +12,7 @@
 
 from dataclasses import replace
 
-from diagnosed import judged_findings, log_of
+from diagnosed import judge_findings, log_of
 from gyro_calibration.diagnosis.data_quality import (
     classify_reference,
     heading_difference,
@@ -202,7 +202,7 @@ def test_an_effect_of_the_rate_is_established_beside_the_noise_of_a_reference(re
     hidden = hide_with_reference(['scale_factor_asymmetry'], 5.0, np.random.default_rng(1),
                                  reference)
     found, named = established(hidden)
-    assert judged_findings(hidden, named).is_right, terminal_lines(found)
+    assert judge_findings(hidden, named).is_right, terminal_lines(found)
     assert named[0].minimum_detectable > 0.0
 
 
