@@ -69,7 +69,7 @@ def with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroM
 
 def uncertain_covariance(model: GyroModel, assumptions: Assumptions) -> Array:
     """
-    Return the covariance of all uncertain values of an `assumed` model, shape (m, m).
+    Return the covariance of a model's uncertain values, after `with_assumed_covariance`, (m, m).
 
     With a self-calibration, the temperature coefficient is before its s and b, which are the last
     two; without one, it is the last. `uncertain_sensitivity` has the same order.
@@ -85,19 +85,19 @@ def uncertain_covariance(model: GyroModel, assumptions: Assumptions) -> Array:
 def uncertain_sensitivity(model: GyroModel, sensitivity: Array,
                           temperature_distance: Number) -> Array:
     """
-    Return the sensitivity of the rate to each value of `uncertain`, shape (m, ...).
+    Return the sensitivity of the rate to each value of `uncertain_covariance`, shape (m, ...).
 
     Parameters
     ----------
-    sensitivity : `compensation.rate_sensitivity` of the `assumed` model, shape (m - 1, ...)
+    sensitivity : `compensation.rate_sensitivity` of the same model, shape (m - 1, ...)
     temperature_distance : of the temperature from that at which the bias is known, K, a number or
         shape (...)
 
     """
     place = _coefficient_index(model, len(sensitivity))
     whole = np.empty((len(sensitivity) + 1, *sensitivity.shape[1:]))
-    whole[:place], whole[place], whole[place + 1:] = (
-        sensitivity[:place], -temperature_distance, sensitivity[place:])
+    whole[:place], whole[place + 1:] = sensitivity[:place], sensitivity[place:]
+    whole[place] = -temperature_distance
     return whole
 
 

@@ -12,9 +12,10 @@
 Table of the bias at rest over temperature: kept between runs, aged, and used with its variance.
 
 The bias here is the rate at rest *after the model and before the self-calibration*
-(`Compensated.modelled`), which is also the bias of a `SelfCalibration`. So it does not depend on
-the self-calibration in use. The change of the bias with temperature from the table is added to the
-bias of the last calibration; the bias from the table is not, which would compensate it twice.
+(`CompensatedSamples.model_rate`), which is also the bias of a `SelfCalibration`. So it does not
+depend on the self-calibration in use. The change of the bias with temperature from the table is
+added to the bias of the last calibration; the bias from the table is not, which would compensate
+it twice.
 
 Biases differ by temperature, whose local coefficient is a smooth random process over temperature;
 by runs, as a gyro has another bias after each power-on; by jumps; and by time, through flicker,
@@ -222,8 +223,8 @@ class BiasTable:
             self._held_entries.clear()
             self._add_entry(given)
             return ''
-        self._held_entries = [*(each for each in self._held_entries
-                                if self._is_consistent(each, given)), given]
+        self._held_entries = [each for each in self._held_entries
+                              if self._is_consistent(each, given)] + [given]
         off = (f'{(bias - before) / DEGREE:.4f} deg/s off what is known at '
                f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
         if len(self._held_entries) < _JUMP_ESTIMATES:
@@ -231,8 +232,7 @@ class BiasTable:
             return f'a bias that is {off} is not used: check whether the robot turned slowly'
         self._add_jump((bias - before) ** 2)
         return (f'the bias jumped: {_JUMP_ESTIMATES} rests in a row are {off}; earlier entries '
-                'are '
-                'shifted')
+                'are shifted')
 
     def _is_consistent(self, held: Entry, given: Entry) -> bool:
         variance = (held.variance + given.variance + self._wander_variance(given.time - held.time)
@@ -296,8 +296,8 @@ class BiasTable:
     def bias_difference(self, from_temperature: float, to_temperature: float,
                         time: float) -> tuple[float, float]:
         """Return the change of bias between temperatures, rad/s, and its variance, (rad/s)²."""
-        (from_temperature, time), (to_temperature, _) = (_clip_to_range(from_temperature, time),
-                                                         _clip_to_range(to_temperature, time))
+        from_temperature, time = _clip_to_range(from_temperature, time)
+        to_temperature, _ = _clip_to_range(to_temperature, time)
         own = self._temperature_variance(from_temperature, np.array([to_temperature]))[:, 0]
         if not self.entries:
             return 0.0, float(_SIZE_PROBABILITIES @ own)
@@ -395,9 +395,9 @@ class BiasTable:
         wander = self._wander_variance(_pairwise_differences(times)) * (1.0 - np.eye(len(times)))
         alike = np.exp(
             -np.abs(_pairwise_differences(temperatures)) / self._prior.correlation_length)
+        ageing = self._prior.ageing ** 2 / _YEAR * alike * np.minimum(age[:, None], age)
         fixed = (_covariance_of_differences(self._wander_variance(age), wander)
-                 + np.diag(variances) + self._prior.ageing ** 2 / _YEAR * alike * np.minimum(
-                     age[:, None], age) + self._jump_covariance(runs))
+                 + np.diag(variances) + ageing + self._jump_covariance(runs))
         by_run = (self._prior.turn_on ** 2
                   * _covariance_of_differences(2.0 * (runs != self.run), 2.0 * runs_apart))
         return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
@@ -554,8 +554,7 @@ def _propagation_message(calibration: SelfCalibration, table: BiasTable, age: fl
     else:
         why = f'at {calibration.temperature:.1f} degC, and now it is {temperature:.1f} degC'
     return (f'the calibration was made {_format_age(age)} ago {why}: the standard deviation of '
-            'its bias '
-            f'is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
+            f'its bias is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
             f'{own / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
 
 

@@ -169,8 +169,8 @@ class Intervals:
                 or bisect_left(steps, _BURST_RATIO * middle) > _MIN_BURST_SHARE * len(steps)):
             # the longest may be gaps
             self._even_interval = steps[-1 - len(steps) // 100]
-            self.usual_interval = max(sum(min(step, self._even_interval)
-                                          for step in steps) / len(steps), MIN_SAMPLE_INTERVAL)
+            mean = sum(min(step, self._even_interval) for step in steps) / len(steps)
+            self.usual_interval = max(mean, MIN_SAMPLE_INTERVAL)
         self._gap_limit = self._even_interval + (_GAP_RATIO - 1.0) * self.usual_interval
 
 
@@ -241,8 +241,8 @@ class GapModel:
         self._lost_duration = self._last_step = 0.0
 
     def _begin_block(self) -> None:
-        self._duration, self._count, self._total, self._steps, self._squares = 0.0, 0, 0.0, 0, 0.0
-        self._products = 0.0
+        self._count = self._steps = 0
+        self._duration = self._total = self._squares = self._products = 0.0
 
     def add(self, interval: float, rate: float, rate_before: float,
             lost: int | None = None) -> Gap | None:
@@ -264,8 +264,7 @@ class GapModel:
             lost = self.intervals.add(interval)
         if lost:
             gap = self._make_gap(lost, interval, rate - rate_before)
-            self._lost_duration = gap.duration
-            self._last_step = 0.0
+            self._lost_duration, self._last_step = gap.duration, 0.0
             if interval > _BLOCK_DURATION:
                 self._begin_block()
                 for level in self._levels:
@@ -310,8 +309,8 @@ class GapModel:
         if self._steps and self._squares < MAX_RATE ** 2:
             weight = self._duration / (_MEMORY_DURATION + self._duration)
             self._step_square += weight * (self._squares / self._steps - self._step_square)
-            self._curvature_square += weight * (max(0.5 * (self._squares - self._products)
-                                                    / self._steps, 0.0) - self._curvature_square)
+            curvature = max(0.5 * (self._squares - self._products) / self._steps, 0.0)
+            self._curvature_square += weight * (curvature - self._curvature_square)
         for level in self._levels:
             if mean is None:
                 break
@@ -325,25 +324,25 @@ class GapModel:
         ends = self.noise.angle_random_walk ** 2 / usual
         noise = ends * (surplus * (0.5 * surplus + usual) + 0.5 * self._lost_duration * surplus)
         # a step larger than those before may have occurred at any time within the gap
-        new_step_square = max(step * step - _NEW_STEP_RATIO ** 2 * (
-            _interpolate_power_law(self._steps_by_length(), interval, 2.0) + 2.0 * ends), 0.0)
-        return Gap(lost, surplus, interval ** 2 * (_interpolate_power_law(
-            self._curvatures_by_length(), 0.5 * interval, 4.0) + new_step_square / 12.0), noise)
+        usual_square = _interpolate_power_law(self._steps_by_length(), interval, 2.0) + 2.0 * ends
+        new_square = max(step * step - _NEW_STEP_RATIO ** 2 * usual_square, 0.0)
+        curvature = _interpolate_power_law(self._curvatures_by_length(), 0.5 * interval, 4.0)
+        return Gap(lost, surplus, interval ** 2 * (curvature + new_square / 12.0), noise)
 
     def _curvatures_by_length(self) -> list[tuple[float, float]]:
         """Return lengths, s, and the variance by curvature without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual_interval
-        points = [(usual, _POINT_VARIANCE_SHARE * max(
-            self._curvature_square - 1.5 * density / usual, 0.0))]
-        return points + [(each.length, _MEAN_VARIANCE_SHARE * each.without_noise(density)[0])
-                         for each in self._levels[usual > 0.5 * _BLOCK_DURATION:]]
+        curvature = max(self._curvature_square - 1.5 * density / usual, 0.0)
+        return [(usual, _POINT_VARIANCE_SHARE * curvature),
+                *((each.length, _MEAN_VARIANCE_SHARE * each.without_noise(density)[0])
+                  for each in self._levels[usual > 0.5 * _BLOCK_DURATION:])]
 
     def _steps_by_length(self) -> list[tuple[float, float]]:
         """Return lengths, s, and the mean squares of steps without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual_interval
-        points = [(usual, max(self._step_square - 2.0 * density / usual, 0.0))]
-        return points + [(each.length, each.without_noise(density)[1])
-                         for each in self._levels if each.length > usual]
+        return [(usual, max(self._step_square - 2.0 * density / usual, 0.0)),
+                *((each.length, each.without_noise(density)[1])
+                  for each in self._levels if each.length > usual)]
 
 
 def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[int]:

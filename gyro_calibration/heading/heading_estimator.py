@@ -111,6 +111,7 @@ class HeadingEstimator:
     current_model : the model with the present calibration, by which samples are compensated
     tracker : of the heading
     table : of biases at rest
+    is_calibrated_this_run : whether the calibration was made in this run
     temperature : last temperature, degC; None before the first
     rate : last rate, rad/s; zero at rest
     corrected_rate : last rate before the tracker, rad/s
@@ -140,7 +141,7 @@ class HeadingEstimator:
         self._temperature_timeout, self._keeps_steps = temperature_timeout, keep
         self.temperature: float | None = None
         self._temperature_time, self._follows_temperature = -math.inf, False
-        self._calibrated_this_run = self._age_changed = False
+        self.is_calibrated_this_run = self._age_changed = False
         self.rate = self.corrected_rate = 0.0
         self.last_compensated = CompensatedSamples(0.0, 0.0, 0.0, False, False)
         self.restart_count = 0
@@ -162,13 +163,13 @@ class HeadingEstimator:
 
     def use_calibration(self, model: GyroModel, now: float) -> None:
         """Use a self-calibration that was made just now; the heading does not jump."""
-        self.model, self._calibrated_this_run = model, True
+        self.model, self.is_calibrated_this_run = model, True
         self._restart(now, is_fresh=True)
 
     def begin_run(self, now: float) -> None:
         """Expect another bias, as after the gyro was without power; the heading does not jump."""
         self.table.begin_run()
-        self._calibrated_this_run = False
+        self.is_calibrated_this_run = False
         self._restart(now)
 
     def configure(self, settings: Settings) -> None:  # noqa: A003
@@ -186,20 +187,15 @@ class HeadingEstimator:
         self._heading_before_resets += self.tracker.heading - heading
         self.tracker.set_heading(heading, variance)
 
-    @property
-    def is_calibrated_this_run(self) -> bool:
-        """Tell whether the calibration was made in this run."""
-        return self._calibrated_this_run
-
     def shift_clock(self, step: float) -> None:
         """Correct all dates of this run for a clock that was set by a step, s."""
         self._start_time += step
         self.table.shift_clock(step)
         calibration = self.model.self_calibration
-        old = (not self._calibrated_this_run
+        old = (not self.is_calibrated_this_run
                and (calibration is not None or len(self.table.entries) > 0))
         self._age_changed = self._age_changed or (old and abs(step) > _AGE_TOLERANCE)
-        if self._calibrated_this_run and calibration is not None and calibration.time:
+        if self.is_calibrated_this_run and calibration is not None and calibration.time:
             then = datetime.fromisoformat(calibration.time) + timedelta(seconds=step)
             self.model = with_self_calibration(
                 self.model, replace(calibration, time=then.isoformat(timespec='seconds')))
@@ -209,8 +205,8 @@ class HeadingEstimator:
     def _restart(self, now: float, is_fresh: bool = False) -> None:
         """Propagate the calibration to the present, unless it is new, and start the tracker."""
         self._calibration_message = ''
-        self.current_model, age = ((with_assumed_covariance(self.model, self._assumptions),
-                                    0.0) if is_fresh else self._propagated_model(now))
+        self.current_model, age = ((with_assumed_covariance(self.model, self._assumptions), 0.0)
+                                   if is_fresh else self._propagated_model(now))
         self.covariance = uncertain_covariance(self.current_model, self._assumptions)
         temperature = self.model.reference_temperature
         sensitivity_slope = None if self.current_model.needs_history else np.subtract(
@@ -252,10 +248,9 @@ class HeadingEstimator:
 
         """
         here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
-        before = (None if around is None
-                  else replace(around, temperature=self.last_compensated.temperature))
-        held = (compensate(self.current_model, 0.0, self.last_compensated.temperature,
-                           before).model_rate)
+        last = self.last_compensated.temperature
+        before = None if around is None else replace(around, temperature=last)
+        held = compensate(self.current_model, 0.0, last, before).model_rate
         self._bias_shift = float(here) - float(held)
         self._unobserved_distance = _lost_temperature_distance(self._time - self._unknown_since)
         self._start_correction(now)
@@ -274,16 +269,15 @@ class HeadingEstimator:
                 model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
-        worth = propagate_calibration(calibration, self.table, self.age(now), now,
-                                      self._known_temperature, self._calibrated_this_run)
-        self._calibration_message = worth.message
+        propagated = propagate_calibration(calibration, self.table, self.age(now), now,
+                                           self._known_temperature, self.is_calibrated_this_run)
+        self._calibration_message = propagated.message
         if (self._dated_age(now) or 0.0) < -_AGE_TOLERANCE:
-            self._calibration_message = (f'the calibration is dated {calibration.time}, which is '
-                                         'later than '
-                                         'the clock of this computer: its age is not known and '
-                                         'taken for a '
-                                         'year; set the clock, or calibrate again')
-        return with_self_calibration(model, worth.calibration), 0.0
+            self._calibration_message = (
+                f'the calibration is dated {calibration.time}, which is later than the clock of '
+                'this computer: its age is not known and taken for a year; set the clock, or '
+                'calibrate again')
+        return with_self_calibration(model, propagated.calibration), 0.0
 
     @property
     def calibration_message(self) -> str:
@@ -376,7 +370,7 @@ class HeadingEstimator:
             return ''
         last, self._time = self._time, time
         known_again = not self._follows_temperature and self._known_temperature is not None
-        goes_on = self._calibrated_this_run and last > -math.inf
+        goes_on = self.is_calibrated_this_run and last > -math.inf
         if self._age_changed or known_again and not goes_on:
             self._restart(now)
         around = (self._follow_channels(time - last, force, supply)
@@ -391,8 +385,9 @@ class HeadingEstimator:
         if change:
             rate -= change * (1.0 if calibration is None else calibration.scale)
         if abs(time - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
-            self._rest_sensitivity, self._rest_sensitivity_time = self._uncertain_sensitivity(
-                output, 0.0, self.last_compensated.temperature, around, distance), time
+            self._rest_sensitivity_time = time
+            self._rest_sensitivity = self._uncertain_sensitivity(output, 0.0, result.temperature,
+                                                                 around, distance)
         self._update_sensitivity(time, output, float(result.rate), around, distance)
         message = tracker.add(time, rate, self._sensitivity, wheels, self._rest_sensitivity)
         self.corrected_rate, self.rate = rate, tracker.rate
@@ -415,9 +410,7 @@ class HeadingEstimator:
     def _update_sensitivity(self, time: float, output: float, rate: float, around: Channels | None,
                             distance: float) -> None:
         """Update the sensitivity, which is held at rest and for a short time at similar rates."""
-        at, looked = self._held_time_and_rate
-        if (abs(time - at) > _SENSITIVITY_INTERVAL + TIME_TOLERANCE
-                or abs(rate - looked) > _RATE_TOLERANCE + _RELATIVE_RATE_TOLERANCE * abs(rate)):
+        if _is_outdated(time, rate, self._held_time_and_rate):
             self._held_sensitivity, self._held_time_and_rate = None, (time, rate)
             self._held_arguments = (output, rate, self.last_compensated.temperature, around,
                                     distance)
@@ -428,9 +421,9 @@ class HeadingEstimator:
             self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
         self._sensitivity = self._held_sensitivity
 
-    def _uncertain_sensitivity(self, output: float, rate: float, temperature: Number,
-                               around: Channels | None, distance: float) -> Array:
-        """Return the sensitivity of the rate to each uncertain value, shape (m,)."""
+    def _uncertain_sensitivity(self, output: Number, rate: Number, temperature: Number,
+                               around: Channels | None, distance: Number) -> Array:
+        """Return the sensitivity of the rate to each uncertain value, shape (m, ...)."""
         return uncertain_sensitivity(
             self.current_model,
             rate_sensitivity(self.current_model, output, rate, temperature, around), distance)
@@ -546,8 +539,8 @@ class HeadingEstimator:
             else:
                 change[:], distance[:] = self._bias_change(self._time)
         calibration = used.self_calibration
-        rate = np.asarray(result.rate) - change * (1.0 if calibration is None
-                                                   else calibration.scale)
+        scale = 1.0 if calibration is None else calibration.scale
+        rate = np.asarray(result.rate) - change * scale
         still = self._rest_sensitivities(time, output, result, distance)
         found[:, :5] = tracker.follow(time, rate,
                                       self._motion_sensitivities(time, output, result, distance),
@@ -572,7 +565,7 @@ class HeadingEstimator:
 
     def _rest_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
                             distance: Array) -> Array:
-        """Return the sensitivities at rest, computed every `_STILL` s, shape (n, m)."""
+        """Return the sensitivities at rest, held for half a second, shape (n, m)."""
         places = list[int]()
         for place, at in enumerate(time.tolist()):
             if abs(at - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
@@ -587,19 +580,18 @@ class HeadingEstimator:
     def _motion_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
                               distance: Array) -> Array:
         """Return the sensitivities in motion, which are held for a short time, shape (n, m)."""
-        places, (at, looked) = list[int](), self._held_time_and_rate
+        places, held_time_and_rate = list[int](), self._held_time_and_rate
         rates = np.asarray(result.rate)
         for place, (now, rate) in enumerate(zip(time.tolist(), rates.tolist())):
-            if (abs(now - at) > _SENSITIVITY_INTERVAL + TIME_TOLERANCE or abs(rate - looked)
-                    > _RATE_TOLERANCE + _RELATIVE_RATE_TOLERANCE * abs(rate)):
+            if _is_outdated(now, rate, held_time_and_rate):
                 places.append(place)
-                at, looked = now, rate
+                held_time_and_rate = now, rate
         if (self._held_sensitivity is None and (not places or places[0])
                 and self._held_time_and_rate[0] > -math.inf):
             self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
         held = self._rest_sensitivity if self._held_sensitivity is None else self._held_sensitivity
         rows = self._sensitivity_rows(places, output, rates, result, distance)
-        self._held_time_and_rate = at, looked
+        self._held_time_and_rate = held_time_and_rate
         whole = np.repeat(np.vstack([held, rows]), np.diff([0, *places, len(time)]), axis=0)
         self._held_sensitivity = whole[-1]
         return whole
@@ -610,10 +602,10 @@ class HeadingEstimator:
         if not places:
             return np.empty((0, len(self.covariance)))
         temperature = result.temperature
-        return uncertain_sensitivity(self.current_model, rate_sensitivity(
-            self.current_model, output[places], rate[places],
-            temperature[places] if isinstance(temperature, np.ndarray) else temperature),
-            distance[places]).T
+        if isinstance(temperature, np.ndarray):
+            temperature = temperature[places]
+        return self._uncertain_sensitivity(output[places], rate[places], temperature, None,
+                                           distance[places]).T
 
     # The bias at rest for the next run
 
@@ -699,6 +691,12 @@ class HeadingEstimator:
         """Return the channels that the model needs and that no message contains."""
         return [channel for channel in ('supply', 'specific_force')
                 if self.current_model.uses_channel(channel) and channel not in available]
+
+
+def _is_outdated(time: float, rate: float, held: tuple[float, float]) -> bool:
+    """Tell whether a sensitivity in motion, held since a time and a rate, is computed again."""
+    return (abs(time - held[0]) > _SENSITIVITY_INTERVAL + TIME_TOLERANCE
+            or abs(rate - held[1]) > _RATE_TOLERANCE + _RELATIVE_RATE_TOLERANCE * abs(rate))
 
 
 def _lost_temperature_distance(delay: float) -> float:

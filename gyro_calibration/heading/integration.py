@@ -86,8 +86,8 @@ class ThresholdFilter:
             return False
         # motion if the window varies by more than the noise
         explained = 9.0 * self.settings.angle_random_walk ** 2 * len(rates)
-        return not 0.0 < explained < ((sum(each * each for each in rates) / len(rates)
-                                       - mean * mean) * (time - window[0][0]))
+        variance = sum(each * each for each in rates) / len(rates) - mean * mean
+        return not 0.0 < explained < variance * (time - window[0][0])
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
@@ -170,13 +170,13 @@ class BlockIntegrator:
         return (filtered, heading,
                 np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen))
 
-    def _gap_variances(self, time: Array, rate: Array, is_kept: Array) -> Array:
+    def _gap_variances(self, time: Array, rate: Array, kept: Array) -> Array:
         """Return the variance by the gaps so far, rad², shape (n,)."""
         unseen, (last_time, last_rows) = np.zeros(len(time)), self._last_sample
         before = ((float(last_time[0]), self._last_rate, bool(last_rows[1, 0])) if len(last_time)
                   else None)
-        for index, sample in enumerate(zip(time.tolist(), rate.tolist(),
-                                           (is_kept > 0.0).tolist())):
+        samples = zip(time.tolist(), rate.tolist(), (kept > 0.0).tolist())
+        for index, sample in enumerate(samples):
             gap = self._gaps.add(sample[0] - before[0], sample[1], before[1]) if before else None
             if gap is not None and before is not None and (sample[2] or before[2]):
                 self._gap_variance += gap.variance

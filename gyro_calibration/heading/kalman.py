@@ -130,7 +130,7 @@ class HeadingState:
                                   rate_integral.is_unobserved, len(rate_integral.sensitivity))
 
     def _observation_row(self, rate_integral: RateIntegral) -> tuple[Array, float]:
-        """Return `Step.seen`, and the variance of the noise of the integral, rad²."""
+        """Return `Transition.observation`, and the variance of the noise of the integral, rad²."""
         seen, _, grown = self._padded_transition(rate_integral)
         seen = seen.copy()
         seen[len(seen) - len(rate_integral.sensitivity):] = -rate_integral.sensitivity
@@ -165,15 +165,14 @@ class HeadingState:
         """
         Return the state at the begin of a time at rest, updated by its measurement.
 
-        A `wander` of the turn is added to the variance of the measurement and to that of the
+        A `wander_variance` is added to the variance of the measurement and to that of the
         heading, which is then the heading at the end.
 
         """
         step = step or self.transition(rate_integral)
         gain_direction = self.covariance @ step.observation
-        variance = float(
-            step.observation @ gain_direction
-            + step.process_noise[HEADING_INDEX, HEADING_INDEX]) + rate_integral.wander_variance
+        noise = step.process_noise[HEADING_INDEX, HEADING_INDEX]
+        variance = float(step.observation @ gain_direction + noise) + rate_integral.wander_variance
         innovation = rate_integral.angle - float(step.observation @ self.mean)
         covariance = self.covariance
         if rate_integral.wander_variance:
@@ -249,11 +248,11 @@ def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, varianc
     Parameters
     ----------
     noise : of the model
-    covariance : of the calibration, shape (m, m), from `compensation.covariance`
+    covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
     heading, variance : rad and rad²
-    age : of a self-calibration, s, whose bias, the last value, is a mean over `CALIBRATED` s; None
-        without one. Its variance contains the floor of the Allan deviation for the flicker, which
-        is replaced here by that of the flicker components
+    age : of a self-calibration, s, whose bias, the last value, is a mean over
+        `BIAS_AVERAGING_TIME`; None without one. Its variance contains the floor of the Allan
+        deviation for the flicker, which is replaced here by that of the flicker components
 
     """
     constants, flicker_variances = noise.flicker_processes()
@@ -277,13 +276,13 @@ def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, varianc
 def heading_variances(states: list[HeadingState], rate_integrals: list[RateIntegral]) -> Array:
     """Return the variance of the heading after each turn from its state, rad², shape (k,)."""
     figures = np.array([(turn.duration, turn.lost_variance + turn.extra_noise_variance
-                         + drift.noise.angle_random_walk ** 2 * turn.duration)
-                        for drift, turn in zip(states, rate_integrals)])
+                         + state.noise.angle_random_walk ** 2 * turn.duration)
+                        for state, turn in zip(states, rate_integrals)])
     # flicker and random walk have the same parameters in all states
     seen, variances = _integrated_wander(states[0].noise, np.round(figures[:, 0], 6))
     rows = np.concatenate([-seen, [turn.sensitivity for turn in rate_integrals]], axis=1)
     rows[:, HEADING_INDEX] += 1.0
-    spread = np.matmul([drift.covariance for drift in states], rows[:, :, None])[:, :, 0]
+    spread = np.matmul([state.covariance for state in states], rows[:, :, None])[:, :, 0]
     return np.asarray((spread * rows).sum(axis=1) + variances + figures[:, 1])
 
 
@@ -294,14 +293,15 @@ def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:
     left = np.exp(-ratio)
     seen = np.zeros((len(durations), _FLICKER_INDEX + len(constants)))
     seen[:, WALK_INDEX], seen[:, _FLICKER_INDEX:] = durations, constants * (1.0 - left)
-    return seen, (noise.rate_random_walk ** 2 * durations ** 3 / 3.0 + variance * (
-        constants ** 2 * np.maximum(2.0 * ratio - 3.0 + 4.0 * left - left ** 2, 0.0)).sum(axis=1))
+    parts = constants ** 2 * np.maximum(2.0 * ratio - 3.0 + 4.0 * left - left ** 2, 0.0)
+    walk = noise.rate_random_walk ** 2 * durations ** 3 / 3.0
+    return seen, walk + variance * parts.sum(axis=1)
 
 
 @lru_cache(maxsize=4096)
 def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
                        value_count: int) -> tuple[Array, Array, Array]:
-    """Return `_wander` or `_unseen` with room for the values of a calibration."""
+    """Return one of the two transitions with room for the values of a calibration."""
     seen, kept, grown = (_unobserved_transition if is_unobserved else _wander_transition)(
         noise, duration)
     whole = np.zeros((len(kept) + value_count, len(kept) + value_count))
@@ -372,9 +372,9 @@ def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: 
         transition[HEADING_INDEX] -= step.observation
         shared = state.covariance @ transition.T
     smoother_gain = shared @ _pseudo_inverse(after.covariance)
+    change = smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T
     return replace(start, mean=start.mean + smoother_gain @ (later.mean - after.mean),
-                   covariance=start.covariance
-                   + smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T)
+                   covariance=start.covariance + change)
 
 
 def _pseudo_inverse(covariance: Array) -> Array:

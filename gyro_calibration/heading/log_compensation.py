@@ -18,7 +18,7 @@ A model with history is evaluated over blocks of the log.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from gyro_calibration.heading.gaps import Intervals
@@ -74,10 +74,10 @@ class LogCompensation:
             return self._compensate(log, None)
         compensated, sensitivities = zip(*(self._compensate_part(part)
                                            for part in self._split_by_reference(log)))
-        joined = {each.name: np.concatenate(
-            [np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
-                  for each in fields(CompensatedSamples)}
-        return CompensatedSamples(**joined), np.concatenate(sensitivities, axis=1)
+        columns = zip(*([np.broadcast_to(each, part.rate.shape) for each in vars(part).values()]
+                        for part in compensated))
+        joined = CompensatedSamples(*(np.concatenate(parts) for parts in columns))
+        return joined, np.concatenate(sensitivities, axis=1)
 
     def true_time(self, time: Array) -> Array:
         """Return when the samples with the next stamps, s, were taken."""
@@ -157,13 +157,12 @@ def plausible_rows(model: GyroModel, log: Log) -> Mask:
 def no_plausible_row_message(model: GyroModel) -> str:
     """Return the message for a log without a plausible row."""
     coldest, hottest = model.temperature_limits
-    return ('no row is plausible, with an output within '
-            f'{model.rate_limit / DEGREE:.0f} deg/s and a temperature from {coldest:.0f} to '
-            f'{hottest:.0f} degC; check columns and units')
+    return (f'no row is plausible, with an output within {model.rate_limit / DEGREE:.0f} deg/s '
+            f'and a temperature from {coldest:.0f} to {hottest:.0f} degC; check columns and units')
 
 
 def compensate_log(model: GyroModel, log: Log) -> Array:
-    """Return the rates of a log with output, rad/s, shape (n,); nan where not `plausible`."""
+    """Return the rates of a log with output, rad/s, shape (n,); nan where not plausible."""
     known = plausible_rows(model, log)
     rate = np.full(len(log), np.nan)
     rate[known] = LogCompensation(model).add(rows_of(log, known))[0].rate

@@ -52,8 +52,9 @@ _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
 #: to it; the first is that of a rest, the others are those of straight drives.
 SCATTER_RATIOS = np.append(0.0, 4.0 ** np.arange(7))
-#: Prior numbers of rests, and of straight drives that pass for rests; largest total of both.
-_PRIOR_RESTS, _PRIOR_STRAIGHT_DRIVES, _MAX_STRETCHES = 3.0, 1.0, 20.0
+#: Prior numbers of rests, 3, and of straight drives that pass for rests, 1; largest total.
+_PRIOR_COUNTS = np.append(3.0, np.full(len(SCATTER_RATIOS) - 1, 1.0 / (len(SCATTER_RATIOS) - 1)))
+_MAX_STRETCHES = 20.0
 #: Threshold per mean for the onset of scatter: the maximum likelihood for a variance of three
 #: times that of the noise.
 SCATTER_ONSET_THRESHOLD = math.log(3.0) / (1.0 - 1.0 / 3.0)
@@ -137,7 +138,7 @@ class _LowestDecile:
 
 class EnergyDetector:
     """
-    The energy of the last `WINDOW` s.
+    The energy of the last `WINDOW_DURATION` s.
 
     Attributes
     ----------
@@ -241,7 +242,7 @@ class Snapshot:
     rate_integral : integral of the rates since the rest began
     innovation_square_sum, innovation_count : sum of the squared normalized innovations since it
         began, and their number
-    log_likelihood : log-likelihood of their scatter for each of `SCATTERS`, shape (k,)
+    log_likelihood : log-likelihood of their scatter for each of `SCATTER_RATIOS`, shape (k,)
 
     """
 
@@ -261,12 +262,11 @@ class RestScatter:
 
     Attributes
     ----------
-    counts : number of rests with each of `SCATTERS`, shape (k,)
+    counts : number of rests with each of `SCATTER_RATIOS`, shape (k,)
 
     """
 
-    counts: Array = field(default_factory=lambda: np.append(_PRIOR_RESTS, np.full(
-        len(SCATTER_RATIOS) - 1, _PRIOR_STRAIGHT_DRIVES / (len(SCATTER_RATIOS) - 1))))
+    counts: Array = field(default_factory=_PRIOR_COUNTS.copy)
 
     def probabilities(self, likelihood: Array) -> Array:
         """Return the probability of each scatter, shape (k,)."""
@@ -318,8 +318,8 @@ class Samples:
         return (self.still_sensitivity if self.still_sensitivity is None
                 or self.still_sensitivity.ndim == 1 else self.still_sensitivity[place])
 
-    def sample(self, place: int, resting: bool,
-               ) -> tuple[float, float, Array, bool | None, Array | None]:
+    def sample(self, place: int,
+               resting: bool) -> tuple[float, float, Array, bool | None, Array | None]:
         """Return the arguments of `HeadingTracker.add`."""
         return (float(self.time[place]), float(self.rate[place]),
                 (self.rest_sensitivity if resting else self.motion_sensitivity)[place],
@@ -392,12 +392,11 @@ class EvenSamples:
         self.block_starts = [0, *self.block_stops[:-1]]
         self.whole_blocks = range(bool(begun), whole)
         moving = self._integrate_sensitivity(self.motion_sensitivity)
-        self.sensitivity_integrals = (moving,
-                                      (moving if given.rest_sensitivity is given.motion_sensitivity
-                                       else self._integrate_sensitivity(self.rest_sensitivity)))
-        sums = [self._sum_by_blocks(values).tolist()
-                for values in (self.intervals, self.angles, self.rate, self.rate * self.rate,
-                               steps * steps)]
+        resting = (moving if given.rest_sensitivity is given.motion_sensitivity
+                   else self._integrate_sensitivity(self.rest_sensitivity))
+        self.sensitivity_integrals = moving, resting
+        summed = (self.intervals, self.angles, self.rate, self.rate * self.rate, steps * steps)
+        sums = [self._sum_by_blocks(values).tolist() for values in summed]
         self._pending_retention = 1.0 - self.intervals / SETTLING_TIME
         sums.insert(2, np.multiply.reduceat(self._pending_retention, self.block_starts).tolist())
         self.block_sums = list(zip(*sums))
@@ -413,9 +412,9 @@ class EvenSamples:
 
     def wheels_in_block(self, number: int) -> Sequence[bool | None]:
         """Return whether wheels moved the robot, for the samples of a block."""
-        wheels = self._given.wheels
-        return () if wheels is None else wheels[self._first + self.block_starts[number]:
-                                                self._first + self.block_stops[number]]
+        wheels, first = self._given.wheels, self._first
+        rows = slice(first + self.block_starts[number], first + self.block_stops[number])
+        return () if wheels is None else wheels[rows]
 
     def still(self, place: int) -> Array | None:
         return self._given.still_at(self._first + place)
@@ -439,11 +438,10 @@ class EvenSamples:
         """End the last epoch before a sample."""
         if self.epochs:
             epoch = self.epochs[-1]
-            epoch.end_index = end
-            if end > max(epoch.start_index, 0):
-                self.used_sensitivity[epoch.start_index + 2:end + 2] = (
-                    self.rest_sensitivity if epoch.is_resting
-                    else self.motion_sensitivity)[epoch.start_index + 1:end + 1]
+            epoch.end_index, first = end, epoch.start_index + 1
+            if end >= max(first, 1):
+                rows = self.rest_sensitivity if epoch.is_resting else self.motion_sensitivity
+                self.used_sensitivity[first + 1:end + 2] = rows[first:end + 1]
 
     def fill_results(self, usual_intervals: Array) -> None:
         """Compute the results of the epochs; `usual_intervals` has a row for each sample."""
@@ -454,17 +452,16 @@ class EvenSamples:
             here = slice(max(epoch.start_index, 0), epoch.end_index)
             if here.stop <= here.start:
                 continue
-            drift, rows = epoch.state, self.used_sensitivity[1:][here]
-            offset, variance = drift.wander_rate
-            values, covariance, shared = drift.calibration_errors
+            state, rows = epoch.state, self.used_sensitivity[1:][here]
+            offset, variance = state.wander_rate
+            values, covariance, shared = state.calibration_errors
             found[here, 3] = (variance + ((rows @ covariance - 2.0 * shared) * rows).sum(axis=1)
-                              + drift.noise.angle_random_walk ** 2
+                              + state.noise.angle_random_walk ** 2
                               / (WINDOW_DURATION if epoch.is_resting else interval[here]))
             found[here, 4] = epoch.is_resting
             if epoch.is_resting:
-                found[here, :3] = (epoch.heading,
-                                   (float(drift.covariance[HEADING_INDEX, HEADING_INDEX])
-                                    + epoch.pending ** 2), 0.0)
+                variance = float(state.covariance[HEADING_INDEX, HEADING_INDEX])
+                found[here, :3] = epoch.heading, variance + epoch.pending ** 2, 0.0
                 continue
             moving.append(epoch)
             found[here, 2] = self.rate[here] + rows @ values - offset
@@ -488,7 +485,7 @@ class EvenSamples:
         """Add the variance of the heading in epochs of motion."""
         opens = [(epoch.state, turn) for epoch in epochs for _, turn in epoch.open_integrals]
         known = heading_variances(*map(list, zip(*opens)))
-        white = [drift.noise.angle_random_walk ** 2 for drift, _ in opens]
+        white = [state.noise.angle_random_walk ** 2 for state, _ in opens]
         places = np.array([place for epoch in epochs for place, _ in epoch.open_integrals])
         until = np.append(np.cumsum(self.intervals), 0.0)  # the last is that of the place -1
         rows = np.concatenate(

@@ -145,9 +145,9 @@ class HeadingTracker:
         Parameters
         ----------
         noise : of the model
-        covariance : of the calibration, shape (m, m), from `compensation.covariance`
+        covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
         age : of the self-calibration, whose s and b are the last values, s; None without one
-        keeps_steps : the `steps`, for `smoothed`
+        keeps_steps : the `steps`, for `log_compensation.smooth_track`
         sensitivity_slope : change of the sensitivity with the rate, shape (m,): the rates include
             the bias estimated at rest, on which a scale factor error does not act
 
@@ -224,11 +224,11 @@ class HeadingTracker:
         heading = self.heading + self._pending_correction
         variance = self.variance - self._pending_correction ** 2
         if self._keeps_steps and self._last_sample is not None:
-            drift, turn = self._state, self._open_integral + self._block_integral
+            state, turn = self._state, self._open_integral + self._block_integral
             self._propagate_state(
                 self._with_still_sensitivity(turn) if self.is_resting else turn, self._last_time)
             self.recalibrations.append((len(self.steps), self._state))
-            self._state = drift
+            self._state = state
         self._still_sensitivity, self._sensitivity_slope = None, sensitivity_slope
         if self._last_sample is not None:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
@@ -303,13 +303,13 @@ class HeadingTracker:
                 self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
             # the jump is permanent; its time between the samples is not known
-            self._block_integral.lost_variance += (
-                (0.5 * (spike[1] - self._last_sample[1]) * (spike[0] - self._last_sample[0])) ** 2)
+            turned = 0.5 * (spike[1] - self._last_sample[1]) * (spike[0] - self._last_sample[0])
+            self._block_integral.lost_variance += turned ** 2
             # a rate between two jumps within 2 s may be erroneous
             begun, before = self._before_last_jump
             if 0.0 < spike[0] - begun < _MIN_REST_DURATION:
-                self._block_integral.lost_variance += (
-                    ((self._last_sample[1] - before) * (spike[0] - begun)) ** 2)
+                turned = (self._last_sample[1] - before) * (spike[0] - begun)
+                self._block_integral.lost_variance += turned ** 2
             self._before_last_jump = self._last_sample[:2]
             self._take_sample(*spike)
         elif spike is not None:
@@ -349,8 +349,8 @@ class HeadingTracker:
             self._detect_motion(interval if gap is None else interval - gap.duration, last[1],
                                 wheels)
         elif self._block_integral.duration >= BLOCK_DURATION - TIME_TOLERANCE:
-            self._open_integral, self._block_integral, self._open_variance = (
-                self._open_integral + self._block_integral, self._new_integral(), None)
+            self._open_integral += self._block_integral
+            self._block_integral, self._open_variance = self._new_integral(), None
             if self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
                 self._advance_state()
         self.rate = (0.0 if self.is_resting or filtered != rate
@@ -405,9 +405,9 @@ class HeadingTracker:
         intervals = np.diff(time, prepend=self._last_sample[0])
         with np.errstate(invalid='ignore'):
             steps = np.abs(np.diff(rate, prepend=self._last_sample[1]))
-            even = (np.abs(rate) < MAX_RATE) & (intervals >= 0.0) & (
-                intervals <= self._settings.maximum_gap) & (
-                    steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals)
+            even = ((np.abs(rate) < MAX_RATE) & (intervals >= 0.0)
+                    & (intervals <= self._settings.maximum_gap)
+                    & (steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals))
         return len(even) if even.all() else int(np.argmin(even))
 
     def _follow_even_samples(self, given: Samples, begin: int, end: int, found: Array) -> int:
@@ -536,9 +536,10 @@ class HeadingTracker:
         assert self._last_sample is not None
         _, rate, _, sensitivity = self._last_sample
         self._block.add(duration, rate, before)
-        if self.is_resting and (wheels or abs(rate - self._rate_error(sensitivity))
-                                > math.hypot(self._energy.sudden_limit(), self._bias_margin)):
-            self._revert_to_motion(0.0)
+        if self.is_resting:
+            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
+            if wheels or abs(rate - self._rate_error(sensitivity)) > limit:
+                self._revert_to_motion(0.0)
         self._wheels_moved = self._wheels_moved or bool(wheels)
         if self._block.duration >= BLOCK_DURATION - TIME_TOLERANCE:
             self._end_block(self._wheels_moved, wheels)
@@ -581,8 +582,9 @@ class HeadingTracker:
         """Hold the last blocks, which may be the begin of a rest."""
         self._recent_blocks.append(part)
         self._held_integral += part
-        while (len(self._recent_blocks) > 2 and self._held_integral.duration
-               - self._recent_blocks[0].duration >= self._quiet_duration - TIME_TOLERANCE):
+        least = self._quiet_duration - TIME_TOLERANCE
+        while (len(self._recent_blocks) > 2
+               and self._held_integral.duration - self._recent_blocks[0].duration >= least):
             self._held_integral -= self._recent_blocks.popleft()
 
     def _held_rest_integral(self) -> RateIntegral:
@@ -594,11 +596,11 @@ class HeadingTracker:
         if (self._held_integral.duration < self._quiet_duration - TIME_TOLERANCE
                 or len(self._recent_blocks) < 2):
             return False
-        most = self._sigmas[self._quiet_duration] * (1.0 if self._quiet_duration == WINDOW_DURATION
-                                                     else 0.5)
-        stands = abs(self._normalized_innovation(
+        factor = 1.0 if self._quiet_duration == WINDOW_DURATION else 0.5
+        innovation = self._normalized_innovation(
             self._state, self._with_still_sensitivity(self._held_rest_integral()),
-            _WHEEL_BIAS_CHANGE if wheels is False else 0.0)) < most
+            _WHEEL_BIAS_CHANGE if wheels is False else 0.0)
+        stands = abs(innovation) < factor * self._sigmas[self._quiet_duration]
         if (not stands and self._quiet_duration > WINDOW_DURATION
                 and not self._accept_slow_turn_as_bias()):
             self._enter_motion(self._quiet_duration)
@@ -617,8 +619,9 @@ class HeadingTracker:
             return False
         start = suspected.snapshot.state.with_added_variance(WALK_INDEX, suspected.rate ** 2)
         moved = start.advance_at_rest(self._with_still_sensitivity(suspected.rate_integral))
-        if (suspected.rate_integral.duration + held.duration < _SLOW_TURN_DECISION_TIME or abs(
-                self._normalized_innovation(moved, held)) > self._sigmas[self._quiet_duration]):
+        most = self._sigmas[self._quiet_duration]
+        if (suspected.rate_integral.duration + held.duration < _SLOW_TURN_DECISION_TIME
+                or abs(self._normalized_innovation(moved, held)) > most):
             suspected.rate_integral += held
             return False
         if self._keeps_steps:
@@ -632,10 +635,10 @@ class HeadingTracker:
         self._adopt_state()
         return True
 
-    def _normalized_innovation(self, drift: HeadingState, turn: RateIntegral,
+    def _normalized_innovation(self, state: HeadingState, turn: RateIntegral,
                                bias_change: float = 0.0) -> float:
         """Return the deviation of an integral from that at rest, in standard deviations."""
-        expected, variance = drift.expected_rest_angle(turn)
+        expected, variance = state.expected_rest_angle(turn)
         return (turn.angle - expected) / math.sqrt(variance + (bias_change * turn.duration) ** 2)
 
     def _compare_means(self, wheels: bool | None) -> None:
@@ -670,9 +673,10 @@ class HeadingTracker:
             limit = _NOISE_TOLERANCE ** 2 * scatter_threshold(
                 lag, last.innovation_count - before.innovation_count, self._settings.false_alarms)
             if last.innovation_square_sum - before.innovation_square_sum > limit:
-                self._revert_to_motion(lag, max(self._snapshots, key=lambda each: (
+                onset = max(self._snapshots, key=lambda each: (
                     last.innovation_square_sum - each.innovation_square_sum
-                    - SCATTER_ONSET_THRESHOLD * (last.innovation_count - each.innovation_count))))
+                    - SCATTER_ONSET_THRESHOLD * (last.innovation_count - each.innovation_count)))
+                self._revert_to_motion(lag, onset)
                 return
 
     def _snapshot_before(self, lag: float) -> Snapshot | None:
@@ -692,8 +696,7 @@ class HeadingTracker:
     def _enter_rest(self) -> None:
         """Begin a rest."""
         self.is_resting, self._rest_integral = True, self._zero_integral
-        self._recognition_left = 0.0
-        self._wheels_stand = False
+        self._recognition_left, self._wheels_stand = 0.0, False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps))]
@@ -829,8 +832,8 @@ class HeadingTracker:
         squared = (turn.angle - expected) ** 2 / variance
         ratios = 1.0 + SCATTER_RATIOS * white / variance
         likelihood = before.log_likelihood - 0.5 * (squared / ratios + np.log(ratios))
-        turn.wander_variance = 0.0 if self._wheels_stand else float(
-            self._rest_scatter.probabilities(likelihood) @ SCATTER_RATIOS) * white
+        scatter = float(self._rest_scatter.probabilities(likelihood) @ SCATTER_RATIOS)
+        turn.wander_variance = 0.0 if self._wheels_stand else scatter * white
         self._propagate_state(turn,
                               self._last_time - self._block_integral.duration - remaining.duration)
         self._rest_integral += turn
