@@ -481,8 +481,8 @@ def robust_residual(columns: Array, observed: Array, passes: int) -> Array:
     weights = np.ones(len(observed))
     for _ in range(passes):
         weighted = weights[:, None] * columns
-        residual = observed - columns @ np.linalg.lstsq(weighted.T @ columns,
-                                                        weighted.T @ observed, rcond=1e-14)[0]
+        residual = observed - columns @ np.linalg.lstsq(
+            weighted.T @ columns, weighted.T @ observed, rcond=1e-14)[0]
         size = np.abs(residual)
         weights = 1.0 / np.maximum(size, max(float(np.median(size)), 1e-12))
     return residual

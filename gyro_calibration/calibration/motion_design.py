@@ -355,8 +355,8 @@ class _MotionFamily:
         count = int(2.0 * (self._max_turns / 2.0) ** point[0])
         ends = np.zeros(count + 1)
         first = int(point[1] >= 0.5)
-        ends[1 + first:-1:2], ends[2 - first:-1:2] = (point[2] * self._reach_up,
-                                                      -point[3] * self._reach_down)
+        ends[1 + first:-1:2] = point[2] * self._reach_up
+        ends[2 - first:-1:2] = -point[3] * self._reach_down
         angles = np.diff(ends)
         if not np.abs(angles).min() > _MIN_ANGLE:
             return None

@@ -457,8 +457,8 @@ def _evaluate_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
     precisions = regression.prior_precisions(inner)
     found = []
     for sizes in product(*axes[:banded]):
-        log_likelihood, values, inverse = regression.solve(regression.banded_covariance(sizes),
-                                                           precisions)
+        log_likelihood, values, inverse = regression.solve(
+            regression.banded_covariance(sizes), precisions)
         found.append((np.column_stack([np.tile(sizes, (len(inner), 1)), inner]), log_likelihood,
                       values[:, :count], inverse[:, :count, :count]))
     return _Grid(*(np.concatenate(each) for each in zip(*found)))

@@ -154,8 +154,8 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
     name = min(trials,
                key=lambda each: trials[each][0] * (_SLIP_PENALTY if each == 'slip' else 1.0))
     unexplained, value = trials[name]
-    if _SLIP_PENALTY * unexplained > fit_profile(run, motion,
-                                                 largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
+    if _SLIP_PENALTY * unexplained > fit_profile(
+            run, motion, largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
         return
     if unexplained > MAX_UNEXPLAINED_SHARE:
         raise DataRefused('the robot turned otherwise than the profile (the best that can be made '
@@ -195,8 +195,8 @@ def _try_early_ends(run: RunPieces, motion: Motion, largest_offset: float) -> Tr
 def _try_speeds(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
     for speed in _TRIAL_SPEEDS[np.abs(np.log(_TRIAL_SPEEDS)) > _UNIT_LOG_TOLERANCE]:
         for offset in _trial_offsets(largest_offset)[::2]:
-            yield run.fit_scale(run.reference_angle(motion, offset,
-                                                    float(speed)))[0], (float(speed),)
+            angle = run.reference_angle(motion, offset, float(speed))
+            yield run.fit_scale(angle)[0], (float(speed),)
 
 
 def _try_late_starts(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:

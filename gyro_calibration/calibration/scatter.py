@@ -338,8 +338,8 @@ class Uncertainty:
 
     def probability_below(self, change: Array | float) -> Array:
         """Return the probability that each value is below the fitted plus a change, shape (m,)."""
-        return np.asarray(self.weights @ student.cdf((change - self.offsets) / self.deviations,
-                                                     self.dof))
+        return np.asarray(
+            self.weights @ student.cdf((change - self.offsets) / self.deviations, self.dof))
 
     def covariance(self) -> Array:
         """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""

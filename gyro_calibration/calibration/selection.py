@@ -164,8 +164,8 @@ def fit_supported_effects(dwells: Dwells, technology: str | None = None,
 def add_temperature_slopes(fit: Calibration) -> Calibration:
     """Add the slopes over temperature that the dwells determine better than a data sheet."""
     for slope, typical_deviation in _TYPICAL_SLOPES.items():
-        extended = None if slope in fit.effects else _try_fit(fit.dwells, (*fit.effects, slope),
-                                                              fit.scatter)
+        extended = None if slope in fit.effects else _try_fit(
+            fit.dwells, (*fit.effects, slope), fit.scatter)
         if (extended is not None and extended.dof
                 and extended.effect_deviation(slope) < typical_deviation):
             fit = extended
@@ -258,8 +258,8 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
                                    fit.scatter)
             # with all rates at its zeros a sine fits any data
             if swapped is not None and swapped.min_non_monotonic_rate is None:
-                fit, confounders = _resolve_pair((fit, taken), (swapped, other), technology,
-                                                 bounded_effect)
+                fit, confounders = _resolve_pair(
+                    (fit, taken), (swapped, other), technology, bounded_effect)
                 found.append(confounders)
                 break
     return fit, tuple(found)

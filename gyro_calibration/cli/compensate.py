@@ -197,9 +197,9 @@ def _integrate_blocks(logs: Iterable[Log], model: GyroModel,
             # without output may lie between samples.
             variance = 0.0 if log.time is None else model.noise.rate_variance(
                 float(np.median(np.diff(log.time[known] if known.sum() > 1 else log.time))))
-        yield CompensatedBlock(log, known, _compensated_columns(model, compensation, integrator,
-                                                                variance, rows_of(log, known)),
-                               integrator.intervals)
+        columns = _compensated_columns(model, compensation, integrator, variance,
+                                       rows_of(log, known))
+        yield CompensatedBlock(log, known, columns, integrator.intervals)
 
 
 def track_log(log: Log, model: GyroModel, hindsight: bool,
@@ -274,15 +274,15 @@ def _compensated_columns(model: GyroModel, compensation: LogCompensation,
             columns[_TRUE_TIME_COLUMN] = time
     columns['rate_std_rad_s'] = np.sqrt(
         variance + quadratic_form(uncertainty_covariance(model), sensitivity))
-    columns['temperature_clipped'], columns['beyond_range'] = (result.temperature_clipped,
-                                                               result.beyond_range)
+    columns['temperature_clipped'] = result.temperature_clipped
+    columns['beyond_range'] = result.beyond_range
     return columns
 
 
 #: Column of the true times of samples, where a model moves stamps, and the columns at these times,
 #: which are interpolated to the stamps of the rows.
-_TRUE_TIME_COLUMN, _MOVED_COLUMNS = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad',
-                                                  'rate_std_rad_s')
+_TRUE_TIME_COLUMN = 'true_time'
+_MOVED_COLUMNS = ('rate_rad_s', 'heading_rad', 'heading_std_rad', 'rate_std_rad_s')
 
 
 def _interpolate_to_stamps(pieces: Iterator[CompensatedBlock]) -> Iterator[CompensatedBlock]:

@@ -60,8 +60,8 @@ def _diagnose(given: argparse.Namespace) -> Answer:
                               on_progress)
     found = replace(found, logs=tuple(given.log))
     if found.model is not model:
-        found = replace(found, model=replace(found.model, origin={**found.model.origin,
-                                                                  **verb.make_origin(found.logs)}))
+        origin = {**found.model.origin, **verb.make_origin(found.logs)}
+        found = replace(found, model=replace(found.model, origin=origin))
     written = write_diagnosis(given.out, found) if given.out else []
     return Answer([*terminal_lines(found), *written], found.to_dict())
 

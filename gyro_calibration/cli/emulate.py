@@ -31,11 +31,10 @@ import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from '
-                                                       'a '
-                           'model and a motion or from a log; prints its path',
-                           '--protocol kvh_dsp3000 --model model.yaml --motion robot --link '
-                           '/tmp/gyro')
+    parser = verb.add_verb(
+        verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from a model and a '
+        'motion or from a log; prints its path',
+        '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
     parser.add_argument('--protocol', required=True, metavar='NAME',
                         help=f'one of {", ".join(PROTOCOLS)}')
     source = parser.add_mutually_exclusive_group(required=True)

@@ -434,8 +434,8 @@ class _TopicSession(_Session):
                 return
             if role == 'gyro':
                 self._samples += 1
-                was_set = self._clock_steps.update(message.received / NSEC_PER_SEC,
-                                                   stamp / NSEC_PER_SEC)
+                was_set = self._clock_steps.update(
+                    message.received / NSEC_PER_SEC, stamp / NSEC_PER_SEC)
                 if self._last_stamp and not was_set and stamp > self._last_stamp:
                     self._intervals.add((stamp - self._last_stamp) / NSEC_PER_SEC)
                 self._last_stamp = stamp

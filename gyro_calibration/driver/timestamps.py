@@ -388,8 +388,8 @@ class SampleClock:
         """Return stamps of samples by their time of arrival on a steady clock, s."""
         if not samples:
             return []
-        self._previous_arrival, self._last_arrival = (self._last_arrival,
-                                                      max(arrival, self._last_arrival))
+        self._previous_arrival = self._last_arrival
+        self._last_arrival = max(arrival, self._last_arrival)
         arrival = self._last_arrival
         numbers = self._number_samples(samples, arrival)
         if shift := self._correct_losses(numbers[-1], arrival):

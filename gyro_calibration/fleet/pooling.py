@@ -200,14 +200,14 @@ class _Solution:
         parts = equations.unit_columns.shape[1]
         unit_right = np.empty((count, equations.units, parts))
         unit_columns = np.zeros((count, equations.units, parts, total))
-        normal[:, :fixed_count, :fixed_count] = np.einsum('pn,na,nb->pab', weight, fixed, fixed,
-                                                          optimize=True)
+        normal[:, :fixed_count, :fixed_count] = np.einsum(
+            'pn,na,nb->pab', weight, fixed, fixed, optimize=True)
         right[:, :fixed_count] = weight @ (of.value[:, None] * fixed)
         for part, column in enumerate(equations.unit_columns.T):
             unit_right[:, :, part] = summed(equations.unit_sums, weight * column * of.value)
             for place in range(fixed_count):
-                unit_columns[:, :, part, place] = summed(equations.unit_sums,
-                                                         weight * column * fixed[:, place])
+                unit_columns[:, :, part, place] = summed(
+                    equations.unit_sums, weight * column * fixed[:, place])
         if equations.drives:
             drive_weight = weight[:, equations.on_drive]
             index = fixed_count + np.arange(equations.drives)

@@ -52,8 +52,8 @@ def z_axis_covariance(variance: float) -> tuple[float, ...]:
 
 
 #: Covariance of a quantity that the message does not report, and of one that is not measured.
-NOT_REPORTED_COVARIANCE, UNMEASURED_COVARIANCE = ((NOT_REPORTED, *8 * (0.0,)),
-                                                  z_axis_covariance(UNMEASURED_VARIANCE))
+NOT_REPORTED_COVARIANCE = (NOT_REPORTED, *8 * (0.0,))
+UNMEASURED_COVARIANCE = z_axis_covariance(UNMEASURED_VARIANCE)
 
 #: Largest number of fields, depth of nesting, and length of a definition in characters.
 _MAX_FIELDS, _MAX_DEPTH, _MAX_DEFINITION_LENGTH = 5000, 10, 100_000

@@ -181,8 +181,8 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     for message in read_messages(path, contents, on_progress):
         if message.topic not in series:
             axis = 'z' if _is_same_topic(message.topic, topics.reference) else topics.axis
-            series[message.topic] = _TopicBuffer(message.topic, message.kind,
-                                                 contents.definitions[message.kind], axis)
+            series[message.topic] = _TopicBuffer(
+                message.topic, message.kind, contents.definitions[message.kind], axis)
         series[message.topic].add(message)
     log = _LogBuilder(path, topics, contents, series).build(rate)
     for note in log.notes:

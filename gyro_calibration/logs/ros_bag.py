@@ -328,8 +328,8 @@ class _McapReader:
             elif code == _RecordCode.METADATA:
                 name, pairs = _parse_metadata(body)
                 if name == METADATA_NAME:  # written by this program
-                    self._contents.recorder_notes += [_to_short_line(f'{key}: {value}')
-                                                      for key, value in pairs.items()]
+                    self._contents.recorder_notes += [
+                        _to_short_line(f'{key}: {value}') for key, value in pairs.items()]
         except (_DamagedPart, struct.error):
             self._contents.skipped_parts += 1
 

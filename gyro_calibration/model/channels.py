@@ -69,8 +69,8 @@ class ChannelHistory:
             self._start_time = float(_edge_value(time, 0))
         known = {'specific_force': specific_force}
         if temperature is not None:
-            known['temperature'] = temperature = clip(temperature, self._min_temperature,
-                                                      self._max_temperature)
+            known['temperature'] = temperature = clip(
+                temperature, self._min_temperature, self._max_temperature)
         here = self._default_temperature + 0.0 * time if temperature is None else temperature
         piece = self._block = _Block(time, {name: signal for name, signal in known.items()
                                             if signal is not None}, self._block)

@@ -86,9 +86,9 @@ def _compensate_sample(model: GyroModel, output: float, temperature: float,
         model.extrapolation_range, model.rate_range, model.rate_limit)
     used, seen = min(max(temperature, low), high), min(max(output, -limit), limit)
     coldest, hottest = model.valid_temperatures
-    modelled, unexplained = model.rate_from_channels(Channels.instantaneous(seen, seen, used)
-                                                     if environment is None
-                                                     else environment.with_rate(seen, seen))
+    modelled, unexplained = model.rate_from_channels(
+        Channels.instantaneous(seen, seen, used) if environment is None
+        else environment.with_rate(seen, seen))
     if not -_MAX_COMPUTABLE_RATE < modelled < _MAX_COMPUTABLE_RATE:
         modelled, unexplained = seen, True
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)

@@ -269,8 +269,8 @@ def format_model(model: GyroModel) -> str:
         covariance = run.pop('covariance')
         if covariance is not None:
             run['covariance'] = [list(row) for row in covariance]
-            run['standard_deviations'] = dict(zip(('scale_factor_error', 'bias'),
-                                                  model.self_calibration.standard_deviations))
+            run['standard_deviations'] = dict(
+                zip(('scale_factor_error', 'bias'), model.self_calibration.standard_deviations))
     if model.tolerance != Tolerance():
         content['tolerance'] = dict(vars(model.tolerance))
     return format_settings(content)

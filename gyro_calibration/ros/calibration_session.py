@@ -146,9 +146,10 @@ class CalibrationRun:
     @property
     def status(self) -> str:
         """Return the progress in words."""
-        return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
-                if math.isinf(self.duration) else f'{self.elapsed:.0f} of {self.max_duration:.0f} '
-                                                  's')
+        if not math.isinf(self.duration):
+            return f'{self.elapsed:.0f} of {self.max_duration:.0f} s'
+        return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call '
+                'finish_calibration')
 
     @property
     def temperature(self) -> float | None:

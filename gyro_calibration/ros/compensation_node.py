@@ -146,8 +146,8 @@ class CompensationNode(Node):
             self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
             self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
         subscribe_to(self, Temperature, 'imu/temperature',
-                     lambda message: self._pipeline.add_temperature(_stamp_ns(message.header),
-                                                                    message.temperature))
+                     lambda message: self._pipeline.add_temperature(
+                         _stamp_ns(message.header), message.temperature))
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
         subscribe_to(self, Odometry, 'odom', self._on_odometry)
         subscribe_to(self, TwistStamped if self._is_velocity_stamped else Twist, 'cmd_vel',

@@ -416,8 +416,8 @@ class Pipeline:
         self.journal.last_received, tracker = now, estimator.tracker
         counts['temperature_clipped'] += int(estimator.last_compensated.temperature_clipped)
         counts['beyond_range'] += int(estimator.last_compensated.beyond_range)
-        counts['lost_samples'], counts['rebuilt'] = (tracker.intervals.lost_samples,
-                                                     tracker.rebuild_count)
+        counts['lost_samples'] = tracker.intervals.lost_samples
+        counts['rebuilt'] = tracker.rebuild_count
         if restarted:
             self._note_restart(restarted)
         elif unseen and moving is not False and tracker.intervals.lost_samples > lost:
@@ -545,8 +545,8 @@ class Pipeline:
         bias, deviation = self.estimator.tracker.bias
         rate = sum(each for _, each in self._recent_rates) / max(len(self._recent_rates), 1) - bias
         noise = self.store.model.noise.angle_random_walk / math.sqrt(_TURN_CHECK_DURATION)
-        if abs(rate) > _TURN_LIMIT_SIGMAS * math.hypot(deviation, noise,
-                                                       self._tracking_settings.threshold.rate):
+        if abs(rate) > _TURN_LIMIT_SIGMAS * math.hypot(
+                deviation, noise, self._tracking_settings.threshold.rate):
             return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: stop the robot, or, if '
                     'it stands, call calibrate_bias first')
         return ''

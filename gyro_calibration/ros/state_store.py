@@ -65,8 +65,9 @@ class StateStore:
         self.table, self.table_hint = BiasTable(self.model, prior), ''
         if not self.problem:
             self.table, self.table_hint = read_bias_table(bias_file, self.model, prior)
-        self.shared_hint, self._file_versions = '', {file: _existing_version(file)
-                                                     for file in (calibration_file, bias_file)}
+        self.shared_hint = ''
+        self._file_versions = {file: _existing_version(file)
+                               for file in (calibration_file, bias_file)}
 
     def poll(self) -> None:
         """Check whether another process has written to the files; to be called periodically."""
@@ -97,9 +98,9 @@ class StateStore:
             self.calibration_hint = f'the last self-calibration is not used: {error}'
             return model
         if fault := _describe_mismatch(stored, model):
-            self.calibration_hint = to_printable('the self-calibration in '
-                                                 f'{self._calibration_file} is not used: '
-                                                 f'{fault}; calibrate again')
+            self.calibration_hint = to_printable(
+                f'the self-calibration in {self._calibration_file} is not used: {fault}; '
+                'calibrate again')
             return model
         return with_self_calibration(model, stored.self_calibration)
 
@@ -112,9 +113,9 @@ class StateStore:
         except (OSError, ArithmeticError) as error:
             wanted = (remedy(error, self._calibration_file) if isinstance(error, OSError)
                       else 'check the rates')
-            self.calibration_hint = to_printable('the calibration is in use but NOT STORED '
-                                                 f'({describe_error(error)}): '
-                                                 f'{wanted}, and calibrate again')
+            self.calibration_hint = to_printable(
+                f'the calibration is in use but NOT STORED ({describe_error(error)}): {wanted}, '
+                'and calibrate again')
         return self.calibration_hint
 
     def store_table(self, now: float, is_final: bool = False) -> None:

@@ -166,8 +166,8 @@ def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
 def test_the_temperature_of_the_log_is_that_of_the_model():
     model = calibrate_encoder(replace(CLEAN,
                                       temperature=np.linspace(20.0, 30.0, len(CLEAN)))).model
-    assert (model.temperature_range, model.reference_temperature) == ((20.0, 30.0),
-                                                                      pytest.approx(25.0))
+    assert (model.temperature_range, model.reference_temperature) == (
+        (20.0, 30.0), pytest.approx(25.0))
 
 
 def test_the_residual_heading_is_what_the_calibration_leaves():

@@ -156,8 +156,8 @@ def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
 def test_of_confounders_that_fit_alike_the_bounded_one_is_taken_by_default():
     generator = np.random.default_rng(6)
     for _ in range(2):
-        fit = select_effects(WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])),
-                                               generator))
+        fit = select_effects(
+            WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])), generator))
         pair, = fit.confounders
         assert pair.taken == 'sine_response' or pair.sigmas >= MIN_PREFERENCE_SIGMAS
 

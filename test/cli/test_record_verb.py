@@ -347,8 +347,8 @@ class Robot:
     def offer(self, *topics, quality=None):
         """Publish on some topics from now on."""
         for topic in topics:
-            self._publishers[topic] = self._ros.publisher(self.kinds[topic], topic,
-                                                          quality or reliable())
+            self._publishers[topic] = self._ros.publisher(
+                self.kinds[topic], topic, quality or reliable())
 
     def is_heard(self, count=1):
         return all(each.get_subscription_count() >= count for each in self._publishers.values())

@@ -169,9 +169,9 @@ def test_lines_of_numbers_that_do_not_fit_the_columns_are_explained():
     recognition = recognize_protocol(b'0.1,2.0,3.0,4.0\r\n' * 5)
     assert (recognition.protocol is None
             and 'lines of 4 numbers came, but columns names 3' in recognition.summary)
-    assert recognize_protocol(b'0.1,2.0,3.0,4.0\r\n' * 5,
-                              Settings(columns=('time_s', 'gyro_dps', 'a',
-                                                'b'))).protocol is find_protocol('csv')
+    assert recognize_protocol(
+        b'0.1,2.0,3.0,4.0\r\n' * 5,
+        Settings(columns=('time_s', 'gyro_dps', 'a', 'b'))).protocol is find_protocol('csv')
     assert (recognize_protocol(b'17\r\n' * 5, Settings(columns=('gyro_dps',))).protocol
             is find_protocol('csv'))
 

@@ -32,8 +32,9 @@ def notes():
 
 
 def samples(count=300):
-    return [(BEGIN + 10_000_000 * number, Sample(0.01 * number, 20.0 + 0.001 * number,
-                                                 specific_force=9.8)) for number in range(count)]
+    return [(BEGIN + 10_000_000 * number,
+             Sample(0.01 * number, 20.0 + 0.001 * number, specific_force=9.8))
+            for number in range(count)]
 
 
 def recorders(folder):

@@ -44,8 +44,8 @@ def written(folder, text):
     ('temperature=x:degF', 'temperature', -150.0 / 9.0), ('acceleration=x:g', 'specific_force',
                                                           19.6133),
     ('supply=x:mV', 'supply', 2e-3), ('moving=x', 'moving', 2.0), ('counts=x', 'counts', 2.0)])
-def test_a_column_is_converted_from_the_unit_that_the_user_names(tmp_path, column, attribute,
-                                                                 value):
+def test_a_column_is_converted_from_the_unit_that_the_user_names(
+        tmp_path, column, attribute, value):
     name, _, text = column.partition('=')
     log = read_log(written(tmp_path, 'wz,x\n1,1\n2,2\n'), columns={name: text, 'gyro': 'wz:deg/s'})
     assert getattr(log, attribute)[1] == pytest.approx(value, rel=1e-12)
@@ -69,8 +69,8 @@ def test_semicolons_tabs_and_decimal_commas_are_understood(tmp_path, text):
     assert log.others in ({}, {'place': ('a,b', 'c')})
 
 
-@pytest.mark.parametrize(('axis', 'rate', 'force'), [('x', 1.0, 7.0), ('y', 2.0, 8.0),
-                                                     ('z', 3.0, 9.0)])
+@pytest.mark.parametrize(('axis', 'rate', 'force'),
+                         [('x', 1.0, 7.0), ('y', 2.0, 8.0), ('z', 3.0, 9.0)])
 def test_the_axis_of_three_is_taken(tmp_path, axis, rate, force):
     names = [f'{name}_{each}' for name in ('gyro', 'acceleration') for each in 'xyz']
     names = [f'{name}_{"rad_s" if name.startswith("gyro") else "mps2"}' for name in names]

@@ -295,8 +295,9 @@ def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
 
 
 def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):
-    messages = [('/imu', BEGIN + number, serialize(BEGIN + number * 10 ** 7, 'gyro',
-                                                   37 * [float(number)])) for number in range(300)]
+    messages = [('/imu', BEGIN + number,
+                 serialize(BEGIN + number * 10 ** 7, 'gyro', 37 * [float(number)]))
+                for number in range(300)]
     with contextlib.closing(database(tmp_path / 'live.db3', {'/imu': IMU}, messages,
                                      'PRAGMA journal_mode=WAL')):
         (tmp_path / 'dead').mkdir()

@@ -155,8 +155,9 @@ def test_effects_with_a_past_are_written_by_hand(tmp_path):
 def test_every_effect_survives_its_file(tmp_path):
     for effect in CATALOGUE.values():
         model = GyroModel(
-            (Term(effect, tuple(float(np.clip(0.5 if each.default is None else each.default,
-                                              *each.bounds)) for each in effect.parameters)),))
+            (Term(effect,
+                  tuple(float(np.clip(0.5 if each.default is None else each.default, *each.bounds))
+                        for each in effect.parameters)),))
         write_model(tmp_path / 'model.yaml', model)
         assert read_model(tmp_path / 'model.yaml').terms == model.terms
 

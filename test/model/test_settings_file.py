@@ -60,8 +60,8 @@ def allowed_time(tmp_path_factory):
 
 
 @pytest.mark.parametrize('content, message', REFUSED.values(), ids=REFUSED)
-def test_what_is_no_file_of_settings_is_refused_in_a_line_and_soon(tmp_path, content, message,
-                                                                   allowed_time):
+def test_what_is_no_file_of_settings_is_refused_in_a_line_and_soon(
+        tmp_path, content, message, allowed_time):
     path, before = written(tmp_path, content), time.process_time()
     with pytest.raises(ValueError) as refused:
         read_settings(path)

@@ -109,8 +109,8 @@ def test_on_a_full_disk_the_calibration_is_used_and_written_when_there_is_room(d
     disk.fill()
     success, message = calibrated(0.02)
     assert success and 'NOT STORED' in message and f'make room in {disk.folder}' in message
-    assert rig.pipeline.store.calibration_hint.startswith('the calibration is in use but NOT '
-                                                          'STORED')
+    assert rig.pipeline.store.calibration_hint.startswith(
+        'the calibration is in use but NOT STORED')
     for _ in range(3000):  # rests, with a temperature, teach the table of biases
         rig.pipeline.add_temperature(max(rig.truth), 25.0)
         rig.step()

@@ -516,8 +516,8 @@ TEMPERATURE_MODEL = yaml.safe_dump(
 @pytest.mark.parametrize('temperature, used, counted',
                          [(25.0, 25.0, 0), (55.0, 55.0, 200), (90.0, 60.0, 200), (None, 30.0, 0)],
                          ids=['inside', 'outside', 'far outside', 'none'])
-def test_the_temperature_is_used_extrapolated_held_or_replaced(tmp_path, temperature, used,
-                                                               counted):
+def test_the_temperature_is_used_extrapolated_held_or_replaced(
+        tmp_path, temperature, used, counted):
     rig = Rig(tmp_path, model=TEMPERATURE_MODEL, stationary_threshold=0.0)
     found = rig.feed(np.full(200, 0.5), temperature=temperature)
     assert found[-1].rate == pytest.approx(0.5 - 0.001 * used, abs=1e-12)
