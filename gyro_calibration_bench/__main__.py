@@ -119,26 +119,20 @@ def answer(given: argparse.Namespace) -> None:
 def score(given: argparse.Namespace) -> None:
     """Print the table; a case without an answer counts as one in which nothing is reported."""
     truth = _read(given.folder / 'truth.json', TRUTH)['cases']
-    said = _read(given.answers, ANSWERS)
-    answers = said['answers']
-    unknown = set(answers) - set(truth)
-    if unknown:
+    content = _read(given.answers, ANSWERS)
+    answers = content['answers']
+    if unknown := set(answers) - set(truth):
         raise ValueError(f'{given.answers}: no such cases: {", ".join(sorted(unknown)[:5])}')
     found = summarize(
         [score_case(each, answers.get(name, {}))
          for name, each in sorted(truth.items(), key=lambda item: PARTS.index(item[1]['part']))])
     if given.json:
-        print(
-            json.dumps({
-                row: {
-                    column: {
-                        'good': good,
-                        'of': count,
-                        'interval': wilson_interval(good, count) if count else None
-                    } for column, (good, count) in counts.items()
-                } for row, counts in found.items()}))
+        print(json.dumps(
+            {row: {column: {'good': good, 'of': count,
+                            'interval': wilson_interval(good, count) if count else None}
+                   for column, (good, count) in counts.items()} for row, counts in found.items()}))
         return
-    print(f'{said.get("method", "")}: {len(answers)} answers to {len(truth)} cases; %, with '
+    print(f'{content.get("method", "")}: {len(answers)} answers to {len(truth)} cases; %, with '
           f'Wilson intervals of 95 %\n\n{markdown_table(found)}')
 
 

@@ -48,27 +48,12 @@ ENCODER_STEP = 2.0 * math.pi / 65536
 #: References with errors, and the effects that are hidden in logs with them in turn.
 IMPERFECT_REFERENCES = {
     f'{kind}_{size:g}': ImperfectReference(kind, size)
-    for kind, sizes in (
-        ('rate', (0.1, 0.3, 0.5)),
-        ('capture', (0.02, 0.05, 0.1)),
-        ('encoder', (0.09, 0.5)),
-        ('course', (1.0, 5.0, 10.0)),
-    )
-    for size in sizes}
-COMPANION_EFFECTS = (
-    'scale_factor_asymmetry',
-    'cubic_nonlinearity',
-    'heading_sensitivity',
-    'bias_temperature',
-    'scale_factor_temperature',
-    'warm_up',
-    'time_offset',
-    'bandwidth',
-    'reference_once_per_rev',
-    'reference_slip',
-    'bias_step',
-    'acceleration_sensitivity',
-)
+    for kind, sizes in (('rate', (0.1, 0.3, 0.5)), ('capture', (0.02, 0.05, 0.1)),
+                        ('encoder', (0.09, 0.5)), ('course', (1.0, 5.0, 10.0))) for size in sizes}
+COMPANION_EFFECTS = ('scale_factor_asymmetry', 'cubic_nonlinearity', 'heading_sensitivity',
+                     'bias_temperature', 'scale_factor_temperature', 'warm_up', 'time_offset',
+                     'bandwidth', 'reference_once_per_rev', 'reference_slip', 'bias_step',
+                     'acceleration_sensitivity')
 #: Correct findings on references that were not hidden.
 TRUE_OF_REFERENCE = {'encoder': ('reference_quantization',), 'course': ('time_offset',)}
 #: Effects that are not combined: findings against a model, and a wrong unit, which changes sizes.
@@ -139,13 +124,12 @@ def part_cases(part: str, repetitions: int) -> Iterator[Case]:
                 for multiple in SIZE_MULTIPLES:
                     name = _choose_in_turn(COMPANION_EFFECTS,
                                            number * len(IMPERFECT_REFERENCES) + place)
-                    yield Case(part, (name, ), multiple, _choose_in_turn(NOISES, number),
+                    yield Case(part, (name,), multiple, _choose_in_turn(NOISES, number),
                                reference, number)
     else:
         multiples = (3.0,) if part == 'outside' else SIZE_MULTIPLES
-        names: Sequence[tuple[str, ...]] = [
-            (name, )
-            for name in {'effects': FORMS, 'outside': OUTSIDE_CATALOGUE}.get(part, ())] or [()]
+        single = {'effects': FORMS, 'outside': OUTSIDE_CATALOGUE}.get(part, ())
+        names: Sequence[tuple[str, ...]] = [(name,) for name in single] or [()]
         yield from (Case(part, each, multiple, _choose_in_turn(NOISES, number + place),
                          _choose_reference(each, number + place), number)
                     for number in range(repetitions) for multiple in multiples
@@ -158,8 +142,8 @@ def _choose_in_turn(choices: Sequence[str], number: int) -> str:
 
 def _choose_reference(names: Sequence[str], number: int) -> str:
     """Choose a reference; figures of the noise are sized without encoder steps."""
-    return 'rate' if any(name in FORMS and FORMS[name].stage == 'noise'
-                         for name in names) else _choose_in_turn(REFERENCES, number)
+    is_noise = any(name in FORMS and FORMS[name].stage == 'noise' for name in names)
+    return 'rate' if is_noise else _choose_in_turn(REFERENCES, number)
 
 
 def random_source(case: Case, seed: int) -> np.random.Generator:
@@ -171,8 +155,8 @@ def make_logs(case: Case, generator: np.random.Generator) -> list[HiddenLog]:
     """Hide what a case asks for; two logs of one gyro where the second separates look-alikes."""
     if case.part == 'references':
         noise = 'gauss_markov' if case.noise == 'floor' else case.noise
-        return [hide_with_reference(
-            case.names, case.multiple, generator, IMPERFECT_REFERENCES[case.reference], noise)]
+        return [hide_with_reference(case.names, case.multiple, generator,
+                                    IMPERFECT_REFERENCES[case.reference], noise)]
     if case.look_alikes is not None:
         log = hide_look_alike(case.look_alikes, case.names[0], generator)
         return ([log] if case.part == 'sets'

@@ -137,7 +137,7 @@ def read_session(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
 
 
 def block_means(values: np.ndarray, interval: float) -> np.ndarray:
-    """Return means over `BLOCK`."""
+    """Return means over `BLOCK_DURATION`."""
     size = round(BLOCK_DURATION / interval)
     return values[:len(values) // size * size].reshape(-1, size).mean(axis=1)
 
@@ -174,8 +174,9 @@ def build_problem(logs: Sequence[Path], known: KnownModel | None) -> Problem:
     wanted = propose_candidates(read[0][0])
     tables, errors = [], []
     for number, (each, error, kept) in enumerate(read):
-        columns = [FORMS[name].error(each, each.rate, size,
-                                     shapes) * (not (number and FORMS[name].is_single_event))
+        # single events are in the first log
+        columns = [FORMS[name].error(each, each.rate, size, shapes)
+                   * (number == 0 or not FORMS[name].is_single_event)
                    for name, size, shapes, _ in wanted]
         plain = [block_means(each.rate, each.interval), np.ones(len(error))]
         own = [plain[0]] + [plain[1] * (place == number) for place in range(len(read))]
@@ -203,43 +204,43 @@ def build_problem(logs: Sequence[Path], known: KnownModel | None) -> Problem:
 
 def select_greedily(logs: Sequence[Path], known: KnownModel | None) -> Answer:
     """Add the column that lowers the Bayesian information criterion most, until none does."""
-    problem_to_solve = build_problem(logs, known)
-    count = len(problem_to_solve.error)
+    problem = build_problem(logs, known)
+    count = len(problem.error)
     chosen: list[int] = []
-    best = count * math.log(float(problem_to_solve.error @ problem_to_solve.error) / count)
+    best = count * math.log(float(problem.error @ problem.error) / count)
     while True:
         scores = []
-        for place in set(range(problem_to_solve.columns.shape[1])) - set(chosen):
-            columns = problem_to_solve.columns[:, [*chosen, place]]
-            left = (problem_to_solve.error
-                    - columns @ np.linalg.lstsq(columns, problem_to_solve.error, rcond=None)[0])
+        for place in set(range(problem.columns.shape[1])) - set(chosen):
+            columns = problem.columns[:, [*chosen, place]]
+            weights = np.linalg.lstsq(columns, problem.error, rcond=None)[0]
+            left = problem.error - columns @ weights
             scores.append((count * math.log(float(left @ left) / count)
                            + (len(chosen) + 1) * math.log(count), place))
         if not scores or min(scores)[0] >= best:
-            return answers_of_columns(problem_to_solve, chosen), False
+            return answers_of_columns(problem, chosen), False
         best, place = min(scores)
         chosen.append(place)
 
 
 def select_by_lasso(logs: Sequence[Path], known: KnownModel | None) -> Answer:
     """Take the largest penalty whose error is within a standard error of the least."""
-    problem_to_solve = build_problem(logs, known)
-    columns = (problem_to_solve.columns / np.linalg.norm(problem_to_solve.columns, axis=0)
-               * math.sqrt(len(problem_to_solve.error)))
-    fold = np.arange(len(problem_to_solve.error)) * FOLD_COUNT // len(problem_to_solve.error)
-    top = float(np.abs(columns.T @ problem_to_solve.error).max()) / len(problem_to_solve.error)
+    problem = build_problem(logs, known)
+    count, lengths = len(problem.error), np.linalg.norm(problem.columns, axis=0)
+    columns = problem.columns / lengths * math.sqrt(count)
+    fold = np.arange(count) * FOLD_COUNT // count
+    top = float(np.abs(columns.T @ problem.error).max()) / count
     penalties = top * np.geomspace(1.0, 1e-3, 25)
     errors = []
     for out in range(FOLD_COUNT):
         inside, outside = fold != out, fold == out
-        errors.append([np.mean((problem_to_solve.error[outside] - columns[outside] @ weights) ** 2)
-                       for weights in lasso_path(columns[inside], problem_to_solve.error[inside],
-                                                 penalties)])
+        errors.append(
+            [np.mean((problem.error[outside] - columns[outside] @ weights) ** 2)
+             for weights in lasso_path(columns[inside], problem.error[inside], penalties)])
     mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0) / math.sqrt(FOLD_COUNT)
     least = int(np.argmin(mean))
     place = int(np.flatnonzero(mean <= mean[least] + spread[least])[0])
-    weights = lasso_path(columns, problem_to_solve.error, penalties[:place + 1])[-1]
-    return answers_of_columns(problem_to_solve, list(np.flatnonzero(weights))), False
+    weights = lasso_path(columns, problem.error, penalties[:place + 1])[-1]
+    return answers_of_columns(problem, list(np.flatnonzero(weights))), False
 
 
 def lasso_path(columns: np.ndarray, error: np.ndarray, penalties: np.ndarray) -> list[np.ndarray]:
@@ -261,31 +262,29 @@ def lasso_path(columns: np.ndarray, error: np.ndarray, penalties: np.ndarray) ->
     return path
 
 
-def answers_of_columns(least_squares: Problem, chosen: Sequence[int]) -> list[NamedCause]:
+def answers_of_columns(problem: Problem, chosen: Sequence[int]) -> list[NamedCause]:
     """Name each chosen effect once, with size and interval by least squares of all chosen."""
     if not chosen:
         return []
-    columns = least_squares.columns[:, chosen]
+    columns = problem.columns[:, chosen]
     inverse = np.linalg.pinv(columns.T @ columns)
-    weights = inverse @ columns.T @ least_squares.error
-    left = least_squares.error - columns @ weights
-    variance = float(left @ left) / max(1, len(left) - len(chosen) - least_squares.nuisances)
+    weights = inverse @ columns.T @ problem.error
+    left = problem.error - columns @ weights
+    variance = float(left @ left) / max(1, len(left) - len(chosen) - problem.nuisances)
     deviations = np.sqrt(variance * np.diag(inverse))
-    unit_columns = least_squares.columns / np.linalg.norm(least_squares.columns, axis=0)
+    unit_columns = problem.columns / np.linalg.norm(problem.columns, axis=0)
     effects: dict[str, list[int]] = {}
     for place in np.argsort(-np.abs(weights) / deviations):
-        effects.setdefault(least_squares.owners[chosen[place]][0], []).append(int(place))
+        effects.setdefault(problem.owners[chosen[place]][0], []).append(int(place))
     answer = []
     for name, places in effects.items():
         first = places[0]
         is_alike = np.abs(unit_columns.T @ unit_columns[:, chosen[first]]) > AMBIGUOUS_CORRELATION
-        others = ({owner for (owner, _), each in zip(least_squares.owners, is_alike) if each}
-                  - set(effects))
-        size = least_squares.owners[chosen[first]][1] * weights[first]
-        half = 1.96 * abs(least_squares.owners[chosen[first]][1]) * deviations[first]
-        sized = math.isfinite(size)
-        answer.append(NamedCause(name, tuple(sorted(others)), size if sized else None,
-                                 (size - half, size + half) if sized else None))
+        others = {owner for (owner, _), each in zip(problem.owners, is_alike) if each}
+        size = problem.owners[chosen[first]][1] * weights[first]
+        half = 1.96 * abs(problem.owners[chosen[first]][1]) * deviations[first]
+        sized = (size, (size - half, size + half)) if math.isfinite(size) else (None, None)
+        answer.append(NamedCause(name, tuple(sorted(others - set(effects))), *sized))
     return answer
 
 

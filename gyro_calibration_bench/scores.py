@@ -185,8 +185,8 @@ def score_case(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> ScoredCas
         right = right and any(pair <= _names_in_set(each) for each in findings)
     elif truth['part'] == 'separated':
         right = right and max(how.set_sizes) == 1
-    row = truth['part'] + (', nothing hidden' if truth['part'] == 'references' and not causes
-                           else '')
+    is_clean = truth['part'] == 'references' and not causes
+    row = truth['part'] + (', nothing hidden' if is_clean else '')
     return ScoredCase(row, right, how, bool(causes))
 
 

@@ -85,9 +85,10 @@ def effect_candidate(name: str, *shapes: float, log_index: int | None = None) ->
     known = CATALOGUE[name]
     if (distortion := known.distortion) is not None:
         # change of the rate by a delay, a lag, a clock rate or a limit
-        return Candidate(
-            name, shapes, lambda each: (distortion(each.channels.rate, each.channels.time,
-                                                   *shapes) - each.channels.rate,), log_index, 1.0)
+        def rate_change(each: Replay) -> Sequence[Array]:
+            rate = each.channels.rate
+            return (distortion(rate, each.channels.time, *shapes) - rate,)
+        return Candidate(name, shapes, rate_change, log_index, 1.0)
     amplitude = known.coefficients[0].default if known.coefficients else None
     return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), log_index,
                      amplitude)
@@ -100,9 +101,9 @@ def gaussian_pulse(time: Array, middle: float, width: float) -> Array:
 
 #: Effects of the reference -> columns by log and shapes, and the shapes that a fit finds.
 _REFERENCE_EFFECTS: Mapping[str, tuple[Callable[..., Sequence[Array]], list[int]]] = {
-    'reference_once_per_rev': (lambda each: (-each.channels.rate * np.sin(each.channels.heading),
-                                             -each.channels.rate * np.cos(each.channels.heading)),
-                               []),
+    'reference_once_per_rev': (lambda each: (
+        -each.channels.rate * np.sin(each.channels.heading),
+        -each.channels.rate * np.cos(each.channels.heading)), []),
     'reference_slip': (lambda each, width, *moments: tuple(
         -gaussian_pulse(each.channels.time, moment, width) for moment in moments), [0])}
 
@@ -121,6 +122,11 @@ def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidat
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
     return effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
                             *candidate.shapes[shape_index + 1:], log_index=candidate.log_index)
+
+
+def common_channels(replays: Sequence[Replay]) -> frozenset[str]:
+    """Return the channels that all logs have."""
+    return frozenset.intersection(*(each.available_channels for each in replays))
 
 
 def constant_channels(replays: Sequence[Replay]) -> frozenset[str]:
@@ -147,8 +153,7 @@ def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
 
 def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give all causes that these logs may show, each with its first shapes."""
-    has = frozenset.intersection(
-        *(each.available_channels for each in replays)) - constant_channels(replays)
+    has = common_channels(replays) - constant_channels(replays)
     duration, interval = max(each.duration for each in replays), replays[0].interval
     fastest = max(float(np.abs(each.channels.rate).max()) for each in replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
@@ -291,8 +296,7 @@ def _unnamed_term(name: str, columns: ColumnFunction, log_index: int | None = No
 
 def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable]]:
     """Give the variables that change in these logs, each scaled to -1 to 1."""
-    has = frozenset.intersection(
-        *(each.available_channels for each in replays)) - constant_channels(replays)
+    has = common_channels(replays) - constant_channels(replays)
     known: dict[str, Variable] = {'rate': lambda each: each.channels.rate}
     if 'temperature' in has:
         known['temperature'] = lambda each: each.channels.temperature
@@ -327,16 +331,15 @@ def _bump_columns(middle: float, width: float) -> ColumnFunction:
 
 def _single_variable_terms(name: str, variable: Variable) -> Iterator[Candidate]:
     for waves in WAVE_COUNTS.get(name, _DEFAULT_WAVE_COUNTS):
-        yield _unnamed_term(name, _function_columns(
-            variable, lambda x, waves: (np.sin(np.pi * waves * x),
-                                        np.cos(np.pi * waves * x)), waves))
+        yield _unnamed_term(name, _function_columns(variable, lambda x, waves: (
+            np.sin(np.pi * waves * x), np.cos(np.pi * waves * x)), waves))
     for power in (2, 4, 5) if name == 'rate' else (3, 4) if name == 'temperature' else (2, 3):
         if (name, power) != ('rate', 2):
             yield _unnamed_term(
-                name, _function_columns(variable, lambda x, power: (x ** power, ), power))
+                name, _function_columns(variable, lambda x, power: (x ** power,), power))
     for steep in (-8.0, -4.0, 4.0, 8.0):
         yield _unnamed_term(name, _function_columns(
-            variable, lambda x, steep: (np.exp(steep * x - abs(steep)), ), steep))
+            variable, lambda x, steep: (np.exp(steep * x - abs(steep)),), steep))
     for count in SPLINE_KNOTS.get(name, _DEFAULT_KNOTS):
         knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
         # their sum is constant, as the bias is
@@ -348,11 +351,10 @@ def _rotation_terms(variables: Mapping[str, Variable]) -> Iterator[Candidate]:
     """Give powers of the rate, and harmonics of the heading, alone and times a variable."""
     rate = variables['rate']
     for power in (0.25, 0.5, 0.75, 1.5):
-        yield _unnamed_term(
-            'rate', _function_columns(rate, lambda x, power: (np.abs(x) ** power, ), power))
-        yield _unnamed_term(
-            'rate',
-            _function_columns(rate, lambda x, power: (np.abs(x) ** power * np.sign(x), ), power))
+        yield _unnamed_term('rate', _function_columns(
+            rate, lambda x, power: (np.abs(x) ** power,), power))
+        yield _unnamed_term('rate', _function_columns(
+            rate, lambda x, power: (np.abs(x) ** power * np.sign(x),), power))
     for harmonic in HEADING_HARMONICS:
         yield _unnamed_term('heading', _harmonic_columns(harmonic, None))
     for harmonic in HEADING_HARMONICS[:3]:

@@ -64,11 +64,9 @@ class Cause:
 
 
 _REVERSALS_EXPERIMENT = ('swing fast with quick reversals: a lag reduces the amplitude of fast '
-                         'motion, '
-                         'a delay does not')
+                         'motion, a delay does not')
 _THERMAL_CYCLE_EXPERIMENT = ('heat and cool the resting gyro at two temperature rates, with '
-                             'abrupt changes from '
-                             'heating to cooling')
+                             'abrupt changes from heating to cooling')
 _FULL_SCALE_EXPERIMENT = 'turn at many speeds up to full scale'
 _CLOSED_TURN_EXPERIMENT = 'make whole turns between marks, or use a second reference'
 _HEADING_STOP_EXPERIMENT = 'turn at several speeds, and stop at eight headings'
@@ -186,9 +184,13 @@ def add_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
                  model: GyroModel) -> list[Finding]:
     """Return findings with their shares of the heading error and their remedies."""
     inside = {term.effect.name for term in model.terms}
-    return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy
-                    or ('' if CAUSES[each.effect].origin == 'gyro' and each.effect not in inside
-                        else _REMEDIES[CAUSES[each.effect].origin])) for each in findings]
+
+    def remedy(effect: str) -> str:
+        origin = CAUSES[effect].origin
+        return '' if origin == 'gyro' and effect not in inside else _REMEDIES[origin]
+
+    return [replace(each, share_of_heading_error=shares.get(each.effect),
+                    remedy=each.remedy or remedy(each.effect)) for each in findings]
 
 
 #: Next experiment, with numbers of `observed_range` -> pairs of causes that it distinguishes.

@@ -114,9 +114,9 @@ def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: A
 
 def held_out_mask(replay: Replay, block_duration: float) -> Mask:
     """Mark the samples that are held out, shape (n,)."""
-    number = _block_numbers(replay, block_duration)
-    return replay.valid & (number % HELD_OUT_STRIDE == 1) & (
-        number < int((replay.channels.time[-1] - replay.channels.time[0]) / block_duration + 1e-9))
+    number, time = _block_numbers(replay, block_duration), replay.channels.time
+    count = int((time[-1] - time[0]) / block_duration + 1e-9)
+    return replay.valid & (number % HELD_OUT_STRIDE == 1) & (number < count)
 
 
 def _block_numbers(replay: Replay, block_duration: float) -> Array:

@@ -151,13 +151,11 @@ def resolve_unit(quality: DataQuality) -> DataQuality:
         return quality
     if is_implausible_factor(quality.unit_factor):
         note = (f'The output was multiplied by {quality.unit_factor:.6g} first, and a new model '
-                'applies '
-                'to the corrected output: correct the unit or the sign of the log (its column, '
-                '--sensitivity, --invert) before it is compensated.')
+                'applies to the corrected output: correct the unit or the sign of the log (its '
+                'column, --sensitivity, --invert) before it is compensated.')
         return replace(quality, remarks=(*quality.remarks, note))
     note = (f'The output was not multiplied by {quality.unit_factor:.6g}, as this factor may '
-            'belong to '
-            'the gyro: a new model contains it as a scale factor error.')
+            'belong to the gyro: a new model contains it as a scale factor error.')
     return replace(quality, unit_factor=1.0, output_step=quality.output_step / quality.unit_factor,
                    limit=None if quality.limit is None else quality.limit / quality.unit_factor,
                    remarks=(*quality.remarks, note))
@@ -265,9 +263,9 @@ def _check_samples(found: DataQuality, output: Array, rate: Array | None, line: 
         repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     valid = valid if repeated is None else valid & ~repeated.is_repeat
     # Samples next to a dead band are the tail of the noise outside it.
-    outlying = find_outliers(comparison, valid if band is None else valid & ~binary_dilation(
-        band.contains(comparison.output), iterations=NEIGHBOURS_PER_SIDE), 0.5 * codes.step,
-                             FALSE_ALARM_CHANCE)
+    tested = valid if band is None else valid & ~binary_dilation(
+        band.contains(comparison.output), iterations=NEIGHBOURS_PER_SIDE)
+    outlying = find_outliers(comparison, tested, 0.5 * codes.step, FALSE_ALARM_CHANCE)
     valid = valid if outlying is None else valid & ~outlying.is_outlier
     away_from_limit = np.ones(len(output), dtype=bool)
     if limit is not None and comparison.expected is not None:
@@ -299,10 +297,8 @@ def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit
         chance = float(np.exp(-min(codes.counts.sum() * codes.alignment ** 2, 700.0)))
         yield _sized_finding(
             'quantization', codes.step, NORMAL_QUANTILE_975 * codes.step_deviation, chance,
-            f'the output has {len(codes.values)} codes, '
-            f'{codes.step / DEGREE:.4g} deg/s '
-            'apart, where its white noise is '
-            f'{comparison.noise_deviation / DEGREE:.3g} deg/s')
+            f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s apart, '
+            f'where its white noise is {comparison.noise_deviation / DEGREE:.3g} deg/s')
     if limit is not None and not _is_in_model(model, 'saturation', limit.size):
         sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high)
                  if np.isfinite(value)]
@@ -321,10 +317,8 @@ def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None
         first = log.time[int(np.argmax(repeated.is_repeat))]
         yield _sized_finding('stuck_samples', count, 0.0, repeated.p_value,
                              f'{count} samples in {repeated.run_count} runs repeat the one '
-                             'before, the first '
-                             f'at {first:.3f} s; codes and noise explain '
-                             f'{repeated.expected_count:.2g} '
-                             'repeats in the whole log')
+                             f'before, the first at {first:.3f} s; codes and noise explain '
+                             f'{repeated.expected_count:.2g} repeats in the whole log')
     if outlying is not None:
         count = int(np.count_nonzero(outlying.is_outlier))
         first = log.time[int(np.argmax(outlying.is_outlier))]
@@ -336,11 +330,10 @@ def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None
                             / (interval * noise_deviation) ** 2 > MIN_STEP_VARIANCE_SHARE)):
         yield _sized_finding('reference_quantization', reference_step, 0.0, 0.0,
                              'the reference heading comes in steps of '
-                             f'{reference_step / DEGREE:.4g} deg: its rate '
-                             'over one sample is uncertain by '
+                             f'{reference_step / DEGREE:.4g} deg: its rate over one sample is '
+                             'uncertain by '
                              f'{reference_step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, '
-                             'where the gyro has '
-                             f'{noise_deviation / DEGREE:.3g} deg/s of noise')
+                             f'where the gyro has {noise_deviation / DEGREE:.3g} deg/s of noise')
 
 
 # the kind of the reference

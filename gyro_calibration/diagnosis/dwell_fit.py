@@ -146,7 +146,7 @@ def stated_technology(model: GyroModel) -> str | None:
     return stated if stated in TECHNOLOGY_EFFECTS else None
 
 
-# naming
+# choice of causes
 
 def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
                 withdrawn: frozenset[str] = frozenset()) -> NamedCauses:
@@ -165,27 +165,28 @@ def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float
     change, _ = fit_supported_effects(subtract_effects(dwells, tested), stated_technology(tested),
                                       false_alarm_rate=_CAUSE_ALARM_SHARE * false_alarm_rate)
     change = _refit_without(change, withdrawn)
-    change, needless = _choose_temperature_origin(change, model, naming_level(false_alarm_rate))
-    guilty = tuple(each for each in change.effects if each not in (*NUISANCE_EFFECTS, *needless)
-                   and _effect_p_value(change, tested, each) < naming_level(false_alarm_rate))
-    change = _refit_without(change,
-                            frozenset(each.name for each in change.effects
-                                      if each not in (*NUISANCE_EFFECTS, *needless, *guilty)))
+    level = significance_level(false_alarm_rate)
+    change, needless = _choose_temperature_origin(change, model, level)
+    kept = (*NUISANCE_EFFECTS, *needless)
+    guilty = tuple(each for each in change.effects
+                   if each not in kept and _effect_p_value(change, tested, each) < level)
+    change = _refit_without(change, frozenset(each.name for each in change.effects
+                                              if each not in (*kept, *guilty)))
     if model is None:
         return NamedCauses(change, change, guilty, tested, false_alarm_rate)
     fit = _refit_changed_values(dwells, model, change)
-    changed_nuisances = [each for each in NUISANCE_EFFECTS if each in fit.effects
-                         and _change_p_value(fit, model,
-                                             each) < naming_level(false_alarm_rate, True)]
-    return NamedCauses(fit, change, (*(_effect_or_confounder(each, fit) for each in guilty),
-                                     *changed_nuisances), tested, false_alarm_rate)
+    level = significance_level(false_alarm_rate, is_nuisance=True)
+    causes = (*(_effect_or_confounder(each, fit) for each in guilty),
+              *(each for each in NUISANCE_EFFECTS
+                if each in fit.effects and _change_p_value(fit, model, each) < level))
+    return NamedCauses(fit, change, causes, tested, false_alarm_rate)
 
 
-def naming_level(false_alarm_rate: float, is_nuisance: bool = False) -> float:
-    """Return the level at which one cause is named."""
-    return (
-        _NUISANCE_ALARM_SHARE * false_alarm_rate / len(NUISANCE_EFFECTS) if is_nuisance
-        else _CAUSE_ALARM_SHARE * false_alarm_rate / (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS)))
+def significance_level(false_alarm_rate: float, is_nuisance: bool = False) -> float:
+    """Return the p-value below which one cause is named."""
+    if is_nuisance:
+        return _NUISANCE_ALARM_SHARE * false_alarm_rate / len(NUISANCE_EFFECTS)
+    return _CAUSE_ALARM_SHARE * false_alarm_rate / (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS))
 
 
 def _refit_without(change: Calibration, names: frozenset[str]) -> Calibration:
@@ -198,10 +199,11 @@ def _refit_without(change: Calibration, names: frozenset[str]) -> Calibration:
 def _refit_changed_values(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibration:
     """Refit the changed effects as a whole, the values of the model and their changes."""
     own = {term.effect.name for term in model.terms}
-    effects = tuple(other if (other := _confounder(each)) is not None
-                    and other.name in own - {each.name} else each for each in change.effects)
-    fit, _ = resolve_confounders(fit_effects(subtract_effects(dwells, model, effects), effects,
-                                             change.scatter), stated_technology(model))
+    effects = tuple(
+        other if (other := _confounder(each)) is not None and other.name in own - {each.name}
+        else each for each in change.effects)
+    fit = fit_effects(subtract_effects(dwells, model, effects), effects, change.scatter)
+    fit, _ = resolve_confounders(fit, stated_technology(model))
     return with_reference_temperature(fit, model.reference_temperature)
 
 
@@ -218,8 +220,8 @@ def value_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
 
 def _change_p_value(fit: Calibration, model: GyroModel, effect: Effect) -> float:
     """Return the p-value of a change of bias or scale factor."""
-    column = (sensitivity_columns(_used_dwells(fit),
-                                  [term for term in fit.terms if term.effect is effect])[:, 0])
+    own = [term for term in fit.terms if term.effect is effect]
+    column = sensitivity_columns(_used_dwells(fit), own)[:, 0]
     return _effect_p_value(fit, model, effect, column * value_change(fit, model, effect))
 
 
@@ -288,11 +290,11 @@ def _choose_temperature_origin(fit: Calibration, model: GyroModel | None,
     first = (_USUAL_TEMPERATURES if model is None
              else (model.reference_temperature, *_USUAL_TEMPERATURES))
     if BIAS_TEMPERATURE_QUADRATIC in fit.effects:
-        for place in (*first, float(fit.dwells.temperature.mean()),
-                      float(fit.dwells.temperature[0])):
-            counted = with_reference_temperature(fit, place)
-            if counted.p_value(BIAS_TEMPERATURE) > level:
-                return ((counted if model is None else with_reference_temperature(fit, first[0])),
+        for origin in (*first, float(fit.dwells.temperature.mean()),
+                       float(fit.dwells.temperature[0])):
+            moved = with_reference_temperature(fit, origin)
+            if moved.p_value(BIAS_TEMPERATURE) > level:
+                return ((moved if model is None else with_reference_temperature(fit, first[0])),
                         (BIAS_TEMPERATURE,))
     return (fit if model is None else with_reference_temperature(fit, first[0])), ()
 
@@ -300,8 +302,8 @@ def _choose_temperature_origin(fit: Calibration, model: GyroModel | None,
 def with_reference_temperature(fit: Calibration, temperature: float) -> Calibration:
     """Return the same fit with another reference temperature of its effects."""
     terms = [replace(term, values=(temperature, *term.values[1:]))
-             if term.effect.nonlinear_parameters and term.effect.nonlinear_parameters[0].name
-             == 'reference_temperature' else term for term in fit.terms]
+             if [each.name for each in term.effect.nonlinear_parameters][:1]
+             == ['reference_temperature'] else term for term in fit.terms]
     places = [place for place, term in enumerate(terms)
               if not any(shape.default is None for shape in term.effect.nonlinear_parameters)]
     channels = channels_of(fit.dwells)
@@ -338,8 +340,9 @@ def assemble_model(dwells: Dwells, model: GyroModel | None, fit: Calibration) ->
     new = {term.effect.name: term for term in fit.terms}
     # the confounder of an effect of the model may stand in its place
     kept_terms = [
-        term for term in model.terms if (other := _confounder(term.effect)) not in fit.effects
-        or term.effect in fit.effects or any(each.effect is other for each in model.terms)]
+        term for term in model.terms
+        if term.effect in fit.effects or (other := _confounder(term.effect)) not in fit.effects
+        or any(each.effect is other for each in model.terms)]
     own = [term.effect.name for term in kept_terms]
     terms = (*(new.get(term.effect.name, term) for term in kept_terms),
              *(term for name, term in new.items() if name not in own))
@@ -473,13 +476,12 @@ def _structure_curves(dwells: Dwells) -> Mapping[str, Array]:
     # A variable that differs between sweeps alone has as many independent values as sweeps.
     slow = min(_MAX_CURVE_COLUMNS, sweeps // 3)
     probes = {
-        RATE: _spline_columns(dwells.rate,
-                              min(_MAX_CURVE_COLUMNS,
-                                  len(dwells) // _MIN_DWELLS_PER_COLUMN)),
+        RATE: _spline_columns(
+            dwells.rate, min(_MAX_CURVE_COLUMNS, len(dwells) // _MIN_DWELLS_PER_COLUMN)),
         SINGLE_RATES: _rate_columns(dwells),
         ORDER: _spline_columns(np.arange(len(dwells)).astype(float), slow),
         SWEEP: _sweep_columns(dwells)}
-    if (dwells.temperature is not None and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD):
+    if dwells.temperature is not None and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD:
         probes[TEMPERATURE] = _spline_columns(dwells.temperature, slow)
         rate = _scale_to_unit_range(dwells.rate)
         temperature = _scale_to_unit_range(dwells.temperature)
@@ -512,8 +514,9 @@ def _rate_columns(dwells: Dwells) -> Array:
     parts = cross_validation_parts(dwells)
     repeated = np.array(
         [len(np.unique(parts[column > 0.0])) >= _MIN_REPEATING_SWEEPS for column in columns.T])
-    return (columns[:, repeated] if np.count_nonzero(repeated)
-            * _MIN_DWELLS_PER_COLUMN <= len(dwells) else columns[:, :0])
+    if np.count_nonzero(repeated) * _MIN_DWELLS_PER_COLUMN > len(dwells):
+        return columns[:, :0]
+    return columns[:, repeated]
 
 
 def _sweep_columns(dwells: Dwells) -> Array:
@@ -521,8 +524,8 @@ def _sweep_columns(dwells: Dwells) -> Array:
     parts = cross_validation_parts(dwells)
     if len(dwells) < 8 * (parts.max() + 1):
         return np.zeros((len(dwells), 0))
-    return (parts[:, None] == np.arange(parts.max()
-                                        + 1)) * (_scale_to_unit_range(dwells.rate) ** 2)[:, None]
+    is_in_sweep = parts[:, None] == np.arange(parts.max() + 1)
+    return is_in_sweep * (_scale_to_unit_range(dwells.rate) ** 2)[:, None]
 
 
 #: Confounders of bias and scale factor that dwells in one pose on one table never rule out.
@@ -535,8 +538,9 @@ def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]
     """Return the alternatives of an effect, and the experiment that would distinguish them."""
     if effect in _ALWAYS_CONFOUNDED:
         return [_ALWAYS_CONFOUNDED[effect]], CAUSES[effect.name].separate_by
-    steady = [(sigmas, other) for other in _swapped_fits(fit, effect) if (sigmas := math.sqrt(
-        max(other.misfit - fit.misfit, 0.0))) < MIN_DISTINGUISHING_SIGMAS]
+    steady = [
+        (sigmas, other) for other in _swapped_fits(fit, effect)
+        if (sigmas := math.sqrt(max(other.misfit - fit.misfit, 0.0))) < MIN_DISTINGUISHING_SIGMAS]
     found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
     found += [(sigmas, name) for name, columns in _unsteady_causes(fit, effect)
               if (sigmas := _advantage_sigmas(fit, effect, columns)) < MIN_DISTINGUISHING_SIGMAS]

@@ -30,9 +30,9 @@ from scipy import stats
 from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
-_COMMON_FACTORS: Mapping[str, float] = {'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi,
-                                        '-pi/180': -math.pi / 180.0, '-180/pi': -180.0 / math.pi,
-                                        '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
+_COMMON_FACTORS: Mapping[str, float] = {
+    'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi, '-pi/180': -math.pi / 180.0,
+    '-180/pi': -180.0 / math.pi, '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
 #: Powers of two instead of powers of ten, and vice versa.
 _BINARY_FACTORS: Mapping[str, float] = {
     **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)},
@@ -232,8 +232,8 @@ def model_scale_factor(model: GyroModel, rate: Array) -> float:
 def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
     low, high = output.min(), output.max()
     # without the ends, which may be clipped, unless most samples are there
-    inliers = (output > low
-               + _END_SHARE * (high - low)) & (output < high - _END_SHARE * (high - low))
+    ends = _END_SHARE * (high - low)
+    inliers = (output > low + ends) & (output < high - ends)
     if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.3 * np.ptp(rate):
         inliers = np.ones(len(rate), dtype=bool)
     for _ in range(_FIT_ITERATIONS):
@@ -245,8 +245,8 @@ def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
         inliers = np.abs(residual) <= 5.0 * robust_deviation(residual) + 1e-15
     # the standard deviation by the scatter of up to 20 parts, as the noise is coloured
     columns, residual = columns[inliers], residual[inliers]
-    pieces = np.minimum(np.arange(len(residual)) * min(20, len(residual) // 2) // len(residual),
-                        19)
+    count = len(residual)
+    pieces = np.minimum(np.arange(count) * min(20, count // 2) // count, 19)
     scores = np.array([np.bincount(pieces, column * residual) for column in columns.T])
     inverse = np.linalg.pinv(columns.T @ columns)
     student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)

@@ -187,8 +187,7 @@ def _refuse_table(log: Log, output: Array) -> None:
     if rows > MAX_TABLE_ROWS:
         raise DataRefused(
             f'the log has no time_s, and {rows} rows, where a rate table has at most '
-            f'{MAX_TABLE_ROWS}: '
-            'add time_s, or give the sample rate with --rate')
+            f'{MAX_TABLE_ROWS}: add time_s, or give the sample rate with --rate')
 
 
 def _refuse_short(time: Array, output: Array) -> None:
@@ -196,8 +195,7 @@ def _refuse_short(time: Array, output: Array) -> None:
     if known < MIN_SAMPLES or known < MIN_VALID_SHARE * len(output):
         raise DataRefused(
             f'the gyro has a value in {known} of {len(output)} samples; at least {MIN_SAMPLES} '
-            'and a '
-            'tenth are needed: record again, and repair the line if it loses samples')
+            'and a tenth are needed: record again, and repair the line if it loses samples')
     if time[-1] - time[0] < MIN_DURATION:
         raise DataRefused(f'the log lasts {time[-1] - time[0]:.1f} s; '
                           f'a diagnosis needs at least {MIN_DURATION:g} s: record longer')
@@ -382,8 +380,7 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
 
 def _motion_gate(agreed: Agreement, log: Log) -> Gate:
     evidence = (f'{100.0 * agreed.coherence:.3g} % of the variance of the heading over spans is '
-                'common '
-                'to gyro and reference')
+                'common to gyro and reference')
     wanders = (agreed.residual_and_growth[0] > _MIN_TILT_ANGLE
                and agreed.residual_and_growth[1] > _MIN_TILT_GROWTH and agreed.long_span_coherence
                < agreed.short_span_coherence - 0.5 * _MIN_MOTION_COHERENCE)

@@ -342,8 +342,9 @@ def _gyro_noise(fit: SpanFit) -> Noise:
     """Return the noise of the gyro; bias wander that the log does not show is 0."""
     # at the edge of the grid nothing bounds it from below
     return Noise(fit.noise_size('angle_random_walk'),
-                 **{part.name: fit.noise_size(part.name) if fit.fit.sizes[part.name][1] > 1.01
-                    * part.size_range[0] else 0.0 for part in wander_noise(fit.spans)})
+                 **{part.name: fit.noise_size(part.name)
+                    if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
+                    for part in wander_noise(fit.spans)})
 
 
 # gain
@@ -406,12 +407,16 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
                if getattr(plain.spans.log, channel) is None}
     shown = {}
     for name, cause in CAUSES.items():
-        lacks = sorted(missing & cause.required_channels)
-        if name not in seen:
-            shown[name] = (f'the logs have no {" and no ".join(lacks)}'.replace('_', ' ') if lacks
-                           else 'fewer than three stretches turn, which do not distinguish it '
-                           'from a scale factor error' if plain.scale_held and _follows_the_rate(
-                               name) else 'the errors of the reference hide it over short spans')
+        if name in seen:
+            continue
+        if lacks := sorted(missing & cause.required_channels):
+            reason = f'the logs have no {" and no ".join(lacks)}'.replace('_', ' ')
+        elif plain.scale_held and _follows_the_rate(name):
+            reason = ('fewer than three stretches turn, which do not distinguish it from a scale '
+                      'factor error')
+        else:
+            reason = 'the errors of the reference hide it over short spans'
+        shown[name] = reason
     return shown
 
 
@@ -589,16 +594,17 @@ def _find_best_cause(fit: SpanFit, rich_fit: SpanFit, open_terms: Sequence[Cause
                          for each, (chance, _, _) in zip(open_terms, chances)]
     strongest = int(np.argmin(corrected_chances))
     once = open_terms[strongest].is_single_event
-    if min(corrected_chances[strongest],
-           1.0) > (false_alarm_rate if once else SUSPECTED_RATE_FACTOR * false_alarm_rate):
+    level = false_alarm_rate if once else SUSPECTED_RATE_FACTOR * false_alarm_rate
+    if min(corrected_chances[strongest], 1.0) > level:
         return None
     best_of: dict[str, int] = {}
     for other, each in enumerate(open_terms):
         if each.cause not in best_of or chances[other][1] > chances[best_of[each.cause]][1]:
             best_of[each.cause] = other
     gain = chances[strongest][1]
-    equivalent_causes = {name: other for name, other in best_of.items() if chances[other][1] > gain
-                         - math.log(_MAX_LIKELIHOOD_RATIO) or other == strongest}
+    least = gain - math.log(_MAX_LIKELIHOOD_RATIO)
+    equivalent_causes = {name: other for name, other in best_of.items()
+                         if chances[other][1] > least or other == strongest}
     # the simplest of the equivalent causes: with the fewest values and fitted shapes
 
     def count_values(other: int) -> int:
@@ -631,12 +637,15 @@ def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[s
     both -= base @ (base.T @ both)
     clusters = [each[rows] for each in (data.row_stretches, *data.row_sectors)]
     sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
-    return [
-        (1.0, 0.0, 0.0) if each.is_positive and float(both[:, place.start] @ both[:, -1]) <= 0.0
-        else _cluster_robust_evidence(both[:, place], both[:, -1],
-                                      clusters if CAUSES[each.cause].along in _MOTION_VARIABLES
-                                      else clusters[:1], 1e-6 * sizes[place])
-        for place, each in zip(places, open_terms)]
+    found = []
+    for place, each in zip(places, open_terms):
+        if each.is_positive and float(both[:, place.start] @ both[:, -1]) <= 0.0:
+            found.append((1.0, 0.0, 0.0))
+            continue
+        own = clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1]
+        found.append(_cluster_robust_evidence(both[:, place], both[:, -1], own,
+                                              1e-6 * sizes[place]))
+    return found
 
 
 def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
@@ -686,9 +695,8 @@ def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice]
         for fold in sets:
             held = np.isin(data.row_stretches, fold)
             rest = ~held
-            gains = [gain
-                     for _, gain, _ in _term_evidences(data, columns, places, open_terms, rest)]
-            best = int(np.argmax(gains))
+            evidences = _term_evidences(data, columns, places, open_terms, rest)
+            best = int(np.argmax([gain for _, gain, _ in evidences]))
             same_choices += open_terms[best].cause in equivalent_causes
             off = []
             for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):

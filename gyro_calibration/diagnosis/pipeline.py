@@ -19,6 +19,7 @@ from functools import partial
 import math
 
 from gyro_calibration.diagnosis.candidates import (
+    common_channels,
     constant_channels,
     fitted_shape_indices,
     is_named,
@@ -143,6 +144,7 @@ _STEP_SHARES = {
     'cross-validation': 3,
     'findings': 4}
 
+Causes = tuple[SelectedCause, ...]
 #: A cause and its alternatives, each with its deficit in log-likelihood.
 Alternatives = Sequence[tuple[SelectedCause, float]]
 
@@ -217,10 +219,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     steps.begin('data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
     steps.begin('replay of the model')
-    replays = [replay(log if clean.unit_factor == 1.0 or log.output is None
-                      else replace(log, output=log.output * clean.unit_factor), clean.usable,
-                      generator, clean.update_interval, clean.heading_step, clean.output_step,
-                      model) for log, clean in zip(logs, quality)]
+    replays = [replay(_in_true_unit(log, clean.unit_factor), clean.usable, generator,
+                      clean.update_interval, clean.heading_step, clean.output_step, model)
+               for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
     search, everything = _search_with_filtered_noise(replays, generator,
                                                      _SEARCH_ALARM_SHARE * rate, steps)
@@ -248,16 +249,18 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     changed = [] if model is None else _model_value_findings(found, model, noise, rate)
     within = [(known, members) for known, members in zip(named, sets) if known not in out]
     lasting = any(not is_single_event(known) for known, _ in within)
-    won = measure_gain(
-        search, {each.candidate.cause for _, members in within for each, _ in members},
-        model is not None) if (lasting or changed) and not is_scale_implausible(found) else None
-    offered = won is None or not won.is_worse
+    gain = None
+    if (lasting or changed) and not is_scale_implausible(found):
+        tried = {each.candidate.cause for _, members in within for each, _ in members}
+        gain = measure_gain(search, tried, model is not None)
+    offered = gain is None or not gain.is_worse
     steps.begin('findings')
     more = find_suspected(search, (*named, *unnamed))
     taken = {each.candidate.cause for each in named}
-    findings = [*_cause_findings(search, found, sets, unnamed, [
-        each for each in unconfirmed if is_lasting(each.candidate)
-        and each.candidate.cause not in taken] or ([more.causes[-1]] if more else [])),
+    doubtful = [each for each in unconfirmed
+                if is_lasting(each.candidate) and each.candidate.cause not in taken]
+    doubtful = doubtful or ([more.causes[-1]] if more else [])
+    findings = [*_cause_findings(search, found, sets, unnamed, doubtful),
                 *_record_findings(quality, changed)]
     if model is not None:
         findings += _noise_findings(figures, model, rate, found.replays)
@@ -267,8 +270,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                           if out else found.fit, found.replays, lasting_only=True)
     plain = FittedValues(fit_causes(search.problem, []), found.replays)
     deviation = _mean_bias_deviation(inside, noise)
-    before = model or add_origin_notes(replace(add_causes(GyroModel(), plain, deviation),
-                                               noise=noise), GyroModel(), quality)
+    best = replace(add_causes(GyroModel(), plain, deviation), noise=noise)
+    before = model or add_origin_notes(best, GyroModel(), quality)
     after = extend_model(model, inside, quality, findings, noise, deviation) if offered else before
     # Curves before the extension contain the best bias and scale factor error, unless these differ
     # significantly from those of the model.
@@ -279,11 +282,16 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
     return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
-                     tuple(unexplained_structures(search, found, unnamed)), noise, simulated, won,
+                     tuple(unexplained_structures(search, found, unnamed)), noise, simulated, gain,
                      before, after, _untestable_causes(search, logs), residual_curves(left, shown),
                      heading_error_curve(left, shown), allan_curves(found, noise, simulated),
-                     tuple(_remarks(quality, names, found, unnamed, refuted, out, won, model)),
+                     tuple(_remarks(quality, names, found, unnamed, refuted, out, gain, model)),
                      rate, heading_shares=of_heading)
+
+
+def _in_true_unit(log: Log, factor: float) -> Log:
+    """Return a log with its output multiplied by a factor."""
+    return log if factor == 1.0 or log.output is None else replace(log, output=log.output * factor)
 
 
 def _cause_findings(search: Search, fit: FittedValues, alternatives_of: Sequence[Alternatives],
@@ -322,8 +330,7 @@ def _cause_p_value(search: Search, causes: Sequence[SelectedCause], cause_index:
 
 
 def _search_with_filtered_noise(replays: Sequence[Replay], generator: np.random.Generator,
-                                rate: float,
-                                steps: ProgressSteps) -> tuple[Search, tuple[SelectedCause, ...]]:
+                                rate: float, steps: ProgressSteps) -> tuple[Search, Causes]:
     """Search for causes, and repeat it with levels for the noise if the residual is filtered."""
     search = start_search(replays, generator, rate, steps.begin_part)
     causes = search_causes(search)
@@ -334,8 +341,7 @@ def _search_with_filtered_noise(replays: Sequence[Replay], generator: np.random.
     return search, search_causes(search)
 
 
-def _withdraw_names(search: Search, causes: tuple[SelectedCause, ...]) -> tuple[
-        tuple[SelectedCause, ...], tuple[SelectedCause, ...]]:
+def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     """
     Separate named causes from structure without a name.
 
@@ -365,17 +371,17 @@ def _withdraw_names(search: Search, causes: tuple[SelectedCause, ...]) -> tuple[
     unnamed = tuple(each for each in causes if each not in kept)
     if not unnamed:
         return kept, ()
+    variables = {unnamed_variable(each.candidate) for each in unnamed
+                 if not is_named(each.candidate)}
     rest = tuple(each for each in unnamed if not is_named(each.candidate)
-                 or CAUSES[each.candidate.cause].along not in {unnamed_variable(
-                     other.candidate) for other in unnamed if not is_named(other.candidate)})
+                 or CAUSES[each.candidate.cause].along not in variables)
     left = eliminate_backward(search, refine_jointly(search, (*kept, *rest)))
-    return tuple(each
-                 for each in left if any(each.candidate.cause == one.candidate.cause
-                                         and each.candidate.log_index == one.candidate.log_index
-                                         for one in kept)), rest
+    keys = {(each.candidate.cause, each.candidate.log_index) for each in kept}
+    return tuple(each for each in left
+                 if (each.candidate.cause, each.candidate.log_index) in keys), rest
 
 
-def _size_sigmas(search: Search, causes: tuple[SelectedCause, ...]) -> list[float]:
+def _size_sigmas(search: Search, causes: Causes) -> list[float]:
     """Return the distance of the size of each cause from 0 in standard deviations."""
     found, sigmas = FittedValues(fit_causes(search.problem, causes), search.problem.replays), []
     for place, known in enumerate(causes):
@@ -387,8 +393,7 @@ def _size_sigmas(search: Search, causes: tuple[SelectedCause, ...]) -> list[floa
     return sigmas
 
 
-def _is_repeatable(search: Search, causes: tuple[SelectedCause, ...],
-                   cause: SelectedCause) -> bool:
+def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool:
     """Tell whether a cause along a temperature has the same size in all logs within the noise."""
     candidate, runs = cause.candidate, len(search.problem.replays)
     if (runs == 1 or CAUSES[candidate.cause].along not in _REPEATING_VARIABLES or not cause.values
@@ -400,20 +405,19 @@ def _is_repeatable(search: Search, causes: tuple[SelectedCause, ...],
     return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
 
 
-def _choose_simplest(search: Search, named: tuple[SelectedCause, ...],
-                     unnamed: tuple[SelectedCause,
-                                    ...]) -> tuple[tuple[SelectedCause, ...], list[Alternatives]]:
+def _choose_simplest(search: Search, named: Causes,
+                     unnamed: Causes) -> tuple[Causes, list[Alternatives]]:
     """Replace each cause by its simplest alternative, and return the alternatives of each."""
     def size(known: SelectedCause) -> int:
         """Return the number of fitted values of a cause."""
         candidate = known.candidate
-        return len(fitted_shape_indices(
-            candidate)) + (0 if candidate.amplitude is not None
-                           else len(candidate.columns(search.problem.replays[0])))
+        count = len(fitted_shape_indices(candidate))
+        return (count if candidate.amplitude is not None
+                else count + len(candidate.columns(search.problem.replays[0])))
 
     sets: list[Alternatives] = []
     for place in range(len(named)):
-        members = (find_alternatives(search, (*named, *unnamed), place) or [(named[place], 0.0)])
+        members = find_alternatives(search, (*named, *unnamed), place) or [(named[place], 0.0)]
         sizes = [size(each) for each, _ in members]
         if min(sizes) < size(named[place]):
             chosen = members[int(np.argmin(sizes))][0]
@@ -440,15 +444,15 @@ def _model_value_findings(fit: FittedValues, model: GyroModel, noise: Noise,
                      for name in NOISE_NAMES[1:]))
     deviations = np.hypot([_mean_bias_deviation(fit, likely), scale.deviation], own)
     different = []
-    for name, value, deviation, confounders in (('bias', bias, float(deviations[0]), ()),
-                                                ('scale_factor_error', scale.value,
-                                                 float(deviations[1]), ('reference_scale',))):
+    tested = (('bias', bias, float(deviations[0]), ()),
+              ('scale_factor_error', scale.value, float(deviations[1]), ('reference_scale',)))
+    for name, value, deviation, confounders in tested:
         chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
         if chance < _BIAS_ALARM_SHARE * false_alarm_rate:
+            size = _estimate(Value(value, deviation), CAUSES[name].unit)
             different.append(make_finding(
-                name, {name: Estimate.from_half_width(value, NORMAL_QUANTILE_975 * deviation,
-                                                      CAUSES[name].unit)}, chance, confounders,
-                minimum_detectable=5.4 * deviation, evidence='it adds to the value of the model, '
+                name, {name: size}, chance, confounders, minimum_detectable=5.4 * deviation,
+                evidence='it adds to the value of the model, '
                 f'{abs(value) / deviation:.3g} sigma from zero'))
     return different
 
@@ -485,8 +489,7 @@ def _noise_findings(noise_parameters: NoiseParameters, model: GyroModel, false_a
 def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     """Return the reason for each cause that these logs cannot show."""
     replays = search.problem.replays
-    has = frozenset.intersection(
-        *(each.available_channels for each in replays)) | {'time', 'output'}
+    has = common_channels(replays) | {'time', 'output'}
     of_motion = frozenset({'reference', *REFERENCES})
     has |= (of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES)
             else frozenset())

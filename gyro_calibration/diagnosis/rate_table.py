@@ -50,9 +50,9 @@ from gyro_calibration.diagnosis.dwell_fit import (
     model_uncertainty,
     name_causes,
     NamedCauses,
-    naming_level,
     NUISANCE_EFFECTS,
     RATE,
+    significance_level,
     simulate_output,
     simulation_under_test,
     SINGLE_RATES,
@@ -145,14 +145,13 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
     after = assemble_model(dwells, model, named.fit) if offered else before
     strengths = {effect: _misfit_reduction(named, effect) for effect in named.causes}
-    findings = add_remedies(
-        [*record.findings,
-         *_outlier_findings(dwells, named.fit, _OUTLIER_ALARM_SHARE * false_alarm_rate),
-         *(_cause_finding(named, effect)
-           for effect in sorted(named.causes, key=lambda each: -strengths[each]))], {}, after)
+    strongest_first = sorted(named.causes, key=lambda each: -strengths[each])
+    outliers = _outlier_findings(dwells, named.fit, _OUTLIER_ALARM_SHARE * false_alarm_rate)
+    findings = add_remedies([*record.findings, *outliers, *(
+        _cause_finding(named, effect) for effect in strongest_first)], {}, after)
     if after is not before:
-        after = replace(after,
-                        origin={**after.origin, **origin_notes(findings, [record.unit_factor])})
+        notes = origin_notes(findings, [record.unit_factor])
+        after = replace(after, origin={**after.origin, **notes})
     return Diagnosis(
         tuple(findings), structures, Noise(),
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
@@ -166,10 +165,12 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
 # the steps
 
 
-def _conclude_causes(
-    dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-    withdrawn: frozenset[str] = frozenset()
-) -> tuple[NamedCauses, tuple[Unexplained, ...], frozenset[str]]:
+#: Causes, structure without a name, and the names that were withdrawn.
+Conclusion = tuple[NamedCauses, tuple[Unexplained, ...], frozenset[str]]
+
+
+def _conclude_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
+                     withdrawn: frozenset[str] = frozenset()) -> Conclusion:
     """Name causes, and withdraw names along a variable with much unexplained structure."""
     named = name_causes(dwells, model, false_alarm_rate, withdrawn)
     structures, gains = find_structure(named.fit, _STRUCTURE_ALARM_SHARE * false_alarm_rate,
@@ -212,8 +213,8 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
     # the heading error of a turn over the window at the rate of a dwell
     squares = {name: np.outer(np.bincount(part_numbers, error[known] ** 2),
                               [1.0, HEADING_WINDOW ** 2]) for name, error in errors.items()}
-    return gain_from_squares(f'{what} left out, each of {groups.max() + 1} groups in '
-                             'turn', squares, np.outer(np.bincount(part_numbers), [1, 1]),
+    return gain_from_squares(f'{what} left out, each of {groups.max() + 1} groups in turn',
+                             squares, np.outer(np.bincount(part_numbers), [1, 1]),
                              'plain' if model is None else 'given', HEADING_WINDOW)
 
 
@@ -247,8 +248,8 @@ def _misfit_reduction(named: NamedCauses, effect: Effect) -> float:
     if effect not in NUISANCE_EFFECTS:
         rest = _fit_without(named.change_fit, named.change_effect(effect))
         return math.inf if rest is None else rest.misfit - named.change_fit.misfit
-    return (value_change(named.fit, named.model,
-                         effect) / _term_with_deviations(named.fit, effect)[1][0]) ** 2
+    _, (deviation, *_) = _term_with_deviations(named.fit, effect)
+    return (value_change(named.fit, named.model, effect) / deviation) ** 2
 
 
 def _fit_without(fit: Calibration, effect: Effect) -> Calibration | None:
@@ -291,7 +292,7 @@ def _term_with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[
 def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
     """Return the minimum detectable size of an effect, in the unit of its first value."""
     change = named.change_effect(effect)
-    level = naming_level(named.false_alarm_rate, effect in NUISANCE_EFFECTS)
+    level = significance_level(named.false_alarm_rate, effect in NUISANCE_EFFECTS)
     if effect in NUISANCE_EFFECTS:
         return _detectable_size(named.fit, effect, level)
     if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):

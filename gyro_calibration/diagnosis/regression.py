@@ -144,9 +144,10 @@ def _assemble_problem(replays: tuple[Replay, ...], first: NoiseShape,
     angle = np.concatenate([part for part, _ in parts])
     step = np.concatenate([np.full(len(part), step) for part, step in parts])
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
-    relative = np.array([np.add.reduceat(
-        shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen], first_of)
-                         for shape in shapes]) / [len(part) for part in few]
+    angle, step, plain = angle[chosen], step[chosen], plain[chosen]
+    sums = [np.add.reduceat(shape.variance(angle, step) / step / plain, first_of)
+            for shape in shapes]
+    relative = np.array(sums) / [len(part) for part in few]
     # Each combination of components has the same prior probability, whatever its number of sizes.
     kinds = [(bool(each.walk_ratio), bool(each.markov_ratio), bool(each.flicker_corner))
              for each in shapes]
@@ -268,9 +269,10 @@ def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause],
     """
     replays = [with_distorted_rate(each, causes) for each in problem.replays]
     widths = []
-    residual = np.concatenate([each.transform_residual(
-        each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
-                               for each, new in zip(problem.replays, replays)])
+    residual = np.concatenate([
+        each.transform_residual(
+            each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
+        for each, new in zip(problem.replays, replays)])
     columns, owner = [np.concatenate([each.transform_samples(each.channels.rate)
                                       for each in replays])[None]], [(-1, 0)]
     for place, known in enumerate(causes):

@@ -354,9 +354,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     count = int(np.count_nonzero(kept))
     if count < MIN_SAMPLES:
         raise DataRefused(f'{count} of {len(kept)} samples can be used, at least {MIN_SAMPLES} '
-                          'are '
-                          'needed; the others are lost, repeated, outliers or near a limit: turn '
-                          'more slowly, or repair the line, and record again')
+                          'are needed; the others are lost, repeated, outliers or near a limit: '
+                          'turn more slowly, or repair the line, and record again')
     place, interval = grid_indices(time, kept)
     _refuse_gaps(log.time[kept], place)
     every = max(1, math.ceil((place[-1] + 1) / MAX_POINTS))
@@ -395,8 +394,7 @@ def _refuse_gaps(time: Array, grid_index: NDArray[np.intp]) -> None:
     gaps = np.diff(time)
     longest = int(np.argmax(gaps))
     raise DataRefused(f'{len(grid_index)} of {points} samples can be used, at least a fifth is '
-                      'needed; '
-                      f'the longest gap, of {gaps[longest]:.6g} s, begins at '
+                      f'needed; the longest gap, of {gaps[longest]:.6g} s, begins at '
                       f'{time[longest]:.3f} s: cut the log there, and give both parts, or give '
                       '--rate if the stamps are wrong')
 
@@ -414,7 +412,7 @@ def _even_time(time: Array) -> Array:
 
 def _smoothing_decimation(base_replay: Replay) -> int:
     """
-    Return the additional number of points to average, so that smoothing does not show.
+    Return the factor of the number of points to average, so that smoothing does not show.
 
     A gyro with averaged samples, or a smoothed reference, has hardly any noise at the highest
     frequencies. The noises of the grid do not describe that, so that small errors of motion and
@@ -423,8 +421,8 @@ def _smoothing_decimation(base_replay: Replay) -> int:
     """
     residual, factor, decimation = base_replay.channels.output - base_replay.reference, 1, 1
     while 2 * factor * base_replay.point_interval <= _MAX_AVERAGING_TIME:
-        power = replace(base_replay, decimation=base_replay.decimation * factor).transform_samples(
-            residual) ** 2
+        averaged = replace(base_replay, decimation=base_replay.decimation * factor)
+        power = averaged.transform_samples(residual) ** 2
         _, second, _, last = (float(np.median(part)) for part in np.array_split(power, 4))
         factor *= 2
         if last < SMOOTHED_POWER_RATIO * second:
@@ -528,8 +526,9 @@ def _interpolate_updates(time: Array, values: Array, step: float) -> Array:
     renewed = np.flatnonzero((np.diff(values, prepend=np.nan) != 0.0) & known)
     update_times, update_values = time[renewed], values[renewed]
     usual = float(np.median(np.diff(update_times)))
-    held_updates = 1 + np.flatnonzero((np.diff(update_times) > _STANDSTILL_FACTOR * usual) & (
-        np.abs(np.diff(update_values)) > _STANDSTILL_FACTOR * step))
+    held_updates = 1 + np.flatnonzero(
+        (np.diff(update_times) > _STANDSTILL_FACTOR * usual)
+        & (np.abs(np.diff(update_values)) > _STANDSTILL_FACTOR * step))
     update_times = np.insert(update_times, held_updates, update_times[held_updates] - usual)
     update_values = np.insert(update_values, held_updates, update_values[held_updates - 1])
     return np.where(known, np.interp(time, update_times, update_values), np.nan)
@@ -539,12 +538,12 @@ def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Ar
     """Return the rate of a heading by splines, nan where lost; and a smooth one without steps."""
     lost = ~np.isfinite(heading)
     rate = CubicSpline(time, _interpolate_gaps(time, heading))(time, 1)
-    near = maximum_filter1d(
-        lost, 3) | maximum_filter1d(binary_opening(lost, np.ones(_GAP_MARGIN_SAMPLES)),
-                                    2 * _GAP_MARGIN_SAMPLES + 1)
+    long = binary_opening(lost, np.ones(_GAP_MARGIN_SAMPLES))
+    near = maximum_filter1d(lost, 3) | maximum_filter1d(long, 2 * _GAP_MARGIN_SAMPLES + 1)
     raw = np.where(near, np.nan, rate)
-    return raw, _filter_rounding(rate, heading_step,
-                                 float(np.median(np.diff(time)))) if heading_step else rate
+    if heading_step:
+        rate = _filter_rounding(rate, heading_step, float(np.median(np.diff(time))))
+    return raw, rate
 
 
 def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> Mask:
@@ -578,6 +577,5 @@ def _filter_rounding(rate: Array, step: float, interval: float) -> Array:
     rounding = ((step / interval) ** 2 / 12.0
                 * spline_derivative_gain(np.arange(len(rate)) * math.pi / len(rate)))
     power = uniform_filter1d(coefficients ** 2, _SMOOTHING_BINS, mode='nearest')
-    return idct(
-        coefficients * np.clip(1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300),
-                               0.0, 1.0), norm='ortho')
+    weight = 1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300)
+    return idct(coefficients * np.clip(weight, 0.0, 1.0), norm='ortho')

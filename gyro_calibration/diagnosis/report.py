@@ -109,13 +109,13 @@ def _header(diagnosis: Diagnosis) -> Markup:
                     for name in ('name', 'serial_number')).strip()
     about = ' · '.join(
         filter(None, ['Diagnosis', gyro, ', '.join(map(sanitize_text, diagnosis.logs))]))
+    shares, gain = heading_error_sentence(diagnosis), diagnosis.gain
+    tiles = [] if gain is None else [_tile(*each) for each in _gain_rows(gain)]
     return element('header', element('p', about, class_='about'), element('h1', what),
-                   element('p', gained, class_='gained'), element('p', parts, class_='gained')
-                   if (parts := heading_error_sentence(diagnosis)) else None,
+                   element('p', gained, class_='gained'),
+                   element('p', shares, class_='gained') if shares else None,
                    element('p', verdict_phrase(diagnosis), class_=f'verdict {diagnosis.verdict}'),
-                   None if diagnosis.gain is None
-                   else element('div', *(_tile(*each) for each in _gain_rows(diagnosis.gain)),
-                                class_='tiles'))
+                   element('div', *tiles, class_='tiles') if tiles else None)
 
 
 def _tile(what: str, errors: Change, unit: str) -> Markup:
@@ -350,10 +350,8 @@ def _responsive_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Ma
     body = (element('tr', element('th', row[0], scope='row'), *(
         element('td', cell, data_head=head) for head, cell in zip(heads[1:], row[1:])))
         for row in rows)
-    table = element(
-        'table',
-        element('thead', element('tr', *(element('th', head, scope='col') for head in heads))),
-        element('tbody', *body))
+    columns = (element('th', head, scope='col') for head in heads)
+    table = element('table', element('thead', element('tr', *columns)), element('tbody', *body))
     return element('div', table, class_='fold')
 
 
@@ -363,14 +361,14 @@ def _gain_content(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     parts = [] if diagnosis.heading is None else [draw_chart(_heading_chart(diagnosis.heading))]
     if diagnosis.gain is not None:
         errors = _gain_rows(diagnosis.gain)
-        yield element('p', ' '.join(
-            [f'Measured on {sanitize_text(diagnosis.gain.held_out)}, which took no part in the '
-             'choice or '
-             'the fit.', *(f'The extended model {change_phrase(each, unit, f"the {what}")}.'
-                           for what, each, unit in errors)]))
-        parts.append(_responsive_table(['rms', 'before', 'after', 'reduction, 95 % interval'], [
-            [what, format_amount(each.before, unit), format_amount(each.after, unit),
-             _reduction_text(each, unit)] for what, each, unit in errors]))
+        changes = [f' The extended model {change_phrase(each, unit, f"the {what}")}.'
+                   for what, each, unit in errors]
+        yield element('p', f'Measured on {sanitize_text(diagnosis.gain.held_out)}, which took no '
+                      'part in the choice or the fit.' + ''.join(changes))
+        rows = [[what, format_amount(each.before, unit), format_amount(each.after, unit),
+                 _reduction_text(each, unit)] for what, each, unit in errors]
+        parts.append(_responsive_table(['rms', 'before', 'after', 'reduction, 95 % interval'],
+                                       rows))
     yield _side_by_side(parts) if parts else None
 
 

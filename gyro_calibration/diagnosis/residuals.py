@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from gyro_calibration.allan import allan_deviation
+from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.regression import FittedValues, RegressionFit
 from gyro_calibration.diagnosis.replay import (
@@ -138,8 +139,9 @@ def _band_energies(fit: RegressionFit) -> _BandEnergies:
     problem, (angle, step) = fit.problem, fit.problem.coefficient_angles()
     left = np.concatenate(fit.residual_transforms()) * problem.deviation
     # The noise parameters before a filter are those of frequencies below its cut-off.
-    used = np.concatenate([coefficient_angles(each.point_count) < 1.5 * np.pi
-                           / len(each.noise_levels) for each in problem.replays])
+    used = np.concatenate(
+        [coefficient_angles(each.point_count) < 1.5 * np.pi / len(each.noise_levels)
+         for each in problem.replays])
     coarse = np.concatenate(
         [np.full(each.point_count - 1, each.rounding_variance / each.decimation)
          for each in problem.replays])
@@ -176,19 +178,18 @@ def _fit_noise(bands: _BandEnergies, fixed: dict[int, float],
     size = bands.unit_variances.shape[1]
     free = [place for place in range(size) if place not in fixed]
     usual = bands.energy / bands.count
-    begin = start if start is not None else np.log(
-        np.array([(usual / bands.unit_variances[:, place]).min() for place in range(size)]))
+    begin = (start if start is not None
+             else np.log((usual[:, None] / bands.unit_variances).min(axis=0)))
     logarithms = np.array([fixed.get(place, begin[place]) for place in range(size)])
 
     def cost(some: Array) -> float:
         logarithms[free] = some
         return bands.cost(logarithms)
 
-    found = [
-        minimize(cost, begin[free] + shift, method='L-BFGS-B', bounds=[(-60.0, 20.0)] * len(free))
-        for shift in (0.0,
-                      *(-3.0 * (np.arange(len(free)) == place) for place in range(1, len(free))))]
-    best = min(found, key=lambda one: one.fun)
+    shifts = (0.0, *(-3.0 * (np.arange(len(free)) == place) for place in range(1, len(free))))
+    best = min((minimize(cost, begin[free] + shift, method='L-BFGS-B',
+                         bounds=[(-60.0, 20.0)] * len(free)) for shift in shifts),
+               key=lambda one: one.fun)
     logarithms[free] = best.x
     return logarithms.copy(), float(best.fun)
 
@@ -196,8 +197,7 @@ def _fit_noise(bands: _BandEnergies, fixed: dict[int, float],
 def _significance_floors(bands: _BandEnergies, best: Array) -> Array:
     """Return the logarithms below which a figure is less than 1 % of the noise everywhere."""
     variance = bands.variance(best)
-    return np.array([np.log(0.01 * (variance / bands.unit_variances[:, place]).min())
-                     for place in range(len(best))])
+    return np.log(0.01 * (variance[:, None] / bands.unit_variances).min(axis=0))
 
 
 def _likelihood_interval(bands: _BandEnergies, place: int, best: Array,
@@ -250,7 +250,7 @@ def residual_curves(before: Sequence[Array], after: FittedValues) -> list[Curve]
 def _curve_variables(
         replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[Replay], Array]]]:
     """Give name, unit, and a function that returns the variable of a log."""
-    has = frozenset.intersection(*(each.available_channels for each in replays))
+    has = common_channels(replays)
     yield 'time', 's', lambda each: each.channels.time - each.channels.time[0]
     if any(np.ptp(each.channels.rate) > 0.0 for each in replays):
         yield 'rate', 'rad/s', lambda each: each.channels.rate

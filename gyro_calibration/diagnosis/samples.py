@@ -199,8 +199,8 @@ def _is_clipped(comparison: OutputComparison, sign: float, extreme: float, step:
     at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
     runs = int(np.count_nonzero(np.diff(at_extreme.astype(np.int8), prepend=0) > 0))
     fine = step < _FINE_STEP_NOISE_RATIO * comparison.noise_deviation
-    beyond = (np.array([]) if comparison.expected is None else sign
-              * comparison.expected[at_extreme & np.isfinite(comparison.expected)] - extreme)
+    expected = np.array([]) if comparison.expected is None else comparison.expected[at_extreme]
+    beyond = sign * expected[np.isfinite(expected)] - extreme
     if not beyond.size:
         return fine and runs >= _MIN_LIMIT_RUNS
     middle = float(np.median(beyond))
@@ -427,24 +427,25 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
                 else bridge_gaps(comparison.expected))
     limit = max(_MIN_OUTLIER_SIGMAS, float(stats.norm.isf(0.25 * level / len(output))))
     # how much the output is expected to change about each sample
-    expected_change = np.zeros(len(output)) if expected is None else np.ptp(
-        sliding_window_view(np.pad(expected, 2 * NEIGHBOURS_PER_SIDE, mode='edge'),
-                            4 * NEIGHBOURS_PER_SIDE + 1), axis=1)
+    expected_change = np.zeros(len(output))
+    if expected is not None:
+        padded = np.pad(expected, 2 * NEIGHBOURS_PER_SIDE, mode='edge')
+        expected_change = np.ptp(sliding_window_view(padded, 4 * NEIGHBOURS_PER_SIDE + 1), axis=1)
     sigmas = _outlier_sigmas(output, expected_change, valid, min_scatter)
     if expected is not None:
         sigmas = np.maximum(
             sigmas, _outlier_sigmas(output - expected, expected_change, valid, min_scatter))
         # near a jump of the reference of half the size: a jolt, or the reference is outlying
         jumps = maximum_filter1d(_distance_to_median(expected), 2 * _JOLT_SAMPLES + 1)
-        sigmas[jumps > 0.5 * np.minimum(_distance_to_median(output),
-                                        _distance_to_median(output - expected))] = 0.0
-    tested = valid & (np.count_nonzero(_neighbour_samples(~valid, NEIGHBOURS_PER_SIDE),
-                                       axis=1) < NEIGHBOURS_PER_SIDE)
+        off = np.minimum(_distance_to_median(output), _distance_to_median(output - expected))
+        sigmas[jumps > 0.5 * off] = 0.0
+    missing = np.count_nonzero(_neighbour_samples(~valid, NEIGHBOURS_PER_SIDE), axis=1)
+    tested = valid & (missing < NEIGHBOURS_PER_SIDE)
     outlying = _drop_long_runs((sigmas > limit) & tested)
     count = int(np.count_nonzero(outlying))
     near = int(np.count_nonzero((sigmas > _NEAR_OUTLIER_SIGMAS) & (sigmas <= limit) & tested))
-    if (not count or near > 0.5 * count + stats.poisson.isf(
-            0.01, 2.0 * len(output) * stats.norm.sf(_NEAR_OUTLIER_SIGMAS))
+    usual = stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_NEAR_OUTLIER_SIGMAS))
+    if (not count or near > 0.5 * count + usual
             or _is_due_to_motion(outlying, expected_change, comparison)):
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
@@ -476,21 +477,18 @@ def _outlier_sigmas(values: Array, expected_change: Array, valid: Mask,
     off = np.abs(values - np.median(near, axis=1))
     # A step, a corner or a steep slope is off the median, but within the range of its neighbours.
     outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
-    scale = np.maximum(np.maximum(_local_deviation(off, valid),
-                                  _deviation_by_motion(off, expected_change, valid)),
-                       max(min_scatter, 1e-300))
+    scale = np.maximum(_local_deviation(off, valid),
+                       _deviation_by_motion(off, expected_change, valid))
+    scale = np.maximum(scale, max(min_scatter, 1e-300))
     return np.where(outside > 0.5 * off, off / scale, 0.0)
 
 
 def _local_deviation(distance: Array, valid: Mask) -> Array:
     """Return the robust standard deviation in blocks, the largest of those next to a sample."""
     blocks = max(1, len(distance) // _SCATTER_BLOCK_SAMPLES)
-    scales = np.array(
-        [_robust_deviation(part[kept])
-         for part, kept in zip(np.array_split(distance, blocks), np.array_split(valid, blocks))])
-    edged = np.pad(scales, 1, mode='edge')
-    scales = np.maximum(np.maximum(edged[:-2], edged[1:-1]), edged[2:])
-    return np.repeat(scales, [len(part) for part in np.array_split(distance, blocks)])
+    parts, kept = np.array_split(distance, blocks), np.array_split(valid, blocks)
+    scales = [_robust_deviation(part[own]) for part, own in zip(parts, kept)]
+    return np.repeat(maximum_filter1d(scales, 3, mode='nearest'), [len(part) for part in parts])
 
 
 def _robust_deviation(off: Array) -> float:
@@ -499,8 +497,8 @@ def _robust_deviation(off: Array) -> float:
 
 def _deviation_by_motion(distance: Array, expected_change: Array, valid: Mask) -> Array:
     """Return the standard deviation among samples of like motion, by far ones too if enough."""
-    edges = np.unique(np.quantile(expected_change[valid], np.linspace(
-        0.0, 1.0, _MOTION_KINDS + 1)[1:-1])) if valid.any() else np.array([])
+    shares = np.linspace(0.0, 1.0, _MOTION_KINDS + 1)[1:-1]
+    edges = np.unique(np.quantile(expected_change[valid], shares)) if valid.any() else np.array([])
     kinds = np.searchsorted(edges, expected_change, side='left')
     scales = np.zeros(len(edges) + 1)
     for kind in range(len(scales)):
@@ -530,8 +528,8 @@ def _is_due_to_motion(outlying: Mask, expected_change: Array,
     by_chance = 0.5 + stats.norm.isf(_PATTERN_CHANCE) / np.sqrt(12.0 * len(ranks))
     if ranks.mean() > max(_MAX_MEAN_MOTION_RANK, by_chance):
         return True
-    turning = (expected_change > 3.0 * comparison.noise_deviation) & np.isfinite(
-        comparison.expected)
+    turning = ((expected_change > 3.0 * comparison.noise_deviation)
+               & np.isfinite(comparison.expected))
     if np.count_nonzero(outlying & turning) < _MIN_PATTERN_OUTLIERS:
         return False
     speeds = np.abs(comparison.expected)

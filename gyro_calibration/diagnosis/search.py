@@ -245,8 +245,8 @@ def simulate_null_distribution(fit: RegressionFit, columns: CandidateColumns,
         if not np.isfinite(null_evidence[:, own]).any():
             start[cause], scale[cause] = 0.0, 1.0  # not identifiable in these data
             continue
-        most = np.sort(
-            log_mean_exp(null_evidence[:, own]))[int((1.0 - share) * len(null_evidence)):]
+        ordered = np.sort(log_mean_exp(null_evidence[:, own]))
+        most = ordered[int((1.0 - share) * len(ordered)):]
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
     return NullDistribution(start, scale, share)
 
@@ -274,22 +274,20 @@ def restrict_search(search: Search, replays: Sequence[Replay], causes: Collectio
     """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
     found = [each for each in search.candidates if each.cause in causes]
     problem = build_problem(replays)
-    return replace(search, problem=problem,
+    return replace(search, problem=problem, rate=rate, columns_cache={}, step_cache={},
                    candidate_columns=make_candidate_columns(problem, found),
-                   rate=rate, scanned_causes=SCANNED_CAUSES & frozenset(causes), columns_cache={},
-                   step_cache={})
+                   scanned_causes=SCANNED_CAUSES & frozenset(causes))
 
 
 def _drop_unlikely_noises(problem: RegressionProblem,
                           candidates: Sequence[Candidate]) -> RegressionProblem:
     """Remove noises that are unlikely both without causes and with one column of each cause."""
-    middle = [places[len(places) // 2] for places in indices_by_cause(
-        [each for each in candidates if is_named(each)]).values()]
-    tried = [each.noise_likelihood
-             for each in (fit_causes(problem, []),
-                          fit_causes(problem, [], [candidates[place] for place in middle]))]
-    kept = np.flatnonzero(np.any([each.log_likelihood[0] > each.log_likelihood[0].max()
-                                  - MAX_LIKELIHOOD_DEFICIT for each in tried], axis=0))
+    by_cause = indices_by_cause([each for each in candidates if is_named(each)])
+    middle = [candidates[places[len(places) // 2]] for places in by_cause.values()]
+    tried = [fit.noise_likelihood.log_likelihood[0]
+             for fit in (fit_causes(problem, []), fit_causes(problem, [], middle))]
+    kept = np.flatnonzero(
+        np.any([each > each.max() - MAX_LIKELIHOOD_DEFICIT for each in tried], axis=0))
     if not len(kept):
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
@@ -394,8 +392,8 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
     value = 0.5 * (size[indices] / deviation) ** 2 - likely - COLUMN_PENALTY
     # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
     # of an encoder is constant at rest, and differs by up to a step between two rests.
-    value[(wide[indices]
-           / size[indices] < 0.3) | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
+    is_temporary = wide[indices] / size[indices] < 0.3
+    value[is_temporary | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
@@ -559,17 +557,16 @@ def find_strongest(search: Search,
     return search.step_cache[key]
 
 
-def _search_strongest(
-        search: Search,
-        causes: Sequence[SelectedCause]) -> tuple[SearchStep | None, list[SearchStep]]:
+def _search_strongest(search: Search, causes: Sequence[SelectedCause],
+                      ) -> tuple[SearchStep | None, list[SearchStep]]:
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit, causes)
     if not any(search.excess_evidence(each.candidate.cause, each.mean_evidence) > 0.0
                for each in first):
         found = [refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
-                 for each in first if search.excess_evidence(
-                     each.candidate.cause, each.mean_evidence,
-                     SUSPECTED_RATE_FACTOR if is_lasting(each.candidate) else 1.0) > 0.0]
+                 for each in first if is_lasting(each.candidate)
+                 and search.excess_evidence(each.candidate.cause, each.mean_evidence,
+                                            SUSPECTED_RATE_FACTOR) > 0.0]
         return None, sorted(found, key=lambda step: -step.score)
     top = max(first, key=lambda each: each.evidence)
     # Causes that distort the rate are equal to first order; large ones need refined shapes.
@@ -585,9 +582,8 @@ def _search_strongest(
     # than its penalty.
     steps = sorted((step for step in steps if step.score > fit.log_likelihood),
                    key=lambda step: -step.score)
-    beyond = (step for step in steps
-              if search.excess_evidence(step.causes[-1].candidate.cause, step.score
-                                        - fit.log_likelihood) > 0.0)
+    beyond = (step for step in steps if search.excess_evidence(
+        step.causes[-1].candidate.cause, step.score - fit.log_likelihood) > 0.0)
     return next(beyond, None), steps
 
 
@@ -606,10 +602,13 @@ def find_suspected(search: Search, selected: Sequence[SelectedCause]) -> SearchS
     _, steps = find_strongest(search, selected)
     score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
     cause_names = {each.candidate.cause for each in selected}
-    candidates = ((step, step.causes[-1].candidate) for step in steps)
-    return next((step for step, candidate in candidates if is_lasting(candidate)
-                 and candidate.cause not in cause_names and search.excess_evidence(
-                     candidate.cause, step.score - score, SUSPECTED_RATE_FACTOR) > 0.0), None)
+    for step in steps:
+        candidate = step.causes[-1].candidate
+        if (is_lasting(candidate) and candidate.cause not in cause_names
+                and search.excess_evidence(candidate.cause, step.score - score,
+                                           SUSPECTED_RATE_FACTOR) > 0.0):
+            return step
+    return None
 
 
 def _screen_causes(search: Search, fit: RegressionFit,

@@ -537,8 +537,8 @@ def _point_variances(left: Array) -> Array:
     point = np.concatenate([[0.0], np.cumsum(left)])
     off = np.abs(point - median_filter(point, 9, mode='nearest'))
     # a monotonic drift is equal to its median
-    size = 1.4826 * max(float(np.median(off)),
-                        float(np.median(np.abs(np.diff(point, 2)))) / math.sqrt(6.0)) + 1e-9
+    by_steps = float(np.median(np.abs(np.diff(point, 2)))) / math.sqrt(6.0)
+    size = 1.4826 * max(float(np.median(off)), by_steps) + 1e-9
     return np.clip(off / (3.0 * size), 1.0, _MAX_POINT_DEVIATION) ** 2
 
 
@@ -690,18 +690,18 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     """
     spans, noise_fit = fit.spans, noise_fit or fit
     waves, shared = _wander_columns(noise_fit.spans)
-    sizes = {part.name: noise_fit.fit.sizes[part.name][2] if use_max_random_walk
-             and part.name == 'rate_random_walk' else noise_fit.fit.likeliest_sizes[part.name]
-             for part in shared}
+    sizes = {part.name: noise_fit.fit.likeliest_sizes[part.name] for part in shared}
+    if use_max_random_walk and 'rate_random_walk' in sizes:
+        sizes['rate_random_walk'] = noise_fit.fit.sizes['rate_random_walk'][2]
     variance = np.sum([sizes[part.name] ** 2 * part.variance for part in shared], axis=0)
     columns = np.column_stack([design_matrix(spans, causes), waves])
     width = columns.shape[1] - waves.shape[1]
     prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
     prior[:3, :3] = np.diag(1.0 / fit.prior)
     prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
+    sectors = [spans.shaft_sectors] if spans.uses_code_changes else []
     clusters = [np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
-                for each in (spans.stretch_numbers,
-                             *([spans.shaft_sectors] if spans.uses_code_changes else []))]
+                for each in (spans.stretch_numbers, *sectors)]
     return WhitenedRegression(
         np.append(noise_fit.fit.whiten(spans.observed), np.zeros(len(prior))),
         np.concatenate([noise_fit.fit.whiten(columns), prior]), clusters[0], tuple(clusters[1:]),

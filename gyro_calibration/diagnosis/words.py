@@ -401,8 +401,7 @@ def structure_sentence(each: Unexplained) -> str:
     """Return share and probability of structure that no cause explains."""
     share = _format_share(each.share_of_variance)
     return (f'Along {readable_name(each.along)}: {share} of the variance of the residual; '
-            'probability by '
-            f'noise alone: {format_probability(each.p_value)}.')
+            f'probability by noise alone: {format_probability(each.p_value)}.')
 
 
 def heading_share_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:

@@ -79,5 +79,5 @@ def test_without_its_file_a_model_with_such_an_effect_is_refused(tmp_path, run):
 def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(text, message, tmp_path, run):
     if text is not None:
         (tmp_path / 'own.py').write_text(text)
-    code, _, said = run('allan', 'log.csv', '--catalogue', tmp_path / 'own.py')
-    assert code == 2 and message in said and said.count('\n') == 1
+    code, _, error = run('allan', 'log.csv', '--catalogue', tmp_path / 'own.py')
+    assert code == 2 and message in error and error.count('\n') == 1

@@ -217,13 +217,13 @@ def test_shapes_of_the_output_are_what_they_are_called(generator):
 
 
 def test_faults_of_samples_are_as_many_as_it_says(generator):
-    wild, = hide(['outliers'], 4.0, generator, noise='white', **COARSE)
-    far = np.abs(wild.columns['gyro_rad_s'] - wild.truth.prediction) > 6.0 * np.std(
-        wild.truth.noise)
-    assert far.sum() == wild.truth['outliers'].size == 12.0 and (far == ~wild.truth.is_good).all()
-    stuck, = hide(['stuck_samples'], 4.0, generator, noise='white', **COARSE)
-    repeated = np.diff(stuck.columns['gyro_rad_s']) == 0.0
-    assert (repeated == ~stuck.truth.is_good[1:]).all() and repeated.sum() >= 3 * 4
+    outlying, = hide(['outliers'], 4.0, generator, noise='white', **COARSE)
+    truth = outlying.truth
+    far = np.abs(outlying.columns['gyro_rad_s'] - truth.prediction) > 6.0 * np.std(truth.noise)
+    assert far.sum() == truth['outliers'].size == 12.0 and (far == ~truth.is_good).all()
+    repeating, = hide(['stuck_samples'], 4.0, generator, noise='white', **COARSE)
+    repeated = np.diff(repeating.columns['gyro_rad_s']) == 0.0
+    assert (repeated == ~repeating.truth.is_good[1:]).all() and repeated.sum() >= 3 * 4
     holed, = hide(['dropped_samples'], 4.0, generator, noise='white', **COARSE)
     assert 1 <= np.sum(np.diff(holed.columns['time_s']) > 1.5 * holed.session.interval) <= 12
 

@@ -158,14 +158,14 @@ def test_a_factor_that_may_be_of_the_gyro_stays_in_the_scale_factor_of_a_model(w
     terms = {term.effect.name: term.values for term in found.model.terms}
     assert ('unit_error' in names(found)
             and terms['scale_factor_error'][0] == pytest.approx(0.024, abs=1e-3))
-    assert any('was not multiplied' in said for said in found.remarks)
+    assert any('was not multiplied' in remark for remark in found.remarks)
 
 
 def test_a_model_of_a_mended_table_says_what_its_output_was_multiplied_by(without_gain):
     table = Table().measure(gyro('scale_factor_asymmetry', 0.02), np.random.default_rng(8))
     found = diagnose_table(replace(table, output=-table.output), None)
     assert (found.model.origin['output_multiplied_by'] == [-1.0]
-            and any('was multiplied by -1' in said for said in found.remarks))
+            and any('was multiplied by -1' in remark for remark in found.remarks))
 
 
 # models that are put to the test

@@ -80,10 +80,10 @@ def test_outliers_are_held_back_and_reported():
         history, table = simulate(generator, cubic(generator)), BiasTable(MODEL)
         learn(table, replace(history, estimate=history.bias), 0)
         table.begin_run()
-        said = np.array([bool(text) for text in learn(table, history, 1)])
+        refused = np.array([bool(text) for text in learn(table, history, 1)])
         outlier = history.outlier[1]
-        found, held = found + outlier.sum(), held + said[outlier].sum()
-        wrong, kept = wrong + said[~outlier].sum(), kept + (~outlier).sum()
+        found, held = found + outlier.sum(), held + refused[outlier].sum()
+        wrong, kept = wrong + refused[~outlier].sum(), kept + (~outlier).sum()
     assert found >= 5 and held >= 0.8 * found and wrong <= 0.02 * kept
 
 
@@ -145,9 +145,9 @@ def jumped():
 
 
 def test_a_jump_is_noticed_and_shifts_the_whole_curve():
-    table, said, history = jumped()
-    assert (['not used' in text for text in said] == [True, True, False, False, False]
-            and 'jumped' in said[2] and not any(said[3:]))
+    table, messages, history = jumped()
+    assert (['not used' in text for text in messages] == [True, True, False, False, False]
+            and 'jumped' in messages[2] and not any(messages[3:]))
     assert table.held_back_count == 0
     here, there = history.temperature[3, 20], float(history.temperature[:3].min())
     time = history.time[3, 20]
@@ -160,9 +160,9 @@ def test_what_is_off_and_does_not_agree_is_no_jump():
     table, before = BiasTable(MODEL), 20.0
     for number in range(5):
         table.add(before, 0.0, WHITE, 60.0 * number)
-    said = [table.add(before, off * DEGREE, WHITE, 300.0 + 60.0 * number)
-            for number, off in enumerate([0.5, -0.5, 1.0, 2.0, 0.5, 0.5])]
-    assert (all('not used' in text for text in said) and table.held_back_count == 6
+    messages = [table.add(before, off * DEGREE, WHITE, 300.0 + 60.0 * number)
+                for number, off in enumerate([0.5, -0.5, 1.0, 2.0, 0.5, 0.5])]
+    assert (all('not used' in text for text in messages) and table.held_back_count == 6
             and not table.jumps)
     assert not table.add(before, 0.0, WHITE, 700.0)
     # the two of before no longer count
@@ -224,8 +224,8 @@ def test_what_is_known_as_well_as_can_be_still_can_be_read(tmp_path):
     for number in range(100):
         assert not table.add(20.24 + 0.0002 * number, 1e-3, 1e-18, float(number))
     write_bias_table(tmp_path / 'table.yaml', table, 0.0)
-    again, said = read_bias_table(tmp_path / 'table.yaml', GyroModel())
-    assert (said == '' and len(again.entries) == 2
+    again, message = read_bias_table(tmp_path / 'table.yaml', GyroModel())
+    assert (message == '' and len(again.entries) == 2
             and again.predict(20.25, 100.0)[0] == pytest.approx(1e-3))
 
 
@@ -318,9 +318,9 @@ def test_a_table_survives_a_restart(tmp_path):
     table, _, history = jumped()
     path, time = tmp_path / 'folder' / 'table.yaml', history.time[3, -1]
     assert [write_bias_table(path, table, time)[0] for _ in range(2)] == ['', '']
-    again, said = read_bias_table(path, MODEL)
+    again, message = read_bias_table(path, MODEL)
     table.run = again.run
-    assert (said == '' and again.run == 5
+    assert (message == '' and again.run == 5
             and [each.name for each in path.parent.iterdir()] == ['table.yaml'])
     assert again.predict(22.0,
                          time + DAY) == pytest.approx(table.predict(22.0, time + DAY), rel=1e-3)
@@ -334,15 +334,15 @@ def test_a_person_may_write_one(tmp_path):
         'jumps: []\nentries:\n'
         '- {temperature: 20, bias: 1e-3, standard_deviation: 1e-5, '
         'time: 2026-01-01 12:00:00, run: 0}\n')
-    table, said = read_bias_table(path, MODEL)
+    table, message = read_bias_table(path, MODEL)
     (entry,) = table.entries
-    assert (said == '' and entry.bias == 1e-3 and entry.time == 1767268800.0
+    assert (message == '' and entry.bias == 1e-3 and entry.time == 1767268800.0
             and entry.variance == pytest.approx(1e-10))
 
 
 def test_no_file_is_no_fault(tmp_path):
-    table, said = read_bias_table(tmp_path / 'none.yaml', MODEL)
-    assert said == '' and not table.entries and table.run == 0
+    table, message = read_bias_table(tmp_path / 'none.yaml', MODEL)
+    assert message == '' and not table.entries and table.run == 0
 
 
 def whole(tmp_path):
@@ -371,9 +371,9 @@ DAMAGES = {
 def test_a_damaged_file_is_reported_in_one_sentence_and_kept(tmp_path, damage):
     path, content = tmp_path / 'table.yaml', damage(whole(tmp_path))
     path.write_bytes(content)
-    table, said = read_bias_table(path, MODEL)
-    assert ('cannot be read' in said and '\n' not in said and len(said) < 400 + len(str(path))
-            and not table.entries)
+    table, message = read_bias_table(path, MODEL)
+    assert 'cannot be read' in message and '\n' not in message
+    assert len(message) < 400 + len(str(path)) and not table.entries
     assert path.read_bytes() == content
     table.add(20.0, 0.0, WHITE, 0.0)
     assert 'kept-1' in write_bias_table(path, table, 0.0)[0]
@@ -386,8 +386,8 @@ def test_a_table_of_another_model_is_not_used_and_kept_under_a_new_name_each_tim
     table.add(20.0, 0.0, WHITE, 0.0)
     write_bias_table(path, table, 0.0)
     for number, model in enumerate((COMPENSATED, MODEL, COMPENSATED), 1):
-        other, said = read_bias_table(path, model)
-        assert 'belongs to another model' in said and not other.entries
+        other, message = read_bias_table(path, model)
+        assert 'belongs to another model' in message and not other.entries
         write_bias_table(path, other, 0.0)
         assert (tmp_path / f'table.yaml.kept-{number}').exists()
 

@@ -59,13 +59,13 @@ def lost_heading(true, comes, generator, noise=WHITE):
     """Return the heading change by lost samples, rad, and the variance stated for it, rad²."""
     time = np.arange(len(true)) * INTERVAL
     rate = true + simulate_noise(noise, len(true), INTERVAL, generator)
-    gaps, said = GapModel(noise), 0.0
+    gaps, variance = GapModel(noise), 0.0
     late, values = time[comes].tolist(), rate[comes].tolist()
     for index in range(1, len(late)):
         gap = gaps.add(late[index] - late[index - 1], values[index], values[index - 1])
-        said += gap.variance if gap else 0.0
+        variance += gap.variance if gap else 0.0
     assert gaps.intervals.lost_samples == (~comes).sum()
-    return integrate(time[comes], rate[comes])[-1] - integrate(time, rate)[-1], said
+    return integrate(time[comes], rate[comes])[-1] - integrate(time, rate)[-1], variance
 
 
 # how many
@@ -110,22 +110,23 @@ def test_at_rest_the_noise_of_lost_samples_is_as_stated(share, longest):
     squares = []
     for seed in range(40):
         generator = np.random.default_rng(seed)
-        off, said = lost_heading(np.zeros(6000), kept(6000, share, longest, generator), generator)
-        squares.append(off * off / said)
+        comes = kept(6000, share, longest, generator)
+        off, variance = lost_heading(np.zeros(6000), comes, generator)
+        squares.append(off * off / variance)
     assert 0.4 < np.mean(squares) < 1.0 + 4.0 * math.sqrt(2.0 / 40)
 
 
 @pytest.mark.parametrize('share, longest', [(0.01, 1), (0.1, 1), (0.1, 20), (0.03, 85)])
 def test_turns_in_gaps_are_in_the_stated_variance_and_not_much_more(share, longest):
-    squares, said_squares = [], []
+    squares, pairs = [], []
     for seed in range(24):
         generator = np.random.default_rng(seed)
-        off, said = lost_heading(driven(60.0, generator), kept(6000, share, longest, generator),
-                                 generator)
-        squares.append(off * off / said)
-        said_squares.append((off * off, said))
-    actual, said = np.sqrt(np.mean(said_squares, axis=0))
-    assert np.mean(squares) < 1.0 + 4.0 * math.sqrt(2.0 / 24) and said < 3.0 * actual
+        true, comes = driven(60.0, generator), kept(6000, share, longest, generator)
+        off, variance = lost_heading(true, comes, generator)
+        squares.append(off * off / variance)
+        pairs.append((off * off, variance))
+    actual, stated = np.sqrt(np.mean(pairs, axis=0))
+    assert np.mean(squares) < 1.0 + 4.0 * math.sqrt(2.0 / 24) and stated < 3.0 * actual
 
 
 def test_a_turn_that_begins_within_a_gap_may_have_begun_at_any_time_in_it():
@@ -134,8 +135,8 @@ def test_a_turn_that_begins_within_a_gap_may_have_begun_at_any_time_in_it():
         generator = np.random.default_rng(seed)
         true, comes, first = np.zeros(1000), np.ones(1000, bool), generator.integers(501, 560)
         true[first:], comes[501:560] = 1.0, False
-        off, said = lost_heading(true, comes, generator)
-        squares.append(off * off / said)
+        off, variance = lost_heading(true, comes, generator)
+        squares.append(off * off / variance)
     assert 0.5 < np.mean(squares) < 1.5
 
 
@@ -169,8 +170,8 @@ def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap
     tracker = HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms))
     lost, losses = round(gap / INTERVAL), 3
     for index in range(400 * (losses + 1)):
-        said = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
-        assert bool(said) == (gap > 1.0 and index % 400 == 0 < index)
+        message = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
+        assert bool(message) == (gap > 1.0 and index % 400 == 0 < index)
     assert (tracker.intervals.lost_samples == losses * lost
             and tracker.intervals.longest_gap == pytest.approx(gap + INTERVAL))
     assert tracker.intervals.usual_interval == pytest.approx(INTERVAL)
@@ -186,8 +187,8 @@ def test_a_rest_that_goes_on_after_a_gap_takes_over_nothing_of_a_correction_that
         time = INTERVAL * index + (3.0 if index >= 2000 else 0.0)
         if index == 3000:
             tracker.configure(Settings(maximum_gap=0.9))
-        said = tracker.add(time, output, np.array([-output, -1.0]), None, still)
-        assert bool(said) == (index == 2000)
+        message = tracker.add(time, output, np.array([-output, -1.0]), None, still)
+        assert bool(message) == (index == 2000)
         headings.append(tracker.heading)
     assert tracker.is_resting and math.sqrt(tracker.variance) > 1.0 * DEGREE, 'a correction waits'
     assert np.ptp(headings[1500:]) < 0.4 * DEGREE and np.ptp(headings[2900:]) == 0.0
@@ -228,9 +229,9 @@ def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, run, tmp
                   Log(time=(np.arange(len(true)) * INTERVAL)[comes], output=output))
         files = (tmp_path / f'{lost}.csv', '--model', tmp_path / 'model.yaml',
                  '--out', tmp_path / 'out.csv')
-        code, said, _ = run('compensate', *files, *option)
-        assert code == 0 and (f'{(~comes).sum()} samples are lost' in said) == lost
-        deviations.append(float(said.partition('+-')[2].split()[0]))
+        code, text, _ = run('compensate', *files, *option)
+        assert code == 0 and (f'{(~comes).sum()} samples are lost' in text) == lost
+        deviations.append(float(text.partition('+-')[2].split()[0]))
     assert deviations[1] > 1.2 * deviations[0]
 
 

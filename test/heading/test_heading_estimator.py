@@ -63,7 +63,7 @@ class Gyro:
         self.live, self.time, self.now, self.turned = live, 0.0, now, 0.0
         self._bias, self._coefficient = bias, coefficient
         self._generator = np.random.default_rng(seed)
-        self.headings, self.said, self._rate = [], [], 0.0
+        self.headings, self.messages, self._rate = [], [], 0.0
 
     def go(self, seconds, rate=0.0, temperature=25.0, wheels=None):
         """Turn at a rate, rad/s, for some time, at one temperature, a ramp of two, or None."""
@@ -77,8 +77,8 @@ class Gyro:
                 self.live.add_temperature(self.time, degc)
             offset = self._bias + self._coefficient * (0.0 if temperature is None else degc - 25.0)
             now = self.now + self.time
-            self.said.append(self.live.add(self.time, rate + offset + wandering, now,
-                                           wheels=wheels))
+            self.messages.append(
+                self.live.add(self.time, rate + offset + wandering, now, wheels=wheels))
             self.headings.append(self.live.tracker.heading)
             if round(self.time / INTERVAL) % 25 == 0:
                 self.live.update_table(now)
