@@ -252,19 +252,21 @@ def _draw_line(line: Line, at: Array, places: Array, up: _Axis, shown: Mask) -> 
     if line.deviation is not None:
         half = NORMAL_QUANTILE_975 * np.nan_to_num(line.deviation)
         above, below = (up.to_positions(line.values + side)[shown] for side in (half, -half))
-        corners = [*zip(x, above), *zip(x[::-1], below[::-1])]
-        parts.append(element('path', d=''.join(
-            f'M{each:.1f} {a:.1f}V{b:.1f}' for each, a, b in zip(x, above, below)), class_='bars')
-            if line.draw_dots else element('path', d='M' + 'L'.join(
-                f'{each:.1f} {value:.1f}' for each, value in corners) + 'Z', class_='band'))
+        if line.draw_dots:
+            path = ''.join(f'M{each:.1f} {a:.1f}V{b:.1f}' for each, a, b in zip(x, above, below))
+            parts.append(element('path', d=path, class_='bars'))
+        else:
+            corners = [*zip(x, above), *zip(x[::-1], below[::-1])]
+            path = 'L'.join(f'{each:.1f} {value:.1f}' for each, value in corners)
+            parts.append(element('path', d=f'M{path}Z', class_='band'))
     if line.draw_dots:
         parts += [element('circle', cx=float(each), cy=float(value), r=2.6)
                   for each, value in zip(x, y)]
     else:
         begins = (shown & ~np.concatenate([[False], shown[:-1]]))[shown]
-        parts.append(element('path', d=''.join(f'{"M" if begin else "L"}{each:.1f} {value:.1f}'
-                                               for each, value, begin in zip(x, y, begins)),
-                             class_='stroke'))
+        path = ''.join(f'{"M" if begin else "L"}{each:.1f} {value:.1f}'
+                       for each, value, begin in zip(x, y, begins))
+        parts.append(element('path', d=path, class_='stroke'))
     return element('g', *parts, class_=line.style)
 
 
@@ -284,20 +286,20 @@ def _value_table(chart: Chart) -> Markup:
         """Return a value with the half of its interval."""
         if not math.isfinite(line.values[row]):
             return '–'
-        return format_number(float(line.values[row])) + (
-            '' if line.deviation is None
-            else f' ± {format_number(NORMAL_QUANTILE_975 * float(line.deviation[row]), 2)}')
+        text = format_number(float(line.values[row]))
+        if line.deviation is None:
+            return text
+        return f'{text} ± {format_number(NORMAL_QUANTILE_975 * float(line.deviation[row]), 2)}'
 
     heads = [(chart.x_label, chart.x_unit), *((each.name, chart.y_unit) for each in chart.lines)]
-    table = element(
-        'table', element('caption', join_markup(chart.title, ', ', chart.y_label)),
-        element('thead',
-                element('tr', *(element('th', _axis_label(name, unit), scope='col', data_name=name,
-                                        data_unit=unit) for name, unit in heads))),
-        element('tbody',
-                *(element('tr', element('td', chart.x_names[round(float(at)) - 1] if chart.x_names
-                                        else format_number(float(at), 4)),
-                          *(element('td', value(line, row)) for line in chart.lines))
-                  for row, at in enumerate(chart.x))))
+    titles = (element('th', _axis_label(name, unit), scope='col', data_name=name, data_unit=unit)
+              for name, unit in heads)
+    labels = [chart.x_names[round(at) - 1] if chart.x_names else format_number(at, 4)
+              for at in chart.x.tolist()]
+    rows = (element('tr', element('td', label),
+                    *(element('td', value(line, row)) for line in chart.lines))
+            for row, label in enumerate(labels))
+    table = element('table', element('caption', join_markup(chart.title, ', ', chart.y_label)),
+                    element('thead', element('tr', *titles)), element('tbody', *rows))
     return element('details', element('summary', 'Values'),
                    element('div', table, class_='scroll', tabindex='0'))

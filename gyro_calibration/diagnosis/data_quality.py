@@ -304,8 +304,8 @@ def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit
                  if np.isfinite(value)]
         yield _sized_finding('saturation', limit.size, 0.0, limit.p_value,
                              f'{np.count_nonzero(at_limit)} samples '
-                             f'({100.0 * at_limit.mean():.2g} %) '
-                             f'have the extreme code {" or ".join(sides)}')
+                             f'({100.0 * at_limit.mean():.2g} %) have the extreme code '
+                             f'{" or ".join(sides)}')
 
 
 def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None, log: Log,
@@ -326,8 +326,9 @@ def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None
                              f'{count} single samples differ from their neighbours by up to '
                              f'{outlying.largest_sigmas:.0f} sigma, the first at {first:.3f} s')
     interval = float(np.median(np.diff(log.time)))
-    if (reference_step and (not noise_deviation or reference_step ** 2 / 6.0
-                            / (interval * noise_deviation) ** 2 > MIN_STEP_VARIANCE_SHARE)):
+    noise = interval * noise_deviation
+    if reference_step and (
+            not noise or reference_step ** 2 / 6.0 / noise ** 2 > MIN_STEP_VARIANCE_SHARE):
         yield _sized_finding('reference_quantization', reference_step, 0.0, 0.0,
                              'the reference heading comes in steps of '
                              f'{reference_step / DEGREE:.4g} deg: its rate over one sample is '
@@ -338,8 +339,8 @@ def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None
 
 # the kind of the reference
 
-REFERENCE_KINDS = (('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro',
-                    'rest'))
+REFERENCE_KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro',
+                   'rest')
 #: Span over which the errors of gyro and reference are compared, s, and least ratio of the errors
 #: of a course to the noise of the gyro, also for a course that is straight between fixes (measured
 #: in drives: 4.6 to 920, all below 8 on straight lines between fixes; simulated odometry with
@@ -438,8 +439,9 @@ def _evenness(log: Log, step: float) -> float:
                             max(round(0.2 * _COMPARISON_SPAN / interval), 5))
     count = max(round(2.0 * _COMPARISON_SPAN / interval), _BLOCK_SAMPLES)
     blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
-    return (float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2)) if len(blocks)
-            else 1.0)
+    if not len(blocks):
+        return 1.0
+    return float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2))
 
 
 @dataclass(frozen=True)
@@ -482,29 +484,28 @@ def heading_difference(log: Log) -> HeadingDifference:
     slope = np.gradient(output, log.time)
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         rate = bridge_gaps(log.reference_rate)
-        heading = integrate_with_curvature(
-            log.time, rate + _fit_tones(output - rate,
-                                        np.column_stack([output, slope, np.ones(len(output))])))
+        motion = np.column_stack([output, slope, np.ones(len(output))])
+        heading = integrate_with_curvature(log.time, rate + _fit_tones(output - rate, motion))
     assert heading is not None
     longest = max(round(_COMPARISON_SPAN / interval), 4)
     variance = {}
     for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
-        off, *motion = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
-                        for each in (heading - turned, turned, output, slope))
+        off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
+                         for each in (heading - turned, turned, output, slope))
         known = np.isfinite(off)
         if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
-            columns = np.column_stack(motion)[known]
+            columns = np.column_stack(motions)[known]
             left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
             variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
                                        / float(stats.norm.isf(0.05))) ** 2
     whole = variance.pop(1.0, 0.0)
-    error = max(
-        [0.0, *((each - part * whole) / (6.0 * (1.0 - part)) for part, each in variance.items())])
+    error = max(((each - part * whole) / (6.0 * (1.0 - part)) for part, each in variance.items()),
+                default=0.0)
+    error = max(error, 0.0)
     white = white_noise_deviation(log.output) * math.sqrt(interval)
-    return HeadingDifference(
-        math.sqrt(error),
-        min(white, math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _COMPARISON_SPAN))),
-        math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
+    walk = math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _COMPARISON_SPAN))
+    return HeadingDifference(math.sqrt(error), min(white, walk),
+                             math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
 
 
 def _fit_tones(difference: Array, motion: Array) -> Array:
@@ -545,9 +546,9 @@ def rate_noise_share(log: Log) -> float:
     fast = left = every[:0]
     for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
         quiet = _quiet(every, block)
-        part = every[: len(quiet)][quiet]
+        part = every[:len(quiet)][quiet]
         if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
-            fast, left = part, rest[: len(quiet)][quiet]
+            fast, left = part, rest[:len(quiet)][quiet]
     if not len(fast):
         return 0.0
     energy_of_fast = float(fast @ fast)
@@ -560,14 +561,14 @@ def rate_noise_share(log: Log) -> float:
         variance = float(np.mean(product)) / line[0]
         if not variance > _DETECTION_SIGMAS * deviation:
             return 0.0
-    gyro = float(np.mean(left**2)) / 20.0 - variance * line[0] ** 2
+    gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
 
 
 def _quiet(fast: Array, block: int) -> Mask:
-    """Tell which third differences of a rate are in blocks that are most quiet."""
+    """Tell which third differences of a rate are in the quietest blocks."""
     blocks = len(fast) // block
-    energy = np.sum(fast[: blocks * block].reshape(blocks, block) ** 2, axis=1)
+    energy = np.sum(fast[:blocks * block].reshape(blocks, block) ** 2, axis=1)
     # by the blocks on both sides, for those that are quiet themselves are so by chance; one with
     # far more energy than these is a motion between two rests
     sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))

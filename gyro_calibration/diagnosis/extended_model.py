@@ -197,10 +197,10 @@ def _terms_with_covariance(fit: FittedValues, bias_deviation: float) -> tuple[li
             ranks += [
                 fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
                 for number in range(len(terms[-1].values))]
-    fitted = {number: rank for number, rank in enumerate(ranks) if rank is not None}
+    fitted = [number for number, rank in enumerate(ranks) if rank is not None]
+    chosen = [rank for rank in ranks if rank is not None]
     term_covariance = np.zeros((len(ranks), len(ranks)))
-    term_covariance[np.ix_(list(fitted), list(fitted))] = fit.covariance[np.ix_(
-        list(fitted.values()), list(fitted.values()))]
+    term_covariance[np.ix_(fitted, fitted)] = fit.covariance[np.ix_(chosen, chosen)]
     term_covariance[0, 0] = bias_deviation ** 2
     return terms, term_covariance
 

@@ -218,8 +218,8 @@ def _refuse_without_reference(log: Log, output: Array) -> None:
     if count < MIN_SAMPLES or covered < MIN_VALID_SHARE * len(output):
         raise DataRefused(
             f'the reference has a value in {count} of {len(output)} samples; at least '
-            f'{MIN_SAMPLES} '
-            'and a tenth are needed, or one at even intervals: repair its line and record again')
+            f'{MIN_SAMPLES} and a tenth are needed, or one at even intervals: repair its line and '
+            'record again')
 
 
 def _refuse_constant(output: Array) -> None:
@@ -381,24 +381,24 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
 def _motion_gate(agreed: Agreement, log: Log) -> Gate:
     evidence = (f'{100.0 * agreed.coherence:.3g} % of the variance of the heading over spans is '
                 'common to gyro and reference')
-    wanders = (agreed.residual_and_growth[0] > _MIN_TILT_ANGLE
-               and agreed.residual_and_growth[1] > _MIN_TILT_GROWTH and agreed.long_span_coherence
-               < agreed.short_span_coherence - 0.5 * _MIN_MOTION_COHERENCE)
+    residual, growth = agreed.residual_and_growth
+    loss = agreed.short_span_coherence - agreed.long_span_coherence
+    wanders = (residual > _MIN_TILT_ANGLE and growth > _MIN_TILT_GROWTH
+               and loss > 0.5 * _MIN_MOTION_COHERENCE)
     if agreed.coherence >= _MIN_MOTION_COHERENCE and not wanders:
         return Gate('motion', True, evidence)
-    if (not wanders and (agreed.residual_and_growth[0] < _MIN_HEADING_DIFFERENCE
-                         or agreed.turned_range < _MIN_TURNED_ANGLE)):
+    if not wanders and (residual < _MIN_HEADING_DIFFERENCE
+                        or agreed.turned_range < _MIN_TURNED_ANGLE):
         return Gate('motion', None,
                     f'{evidence}; the difference is within the errors of a reference')
     others = [name for name in log.others if 'gyro' in name.lower()]
     axis = f'; or take another axis of the gyro ({", ".join(others[:3])})' if others else ''
     turned = 'transform the rates of all three axes into the frame of the reference first'
     if wanders:
-        return Gate('tilt', False, f'{evidence} over short spans, and '
-                                   f'{100.0 * agreed.long_span_coherence:.2g} % over '
-                    f'longer ones, where {agreed.residual_and_growth[0] / DEGREE:.3g} deg are '
-                    'left: the axis of '
-                    'the gyro tilts', f'{turned}, or keep the sensor level{axis}')
+        evidence += (f' over short spans, and {100.0 * agreed.long_span_coherence:.2g} % over '
+                     f'longer ones, where {residual / DEGREE:.3g} deg are left: the axis of the '
+                     'gyro tilts')
+        return Gate('tilt', False, evidence, f'{turned}, or keep the sensor level{axis}')
     return Gate('motion', False, evidence, 'give a reference of this motion and this axis, with '
                 f'stamps of the same clock; where the sensor tumbles, {turned}{axis}')
 
@@ -406,11 +406,11 @@ def _motion_gate(agreed: Agreement, log: Log) -> Gate:
 def _unit_gates(agreed: Agreement, configured_scale_factor: float, log: Log) -> Iterator[Gate]:
     """Give the gates of sense and unit, by the factor of the output over the reference."""
     assert log.time is not None
-    factor, deviation = (1.0 / (agreed.factor * configured_scale_factor),
-                         agreed.deviation / agreed.factor ** 2 / abs(configured_scale_factor))
+    factor = 1.0 / (agreed.factor * configured_scale_factor)
+    deviation = agreed.deviation / agreed.factor ** 2 / abs(configured_scale_factor)
     evidence = f'the output is {factor:.4g} times the reference'
-    factor_with_interval = (factor, (factor - NORMAL_QUANTILE_975 * deviation,
-                                     factor + NORMAL_QUANTILE_975 * deviation))
+    half = NORMAL_QUANTILE_975 * deviation
+    factor_with_interval = (factor, (factor - half, factor + half))
     if not is_implausible_factor(factor):
         yield Gate('sense', True, f'{evidence}: the same sense')
         yield Gate('unit', True, f'{evidence}: the same unit')

@@ -99,15 +99,12 @@ _REFERENCE_PHRASES = {
     'odometry': 'odometry',
     'motion_capture': 'motion capture',
     'gyro': 'another gyro'}
-_METHOD_TEXT = ('The heading by {} was compared with the integral of the output over spans of a '
-                'second '
-                'or more, under noise of gyro and reference that was found together with the '
-                'causes. A '
-                'cause is established if its evidence holds beyond the scatter between stretches, '
-                'and '
-                'if choice and fit on some stretches predict the others; else it is suspected. '
-                'Only '
-                'established causes are in the model. Intervals are of 95 %.')
+_METHOD_TEXT = (
+    'The heading by {} was compared with the integral of the output over spans of a second or '
+    'more, under noise of gyro and reference that was found together with the causes. A cause is '
+    'established if its evidence holds beyond the scatter between stretches, and if choice and '
+    'fit on some stretches predict the others; else it is suspected. Only established causes are '
+    'in the model. Intervals are of 95 %.')
 #: Causes that are not candidates, because they are tested in each log.
 _ALWAYS_TESTED = {*BASE_VALUES, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_error',
                   'quantization', 'saturation'}
@@ -148,8 +145,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     cleaned_log = replace(log, output=np.where(record.usable, log.output, np.nan))
     prior = None if model is None else model.prior_deviations
     steps.begin('bias and scale factor error')
-    plain = fit_spans(lay_out_spans(cleaned_log if model is None else replace(
-        cleaned_log, output=compensate_log(model, cleaned_log)), reference.kind, prior))
+    if model is not None:
+        cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
+    plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior))
     steps.begin('search for causes')
     extended, found = search_causes(plain, _SEARCH_ALARM_SHARE * false_alarm_rate,
                                     steps.begin_part)
@@ -167,9 +165,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     parts, time = _heading_contributions(extended), extended.spans.time
     noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
     rates = extended.spans.point_rates()
-    of_heading = heading_error_shares(
-        [(parts, time)],
-        2.0 * (noise['reference'] ** 2 + noise['motion'] ** 2 * float(np.mean(rates ** 2))))
+    motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
+    of_heading = heading_error_shares([(parts, time)],
+                                      2.0 * (noise['reference'] ** 2 + motion_variance))
     findings = [*_value_findings(extended, model, false_alarm_rate, reference), *record.findings,
                 *(each for cause in found for each in [_cause_finding(cause, extended)]
                   if not each.parameters[each.effect].contains_zero)]
@@ -208,10 +206,10 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
         if name == 'bias' and model is not None:
             # the mean bias of a log differs from that of the model by bias wander
             duration = float(fit.spans.time[-1] - fit.spans.time[0])
-            deviation = math.sqrt(
-                deviation ** 2 + max(2.0 / math.pi * each.bias_instability ** 2
-                                     + each.rate_random_walk ** 2 * duration / 3.0
-                                     for each in (_gyro_noise(fit), model.noise)))
+            wander = max(2.0 / math.pi * each.bias_instability ** 2
+                         + each.rate_random_walk ** 2 * duration / 3.0
+                         for each in (_gyro_noise(fit), model.noise))
+            deviation = math.sqrt(deviation ** 2 + wander)
         if name == 'time_offset' and lag is not None:
             # to first order a lag is a delay
             place_of_lag = fit.value_slice(lag).start
@@ -284,16 +282,15 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
         'stretches, and '
         f'is selected in {100.0 * found_cause.selection_share:.0f} % of the folds',
         probability=found_cause.probability,
-        where=(found_cause.cause_term.shapes[0],
-               float(fit.spans.time[-1])) if found_cause.cause_term.is_single_event else None)
+        where=((found_cause.cause_term.shapes[0], float(fit.spans.time[-1]))
+               if found_cause.cause_term.is_single_event else None))
     return shown if found_cause.is_established else mark_suspected(shown)
 
 
 def _lag_estimate(half_square: float, half_width: float) -> Estimate:
     """Return a time constant from half of its square."""
-    low, size, high = (math.sqrt(2.0 * max(each, 0.0))
-                       for each in (half_square - half_width, half_square,
-                                    half_square + half_width))
+    low, size, high = (math.sqrt(2.0 * max(half_square + change, 0.0))
+                       for change in (-half_width, 0.0, half_width))
     return Estimate(size, (low, high), 's')
 
 
@@ -313,8 +310,8 @@ def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
 
 def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
     """Return a model with scale factor error, bias, and the causes of the gyro that are fitted."""
-    own = (1.0 + sum(term.values[0]
-                     for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR))
+    own = 1.0 + sum(
+        term.values[0] for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in fit.values[:2])
     terms = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))]
     places: list[int | None] = [1, 0]
@@ -428,8 +425,8 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
               if done.spans.treatment.errs_as_heading
               else f'white noise of {done.spans.reference_noise_ratio:.2g} times that of the gyro')
     yield (f'The reference is taken as {_REFERENCE_PHRASES[reference.kind]} '
-           f'({reference.evidence}); if '
-           f'it is another kind, state it with --reference-kind. Its errors: {errors}.')
+           f'({reference.evidence}); if it is another kind, state it with --reference-kind. Its '
+           f'errors: {errors}.')
     if done.scale_held:
         yield ('Fewer than three stretches with rotation determine the scale factor error, and it '
                f'is kept at 0 +- {100.0 * done.spans.treatment.prior[0]:g} %: turn more often, '
@@ -658,7 +655,7 @@ def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArr
     # by the residual with the candidate: scores that contain the effect would overestimate scatter
     off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
     count, found = x.shape[1], []
-    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size**2)))
+    root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size ** 2)))
     square = float(np.sum((root @ x.T @ residual) ** 2))
     for cluster in clusters:
         scores = np.array([np.bincount(cluster, part * off) for part in x.T])

@@ -101,8 +101,8 @@ class RegressionProblem:
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
         parts = [coefficient_angles(each.point_count) for each in self.replays]
-        return np.concatenate(parts), np.concatenate([np.full(len(part), each.point_interval)
-                                                      for part, each in zip(parts, self.replays)])
+        intervals = [each.point_interval for each in self.replays]
+        return np.concatenate(parts), np.repeat(intervals, [len(part) for part in parts])
 
     def whitening_factors(self, noise_index: int) -> Array:
         """Return the factors that whiten coefficients whitened by the first noise, shape (m,)."""
@@ -592,8 +592,7 @@ class FittedValues:
     @cached_property
     def bias_variance(self) -> float:
         """Return the variance of the mean bias by the uncertainty of other values, (rad/s)²."""
-        means = np.array(
-            [self._bias_sensitivity(place, number) for place, number in self.fit.column_owners])
+        means = np.array([self._bias_sensitivity(*owner) for owner in self.fit.column_owners])
         return float(means @ self._estimates[2] @ means)
 
     def _bias_sensitivity(self, cause_index: int, number: int) -> float:

@@ -228,8 +228,8 @@ def _is_unchanged(curve: Curve) -> bool:
 
 
 def _trace_charts(trace: Trace) -> Iterator[Chart]:
-    time, measured, simulated, extended = _thin_points(trace.time, trace.measured, trace.simulated,
-                                                       trace.extended)
+    time, measured, simulated, extended = _thin_points(
+        trace.time, trace.measured, trace.simulated, trace.extended)
     unit, factor = _rate_unit(measured)
     lines = [Line('measured', 'measured', factor * measured),
              Line('simulated', 'simulated', factor * simulated)]
@@ -293,8 +293,8 @@ def _residual_chart(curve: Curve, place: int) -> Chart:
     along = readable_name(curve.along)
     return Chart(f'residual-{place}', f'Residual along {along}',
                  f'Mean of what the simulation leaves along {along}{_stage_phrase(lines)}, with '
-                 'bands of '
-                 '95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
+                 'bands of 95 % by noise '
+                 'alone.', along, across, scale * curve.at, 'residual', unit, lines)
 
 
 def _spectrum_chart(curve: Curve, place: int) -> Chart:

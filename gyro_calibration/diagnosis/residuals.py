@@ -299,10 +299,10 @@ def _bin_variances(fit: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array
                                                _coefficient_variances(fit.fit), bins):
         point = np.minimum(each.grid_index // each.decimation, each.point_count - 1)
         counts = np.bincount(place * each.point_count + point,
-                             minlength=CURVE_BINS * each.point_count).reshape(
-                                 CURVE_BINS, each.point_count).astype(float)
-        unresolved = np.maximum(
-            counts.sum(axis=1) - (counts ** 2).sum(axis=1) / each.decimation, 0.0)
+                             minlength=CURVE_BINS * each.point_count).astype(float)
+        counts = counts.reshape(CURVE_BINS, each.point_count)
+        squares = (counts ** 2).sum(axis=1)
+        unresolved = np.maximum(counts.sum(axis=1) - squares / each.decimation, 0.0)
         total += (cosine_transform(counts) ** 2 @ variance
                   + white_noise_deviation(residual[each.valid]) ** 2 * unresolved)
     return total
@@ -325,12 +325,12 @@ def _amplitude_spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
     amplitude = [np.sqrt(2.0) * np.abs(np.fft.rfft(values))[1:] * np.sqrt(2.0) / len(values)
                  for values in series]
     frequency = np.fft.rfftfreq(len(series[0]), each.point_interval)[1:]
-    edges = np.unique(np.searchsorted(
-        frequency, np.geomspace(frequency[0], frequency[-1], CURVE_BINS + 1)))[:-1]
+    limits = np.geomspace(frequency[0], frequency[-1], CURVE_BINS + 1)
+    edges = np.unique(np.searchsorted(frequency, limits))[:-1]
     largest = [np.maximum.reduceat(values, edges) for values in amplitude]
     middle = np.sqrt(frequency[edges] * frequency[np.append(edges[1:], len(frequency)) - 1])
-    usual = np.sqrt(
-        np.add.reduceat(amplitude[1] ** 2, edges) / np.diff(np.append(edges, len(frequency))))
+    counts = np.diff(np.append(edges, len(frequency)))
+    usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges) / counts)
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
 
 

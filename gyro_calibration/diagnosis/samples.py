@@ -346,8 +346,8 @@ def _change_deviation(change: Array, same: Mask, step: float) -> float:
     square = float(np.mean(changed_sizes ** 2))
     variance = square
     for _ in range(20):
-        variance = square * (1.0 - float(_same_code_chance(np.zeros(1), np.sqrt(variance),
-                                                           np.array([step]))[0]))
+        same_code = _same_code_chance(np.zeros(1), np.sqrt(variance), np.array([step]))
+        variance = square * (1.0 - float(same_code[0]))
     return float(np.sqrt(variance))
 
 

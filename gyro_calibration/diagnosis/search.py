@@ -347,11 +347,11 @@ def _unalias_frequency(replay: Replay, frequency: float) -> float:
     def relative_power(at: float) -> float:
         """Return the ratio of the power at a frequency to that of its neighbours."""
         place = round(at)
-        return float(
-            power[place - 2:place + 3].max() / np.median(power[max(place - 60, 0):place + 61]))
+        usual = np.median(power[max(place - 60, 0):place + 61])
+        return float(power[place - 2:place + 3].max() / usual)
 
-    return float(
-        max(places[places < len(power) - 3], key=relative_power)) / (2.0 * samples.duration)
+    best = max(places[places < len(power) - 3], key=relative_power)
+    return float(best) / (2.0 * samples.duration)
 
 
 def _is_tone_of_gyro(replay: Replay, frequency: float) -> bool:
@@ -530,11 +530,9 @@ def _linearized_start(fit: RegressionFit, candidate: Candidate) -> Candidate:
         return candidate
     own = candidate_transforms(candidate, fit.problem.replays) / fit.problem.deviation
     free = add_nuisance_columns(fit, own)
-    values, _ = free.estimates
-    ratio = float(values[-1])
-    place = fitted_shape_indices(candidate)[0]
-    return with_shape(candidate, place, candidate.shapes[place] * float(
-        np.copysign(abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio)))
+    ratio, place = float(free.estimates[0][-1]), fitted_shape_indices(candidate)[0]
+    factor = math.copysign(abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio)
+    return with_shape(candidate, place, candidate.shapes[place] * factor)
 
 
 def find_strongest(search: Search,

@@ -279,11 +279,9 @@ class Spans:
         if cause.cause == 'bandwidth':
             # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
             assert self.log.time is not None and self.log.output is not None
-            change = np.gradient(self.log.output, self.log.time)
-            return -self.span_changes(change)[:, None]
-        return np.column_stack(
-            [-self.span_integrals(np.asarray(each))
-             for each in CATALOGUE[cause.cause].columns(channels, *cause.shapes)])
+            return -self.span_changes(np.gradient(self.log.output, self.log.time))[:, None]
+        columns = CATALOGUE[cause.cause].columns(channels, *cause.shapes)
+        return np.column_stack([-self.span_integrals(np.asarray(each)) for each in columns])
 
     def point_rates(self) -> Array:
         """Return the rate at the points, rad/s, shape (n + 1,)."""

@@ -233,9 +233,9 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         up_to = 'up to ' if len(unexplained) > 1 and most >= 1e-3 else ''
         variables = join_list([readable_name(each.along)
                                for each in unexplained[:_MAX_NAMED_CAUSES]])
-        parts.append(f'along {variables} by '
-                     f'{"something" if parts else "structure"} that no cause in the catalogue '
-                     f'explains ({up_to}{_format_share(most)} of the variance of the residual)')
+        parts.append(f'along {variables} by {"something" if parts else "structure"} that no cause '
+                     f'in the catalogue explains ({up_to}{_format_share(most)} of the variance of '
+                     'the residual)')
     return f'Simulation and measurement differ {", and ".join(parts)}.', _gain_sentence(diagnosis)
 
 
@@ -315,11 +315,11 @@ def is_in_extended_model(found: Finding, diagnosis: Diagnosis) -> bool:
 
 
 def _gain_sentence(diagnosis: Diagnosis) -> str:
-    gain = diagnosis.gain
-    if not is_model_extended(diagnosis) and (gain is None or gain.models.get('given')
-                                             == gain.models.get('extended')):
+    gain, is_extended = diagnosis.gain, is_model_extended(diagnosis)
+    if not is_extended and (
+            gain is None or gain.models.get('given') == gain.models.get('extended')):
         return 'No extended model is offered: the model is unchanged.'
-    model = ('The extended model' if is_model_extended(diagnosis)
+    model = ('The extended model' if is_extended
              else f'The model, {_model_values_phrase(diagnosis.model)} alone,')
     if gain is None:
         return 'An extended model is offered; its gain was not measured.'

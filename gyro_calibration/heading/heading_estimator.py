@@ -386,8 +386,8 @@ class HeadingEstimator:
             rate -= change * (1.0 if calibration is None else calibration.scale)
         if abs(time - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
             self._rest_sensitivity_time = time
-            self._rest_sensitivity = self._uncertain_sensitivity(output, 0.0, result.temperature,
-                                                                 around, distance)
+            self._rest_sensitivity = self._uncertain_sensitivity(
+                output, 0.0, result.temperature, around, distance)
         self._update_sensitivity(time, output, float(result.rate), around, distance)
         message = tracker.add(time, rate, self._sensitivity, wheels, self._rest_sensitivity)
         self.corrected_rate, self.rate = rate, tracker.rate

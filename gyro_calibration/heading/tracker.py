@@ -807,8 +807,8 @@ class HeadingTracker:
 
     def _advance_to_last_sample(self) -> None:
         """Propagate the state to the last sample."""
-        self._open_integral, self._block_integral = (self._open_integral + self._block_integral,
-                                                     self._new_integral())
+        self._open_integral += self._block_integral
+        self._block_integral = self._new_integral()
         if not self.is_resting:
             self._enter_motion(self._quiet_duration)
         self._advance_state()

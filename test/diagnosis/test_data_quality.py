@@ -412,8 +412,7 @@ def test_the_update_interval_of_a_held_reference_is_found(every, generator):
     log = swing(generator)
     held = log.reference_rate[np.arange(6000) // every * every]
     interval = update_interval(log.time, held, 0.0)
-    assert interval is None if every == 1 else interval == pytest.approx(every * INTERVAL,
-                                                                         rel=1e-6)
+    assert interval == (None if every == 1 else pytest.approx(every * INTERVAL, rel=1e-6))
     assert bool(inspect_record(replace(log, reference_rate=held)).remarks) == (every > 1)
 
 

@@ -142,8 +142,8 @@ def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
 def test_what_the_catalogue_does_not_have_is_reported_as_unexplained(name):
     log, = hidden_in([name], 5.0, list(OUTSIDE_CATALOGUE).index(name), reference=REFERENCES[0])
     found = diagnosis_of([log], np.random.default_rng(0))
-    assert found.verdict == 'unexplained' and judge_diagnosis(log, found).is_right, told(
-        log, found)
+    assert found.verdict == 'unexplained', told(log, found)
+    assert judge_diagnosis(log, found).is_right, told(log, found)
 
 
 @pytest.mark.evidence

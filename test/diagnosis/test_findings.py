@@ -82,10 +82,10 @@ def diagnosed(data, run, tmp_path, monkeypatch):
     def diagnosed(recording):
         monkeypatch.chdir(tmp_path)
         (tmp_path / 'data').symlink_to(data)
-        (tmp_path / 'none.yaml').write_text(re.search(r'```yaml\n(.*?)```', TEXT,
-                                                      re.DOTALL).group(1))
-        place = next(place
-                     for place, each in enumerate(COMMANDS) if each.endswith(f'--out {recording}'))
+        model = re.search(r'```yaml\n(.*?)```', TEXT, re.DOTALL).group(1)
+        (tmp_path / 'none.yaml').write_text(model)
+        place = next(place for place, each in enumerate(COMMANDS)
+                     if each.endswith(f'--out {recording}'))
         needed = [each for each in COMMANDS[:place]
                   if each.split('--out ')[1] in COMMANDS[place].split()]
         for command in (*needed, COMMANDS[place]):
@@ -129,7 +129,7 @@ def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
         width = interval[1] - interval[0] if interval else 0.0
         for text, moment in ((before, 'before'), (after, 'after')):
             (size,), form = numbers(text)
-            (now,), unit = numbers(format_amount(errors[what][moment],
-                                                 {'rate': 'rad/s', 'heading': 'rad'}[what]))
-            assert unit == form and abs(now - size) <= max(0.25 * width,
-                                                           0.03 * size), (what, moment, now)
+            in_si = {'rate': 'rad/s', 'heading': 'rad'}[what]
+            (now,), unit = numbers(format_amount(errors[what][moment], in_si))
+            near = abs(now - size) <= max(0.25 * width, 0.03 * size)
+            assert unit == form and near, (what, moment, now)

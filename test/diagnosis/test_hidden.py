@@ -169,8 +169,8 @@ def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
     plain = truth.bias + truth.scale_factor_error * each.rate
     assert truth.added_rate - plain == pytest.approx(
         effect_errors(ALL[name], cause.size, cause.shapes, [each])[0], abs=1e-12)
-    assert log.columns['gyro_rad_s'] == pytest.approx(truth.rate + truth.added_rate + truth.noise,
-                                                      abs=1e-12)
+    output = truth.rate + truth.added_rate + truth.noise
+    assert log.columns['gyro_rad_s'] == pytest.approx(output, abs=1e-12)
     assert InformationMetric([each], truth.gyro.figures).norm(
         [truth.added_rate]) == pytest.approx(3.0 * DETECTION_SIGMAS, rel=1e-3)
 
@@ -257,8 +257,8 @@ def test_a_wrong_reference_leaves_the_gyro_alone_and_errs_in_rate_as_in_heading(
     wrong_rate = of_rate.columns['reference_rate_rad_s'] - each.rate
     wrong_heading = of_heading.columns['reference_heading_rad'] - each.heading
     change = np.cumsum(0.5 * (wrong_rate[1:] + wrong_rate[:-1])) * each.interval
-    assert wrong_heading[1:] - wrong_heading[0] == pytest.approx(change,
-                                                                 abs=0.01 * np.ptp(wrong_heading))
+    tolerance = 0.01 * np.ptp(wrong_heading)
+    assert wrong_heading[1:] - wrong_heading[0] == pytest.approx(change, abs=tolerance)
 
 
 def test_an_encoder_has_steps(generator):

@@ -279,8 +279,8 @@ def test_tables_without_temperature_say_what_they_cannot_show():
                                    temperature=None), None)
     assert ('temperature_degc' in found.cannot_show['bias_temperature']
             and 'time' in found.cannot_show['thermal_lag'])
-    assert set(found.cannot_show) | set(STATIC_EFFECTS) | {'outliers',
-                                                           'unit_error'} == set(diagnosis.CAUSES)
+    known = {*found.cannot_show, *STATIC_EFFECTS, 'outliers', 'unit_error'}
+    assert known == set(diagnosis.CAUSES)
 
 
 def test_columns_of_a_table_that_are_not_used_are_not_reported_as_missing(without_gain):

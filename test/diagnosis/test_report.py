@@ -354,8 +354,7 @@ def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
     (np.pi / 180.0, (0.0, np.pi / 90.0), '(rad/s)/(m/s²)', '1.0 (0.0 to 2.0) (deg/s)/(m/s²)'),
     (1.0, (0.9, 1.1), 's/rad', '0.0175 (0.0157 to 0.0192) s/deg'),
     (0.1, (0.1, 0.1), 'V', '0.1 V'), (0.5, (-np.inf, np.inf), 'Hz', '0.5 (−∞ to ∞) Hz')])
-def test_an_estimate_is_written_with_the_digits_that_its_interval_leaves(value, interval, unit,
-                                                                         words):
+def test_an_estimate_is_written_with_the_digits_of_its_interval(value, interval, unit, words):
     assert str(format_quantity(Estimate(value, interval, unit))) == words
 
 

@@ -39,8 +39,8 @@ XV3500 = Noise(2.5 * DEGREE / 60)
 def noisy_robot(seed=0):
     """Return times and rates of the robot with the XV3500's white noise."""
     time = np.arange(16001) * INTERVAL
-    return time, ROBOT_MOTION.rate_at(time) + simulate_noise(XV3500, len(time), INTERVAL,
-                                                             np.random.default_rng(seed))
+    noise = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(seed))
+    return time, ROBOT_MOTION.rate_at(time) + noise
 
 
 def filtered_singly(settings, time, rate):
@@ -180,5 +180,5 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
     tracker.finish()
     assert math.sqrt(tracker.variance) == pytest.approx(deviation[-1], rel=1e-3)
-    assert (tracker.deleted_heading == pytest.approx(integrate(time, rate)[-1] - heading[-1],
-                                                     abs=1e-5))
+    deleted = integrate(time, rate)[-1] - heading[-1]
+    assert tracker.deleted_heading == pytest.approx(deleted, abs=1e-5)

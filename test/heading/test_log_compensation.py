@@ -41,13 +41,13 @@ def model_of(values, **more):
 def drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
     """Return a log of a gyro that is driven, heated and cooled, and shaken."""
     rate = motion(TIME)
+    force = np.random.default_rng(1).standard_normal(len(TIME))
     log = Log(output=rate, time=TIME, temperature=30.0 + 15.0 * np.abs(1.0 - TIME / 300.0),
               reference_rate=rate, reference_heading=integrate(TIME, rate),
               supply=5.0 + 0.2 * np.sin(TIME / 40.0),
-              specific_force=(np.where(TIME > 400.0, 2.0,
-                                       0.1) * np.random.default_rng(1).standard_normal(len(TIME))))
-    return replace(log, output=simulate_gyro_output(model, TIME,
-                                                    channels_from_log(log).with_rate(rate, rate)))
+              specific_force=np.where(TIME > 400.0, 2.0, 0.1) * force)
+    channels = channels_from_log(log).with_rate(rate, rate)
+    return replace(log, output=simulate_gyro_output(model, TIME, channels))
 
 
 @pytest.mark.parametrize('size', [1, 700, 5000])
