@@ -265,8 +265,7 @@ def refuse_samples(time: Array, rate: Array, limits: RunLimits) -> None:
     """Refuse samples that are too few, no numbers, or too far apart."""
     if len(time) < limits.min_samples:
         raise DataRefused(f'only {len(time)} samples came; at least {limits.min_samples} are '
-                          'needed: '
-                          "check the gyro's line and rate")
+                          "needed: check the gyro's line and rate")
     if not np.isfinite(rate).all():
         raise DataRefused(f'{np.sum(~np.isfinite(rate))} samples are not a finite number: '
                           'leave them out, or repair the line')
@@ -331,8 +330,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     if abs(s) > limits.max_scale_factor_error + 3.0 * deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '
-                          'and '
-                          "at the profile's unit")
+                          "and at the profile's unit")
     if abs(b) > limits.max_bias:
         raise DataRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond '
                           f'{limits.max_bias / DEGREE:g} deg/s: do not turn the robot by hand')

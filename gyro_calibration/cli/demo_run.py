@@ -353,8 +353,8 @@ def _table(errors: dict[str, Array]) -> str:
     pure, published = errors['pure integration'].mean(), TABLE_1['pure integration'][0]
     for name, error in errors.items():
         mean, deviation = TABLE_1.get(name, (math.nan, math.nan))
-        theirs = '' if math.isnan(mean) else (f'{mean:.3f} deg, {deviation:.3f} deg, '
-                                              f'{100 * (1 - mean / published):.0f} %')
+        theirs = '' if math.isnan(mean) else (
+            f'{mean:.3f} deg, {deviation:.3f} deg, {100 * (1 - mean / published):.0f} %')
         lines.append(f'| {name} | {error.mean():.3f} deg | {error.std():.3f} deg '
                      f'| {100 * (1 - error.mean() / pure):.0f} % | {theirs} |')
     return '\n'.join(lines) + '\n'

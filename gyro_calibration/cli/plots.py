@@ -56,8 +56,8 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')
-    return _save_figure(figure, path, 'Below: the flatter a line and the nearer to zero, the '
-                                      'better.')
+    return _save_figure(figure, path,
+                        'Below: the flatter a line and the nearer to zero, the better.')
 
 
 def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
@@ -103,9 +103,9 @@ def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')
-    return _save_figure(figure, path, 'Above: the rates coincide if the log belongs to the '
-                                      'motion. '
-                        'Below: the error before follows the turns; after, it stays near zero.')
+    return _save_figure(figure, path,
+                        'Above: the rates coincide if the log belongs to the motion. Below: the '
+                        'error before follows the turns; after, it stays near zero.')
 
 
 def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
@@ -252,9 +252,9 @@ def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
         if shade is not None:
             figure.colorbar(dots, ax=panels[:, column], label=shade_label, location='bottom',
                             aspect=40, shrink=0.9)
-    return _save_figure(figure, path, 'Below: dots without a shape and without bands of one '
-                                      'colour are '
-                        'noise; a curve or a band is an effect that the model lacks.')
+    return _save_figure(figure, path,
+                        'Below: dots without a shape and without bands of one colour are noise; a '
+                        'curve or a band is an effect that the model lacks.')
 
 
 def _draw_errors(axes: Any, across: Array, error: Array, is_inlier: Mask,

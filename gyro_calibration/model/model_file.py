@@ -121,8 +121,8 @@ def _parse_nonnegative(key_path: str, value: Any) -> float:
 def _parse_noise_figure(key_path: str, value: Any) -> float:
     """Read a noise figure: 0, or large enough that its square does not underflow."""
     if 0.0 < (size := _parse_nonnegative(key_path, value)) < 1.0 / MAX_MAGNITUDE:
-        raise InvalidValue(key_path, value, '0 where it is not known, or at least '
-                                            f'{1.0 / MAX_MAGNITUDE}')
+        raise InvalidValue(key_path, value,
+                           f'0 where it is not known, or at least {1.0 / MAX_MAGNITUDE}')
     return size
 
 
@@ -197,8 +197,8 @@ def _parse_polynomial(key_path: str, given: Mapping[str, Any]) -> Term:
 def _parse_polynomial_matrix(key_path: str, rows: Any) -> tuple[Effect, tuple[float, ...]]:
     if (not isinstance(rows, list) or not all(isinstance(row, list) for row in rows)
             or max(map(len, [rows, *rows])) > _MAX_POLYNOMIAL_ORDER + 1):
-        raise InvalidValue(key_path, rows, 'rows of finite numbers, up to order '
-                                           f'{_MAX_POLYNOMIAL_ORDER}')
+        raise InvalidValue(key_path, rows,
+                           f'rows of finite numbers, up to order {_MAX_POLYNOMIAL_ORDER}')
     try:
         return polynomial_from_matrix(_parse_rows(key_path, rows))
     except InvalidValue:
@@ -231,8 +231,8 @@ def _parse_self_calibration(value: Any) -> SelfCalibration | None:
         return SelfCalibration(**run)
     (a, b), (_, c) = matrix.tolist()
     if max(a, c) > _MAX_STANDARD_DEVIATION ** 2:
-        raise InvalidValue(place, value, 'standard deviations of at most '
-                                         f'{_MAX_STANDARD_DEVIATION:g}')
+        raise InvalidValue(place, value,
+                           f'standard deviations of at most {_MAX_STANDARD_DEVIATION:g}')
     return SelfCalibration(**run, covariance=((a, b), (b, c)))
 
 

@@ -61,7 +61,7 @@ class Parameter:
         if (type(value) is not wanted
                 or several and not all(isinstance(each, str) for each in texts)):
             self._refuse(value, self.choices_text or f'{_TYPE_NAMES[wanted]}, for example '
-                                                     f'{self.default!r}')
+                         f'{self.default!r}')
         if any('\0' in each for each in texts if isinstance(each, str)):
             self._refuse(value, 'without a zero byte')
         if isinstance(value, float) and not math.isfinite(value):

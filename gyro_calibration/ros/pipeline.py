@@ -353,8 +353,8 @@ class Pipeline:
         if frame != self._frame:
             before, self._frame = self._frame, frame
             if before is not None:
-                self._note_jump(now, f'samples of the frames {before} and {frame} alternate on '
-                                     'imu/data_raw')
+                self._note_jump(
+                    now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
         self._max_interval = (0 if now - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
