@@ -250,5 +250,7 @@ def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
     scores = np.array([np.bincount(pieces, column * residual) for column in columns.T])
     inverse = np.linalg.pinv(columns.T @ columns)
     student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)
-    deviation = student * math.sqrt((inverse @ scores @ scores.T @ inverse)[0, 0])
+    # of an exact line it is below 0 by rounding
+    variance = (inverse @ scores @ scores.T @ inverse)[0, 0]
+    deviation = student * math.sqrt(max(variance, 0.0))
     return LineFit(float(solution[0]), float(solution[1]), float(deviation))

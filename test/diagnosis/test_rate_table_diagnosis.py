@@ -257,6 +257,14 @@ def test_outlying_dwells_and_wrong_units_are_reported_and_not_fitted():
     assert found.before.terms[1].values[0] == pytest.approx(0.01, abs=1e-3)
 
 
+def test_an_exact_table_with_an_outlying_dwell_is_diagnosed():
+    rate = np.tile(np.linspace(-70.0, 70.0, 15), 3)
+    output = 1.002 * rate + np.where(np.arange(len(rate)) == 7, 15.0, 0.0)
+    table = Log(output=output * DEGREE, reference_rate=rate * DEGREE,
+                temperature=np.repeat([10.0, 25.0, 40.0], 15))
+    assert 'outliers' in names(diagnose_table(table, None))
+
+
 def test_an_outlying_dwell_is_compared_with_what_the_others_foretell_of_it():
     table = Table(sweeps=1, rates=13).measure(GyroModel(LINEAR), np.random.default_rng(21))
     last = np.arange(13) == 12
