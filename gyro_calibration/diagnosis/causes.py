@@ -168,9 +168,13 @@ def make_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
 def mark_suspected(found: Finding) -> Finding:
     """Return a finding as suspected, with the experiment that would establish it as remedy."""
     separate_by = CAUSES[found.effect].separate_by
-    return replace(found, status='suspected',
-                   remedy=(f'record again: {separate_by}' if separate_by
-                           else 'record longer, and check that it is found again'))
+    if not separate_by:
+        remedy = 'record longer, and check that it is found again'
+    elif separate_by.startswith('record again'):
+        remedy = separate_by
+    else:
+        remedy = f'record again: {separate_by}'
+    return replace(found, status='suspected', remedy=remedy)
 
 
 _REMEDIES = {

@@ -15,7 +15,13 @@ import zlib
 
 from diagnosed import diagnosis_of, log_of
 from gyro_calibration.diagnosis.candidates import observed_range
-from gyro_calibration.diagnosis.causes import CAUSES, next_experiment, REFERENCES
+from gyro_calibration.diagnosis.causes import (
+    CAUSES,
+    make_finding,
+    mark_suspected,
+    next_experiment,
+    REFERENCES,
+)
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import DEGREE, QUANTITIES
 from gyro_calibration.model.effects import CATALOGUE
@@ -108,3 +114,9 @@ def test_a_set_that_is_found_has_its_experiment():
     assert {finding.effect, *finding.ambiguous_with} >= set(pair)
     assert 'heat and cool it twice' in finding.separate_by and 'sigma' in finding.separate_by
     assert all(CAUSES[name].separate_by for name in finding.ambiguous_with)
+
+
+@pytest.mark.parametrize('name', ['rate_ramp', 'bias_step', 'time_offset'])
+def test_the_remedy_of_a_suspected_cause_says_once_that_it_is_to_be_recorded_again(name):
+    remedy = mark_suspected(make_finding(name, {}, 0.01)).remedy
+    assert remedy.count('record again') == 1 and CAUSES[name].separate_by in remedy
