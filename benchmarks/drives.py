@@ -161,7 +161,7 @@ class Course:
     warm: float = 600.0
 
 
-#: The first is that of `reproduction.hong_park`, whose gyro comes fresh.
+#: The first is that of `gyro_calibration_reproduction.hong_park`, whose gyro comes fresh.
 COURSES = {
     'robot, 160 s': Course(lambda generator: of_motion(ROBOT_MOTION), 0.0),
     'random, 160 s': Course(partial(random_path, 160.0)),

@@ -158,7 +158,7 @@ def read_bytes(path: str | Path, max_size: int) -> bytes:
 
     Raises
     ------
-    OSError : as `opened`
+    OSError : as `open_regular_file`
     ValueError : it has more bytes than `max_size`
 
     """
@@ -175,7 +175,7 @@ def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
 
     Returns
     -------
-    the version that was written, as `version` returns it as long as no other program writes
+    the version that was written, as `file_version` returns it as long as no other program writes
 
     Raises
     ------

@@ -285,8 +285,8 @@ def _refuse_uncertain_bias(bias: float, deviation: float, limit: float) -> None:
     """
     Refuse a log whose bias is within chance and could make a heading worse.
 
-    It is refused where its standard deviation, rad/s, in `DRIVE` s exceeds the limit, rad, and its
-    95 % interval holds zero.
+    It is refused where its standard deviation, rad/s, in `DRIVE_DURATION` s exceeds the limit,
+    rad, and its 95 % interval holds zero.
 
     """
     if deviation * DRIVE_DURATION > limit and abs(bias) < stats.norm.ppf(0.975) * deviation:

@@ -21,7 +21,7 @@ The model of ``n`` observations is::
   (`BandedNoise`).
 * ``u``, shape (q,), has independent elements with variances ``sum(size_j**2 * variance_j)``
   (`SharedNoise`). It describes errors that many observations have in common: a bias that wanders
-  (`wander`), or the bias of one sweep of a rate table.
+  (`bias_wander_columns`), or the bias of one sweep of a rate table.
 
 The sizes are not known. For each point of a grid over them the restricted likelihood (REML:
 ``values`` with a flat prior and ``u`` are integrated out) is computed, with ``V`` the covariance
@@ -44,8 +44,8 @@ angle_random_walk  rad/√s     gyro, white: variance in proportion to the lengt
 reference          rad        reference, white from point to point; neighbouring spans share one
 motion             s          the same, in proportion to the rate at the point: side slip, jitter
 turned             √rad       either, variance in proportion to the angle turned in the span
-bias_instability   rad/s      gyro, flicker of the two-sided spectrum B²/ω (`wander`)
-rate_random_walk   rad/s/√s   gyro, random walk of the two-sided spectrum K²/ω² (`wander`)
+bias_instability   rad/s      gyro, flicker of the two-sided spectrum B²/ω
+rate_random_walk   rad/s/√s   gyro, random walk of the two-sided spectrum K²/ω²
 =================  =========  ==================================================================
 
 Example, for headings of a gyro's integral and of a reference, rad, at the same times, s::
@@ -54,7 +54,8 @@ Example, for headings of a gyro's integral and of a reference, rad, at the same 
     # the values: 1 + scale factor error, and bias in rad/s
     columns = np.column_stack([np.diff(reference), np.diff(time)])
     noise = heading_noise(time, rate)
-    found = noise_grid(increments, columns, noise, *wander(time), noisy_column=0, wandering=1)
+    found = fit_noise_grid(increments, columns, noise, *bias_wander_columns(time), noisy_column=0,
+                           wandering_value=1)
     found.values, found.covariance, found.size('reference'), found.whiten(columns)
 
 """
@@ -276,7 +277,7 @@ def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | Non
     ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. A bias among the
     values of the regression is the mean over the log. How far that is from the bias where the log
     began has the variance ``2/π B²`` and ``K² T / 3``, which is not observable in the log:
-    `noise_grid` adds it to the variance of the value `wandering`.
+    `fit_noise_grid` adds it to the variance of the value `wandering_value`.
 
     Parameters
     ----------

@@ -197,9 +197,9 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
     output : of the gyro before its model, where that differs, shape (n,); it shows a gyro that is
         dead or at its limit
-    prior : standard deviations of (s, b) about zero before the run, as `GyroModel.prior` of a
-        fleet, shape (2,); what the run leaves open is drawn to it, in a method that gives a
-        covariance
+    prior : standard deviations of (s, b) about zero before the run, as
+        `GyroModel.prior_deviations` of a fleet, shape (2,); what the run leaves open is drawn to
+        it, in a method that gives a covariance
 
     Raises
     ------

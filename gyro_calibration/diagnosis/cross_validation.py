@@ -188,7 +188,7 @@ def heading_error_shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
 
 
 def heading_curve(parts: Mapping[str, Array], time: Array) -> HeadingCurve:
-    """Return the heading error over a log, of all contributions and of the rest (see `shares`)."""
+    """Return the heading error of a log and its rest, as `heading_error_shares` splits it."""
     total = sum(parts.values(), 0.0 * parts['left'])
     before, after = (np.concatenate([[0.0], np.cumsum(each)]) for each in (total, parts['left']))
     return HeadingCurve(time, before, after)

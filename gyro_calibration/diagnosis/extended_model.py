@@ -53,8 +53,8 @@ def extend_model(model: GyroModel | None, fit: FittedValues, quality: Sequence[D
 
     Parameters
     ----------
-    model : of the simulation, `calibrated`; None for an ideal gyro
-    fit : the causes and their values, none of them `left_out`
+    model : of the simulation, by `merge_self_calibration`; None for an ideal gyro
+    fit : the causes and their values, none of them of `unmergeable_causes`
     quality : of each log
     findings : all; of the noise of a given model, only the figures with a finding are replaced
     noise : of the residual

@@ -165,7 +165,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     false_alarm_rate : false alarms per diagnosis
     names : file names of the logs, for messages
     on_progress : is called with the share of the work done and the name of the step that begins
-    reference_kind : of the reference, one of `data_quality.KINDS`; None is found from the log
+    reference_kind : of the reference, one of `data_quality.REFERENCE_KINDS`; None is found from
+        the log
 
     Raises
     ------

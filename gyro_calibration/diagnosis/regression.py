@@ -192,7 +192,7 @@ class RegressionFit:
         Return the logarithm of the likelihood at the best values, averaged over the noises.
 
         This is the restricted likelihood without its dependence on the units of the columns: see
-        `evidence`.
+        `column_evidence`.
 
         """
         by_noise = self.noise_likelihood

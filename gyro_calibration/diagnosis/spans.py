@@ -14,8 +14,9 @@ Headings over spans: regression of the change of a reference on the integral of 
 The errors of the reference are larger than those of the gyro from sample to sample. So the heading
 of the reference (the integral of a reference rate) is the observation, and all columns are
 integrals of the most likely rate ``w`` given both (with a course, that of the gyro;
-`Spans.corrected`). With the output ``y`` and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``,
-the heading ``psi`` of the reference is, at points ``t`` and except for a constant::
+`Spans.with_corrected_rate`). With the output ``y`` and effects
+``y = w + b + s w + sum(a f(w, T, t, ...))``, the heading ``psi`` of the reference is, at points
+``t`` and except for a constant::
 
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
@@ -387,7 +388,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     ----------
     log : with output, time and a reference
     kind : of the reference
-    prior : standard deviations of (s, b) from `GyroModel.prior`, if the type of gyro is known
+    prior : standard deviations of (s, b) from `GyroModel.prior_deviations`, if the type of gyro is
+        known
 
     """
     assert log.time is not None and log.output is not None

@@ -23,7 +23,7 @@ date and is set by months when it finds a time server; then the stamps jump. `No
 converts a steady clock to stamps of such a clock, `HostTimeConverter` converts its stamps to a
 continuous time.
 
-No clock is read here, except by `steady`: the caller gives the time of arrival.
+No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
 
 References
 ----------

@@ -279,7 +279,8 @@ class PooledValue:
     ----------
     observed : the values
     variance_names : of the variances that the logs distinguish
-    likeliest_variances : name -> variance (of `OWN`, a share) at the largest restricted likelihood
+    likeliest_variances : name -> variance (of `OWN_SHARE`, a share) at the largest restricted
+        likelihood
 
     """
 

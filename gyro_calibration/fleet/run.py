@@ -120,7 +120,7 @@ def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: 
     work : a function of a module, which raises nothing
     tasks : may be endless
     workers : that work at a time
-    create : makes an executor of so many workers, of `processes` or `cluster`
+    create : makes an executor of so many workers, of `process_executors` or `cluster_executors`
 
     """
     remaining = iter(tasks)

@@ -134,7 +134,7 @@ def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
 
     Parameters
     ----------
-    records : as `work.done` returns them
+    records : as `work.process_log` returns them
 
     """
     types = sorted({str(each['type']) for each in records})
@@ -443,7 +443,7 @@ def build_models(summary: TypeSummary) -> Iterator[tuple[str, GyroModel]]:
 
     They hold the mean values, and as tolerance the deviation of a power-on from them, so that
     their interval of 95 % is that of the fleet. The compensation adds the tolerance until there is
-    a self-calibration, which uses it as its prior (`GyroModel.prior`).
+    a self-calibration, which uses it as its prior (`GyroModel.prior_deviations`).
 
     """
     yield '', _build_model(summary, None)

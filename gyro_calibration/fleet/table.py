@@ -239,7 +239,7 @@ def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -
     Parameters
     ----------
     entry : with a log that exists
-    file_pattern : pattern of the file names, by `pattern`
+    file_pattern : pattern of the file names, by `compile_file_pattern`
 
     """
     stem = re.sub(f'({"|".join(map(re.escape, sorted(LOG_SUFFIXES, key=len, reverse=True)))})$',

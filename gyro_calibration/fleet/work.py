@@ -191,7 +191,7 @@ class LogTask:
     entry : the log
     folder : of the results
     technology : of the gyros, one of `course_over_ground.TECHNOLOGY_PRIORS`
-    file_pattern : pattern of the file names, by `table.pattern`
+    file_pattern : pattern of the file names, by `table.compile_file_pattern`
     generator : for the diagnosis, the same for each log; None without a diagnosis
     default_type : of logs whose type is not stated
     sample_rate : Hz, of the samples of logs without a usable time

@@ -42,7 +42,7 @@ class StampGrid:
 
     time: Array  # s, shape (n,)
     lost_after: Integers  # how many samples are lost after each but the last, shape (n - 1,)
-    grid_index: Integers  # index on the grid, shape (n,); long gaps are cut to `longest_gap`
+    grid_index: Integers  # index on the grid, shape (n,); long gaps are cut to `max_gap`
     interval: float  # of the grid, s
     max_deviation: float  # largest deviation of the stamps from the grid, s
     has_bursts: bool  # the stamps come in bursts or with jitter; the grid is used instead

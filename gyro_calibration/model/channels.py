@@ -11,7 +11,7 @@
 """
 Channels that need a history: time since power-on, lagged channels, the sign of heating.
 
-A `History` takes a stream sample by sample, or a log as a whole or in blocks, with the same
+A `ChannelHistory` takes a stream sample by sample, or a log as a whole or in blocks, with the same
 results. Each lag that is requested starts at the value of its channel at that time and is updated
 from then on.
 

@@ -68,8 +68,8 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     ----------
     output : rad/s, a number or shape (n,)
     temperature : degC, alike; the model's reference temperature where it is None
-    environment : further channels, from the `GyroModel.history` that took the same temperatures;
-        needed where the model `needs_history`
+    environment : further channels, from the history (`GyroModel.start_history`) that took the same
+        temperatures; needed where the model `needs_history`
 
     """
     given = model.reference_temperature if temperature is None else temperature

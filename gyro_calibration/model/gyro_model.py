@@ -402,7 +402,7 @@ class GyroModel:
 
     def true_time(self, time: Number) -> Number:
         """Return the time of measurement of a sample by its stamp, both in s since power-on."""
-        # in the inverse order of `distorted`
+        # in the inverse order of `distort`
         for term in reversed(self.terms):
             if term.effect.correct_stamps is not None:
                 time = term.effect.correct_stamps(time, *term.values)
@@ -464,7 +464,7 @@ def _iterate_secant(g: Callable[[Number], Number], start: Number, low: float = -
 def _invert_response(error_at: Callable[[Number], Number], output: Number, start: Number,
                      domain: tuple[float, float]) -> tuple[Number, Number]:
     """
-    Solve ``rate + added(rate) = given`` in a domain where the left side grows with the rate.
+    Solve ``rate + error_at(rate) = output`` in a domain where the left side grows with the rate.
 
     Parameters
     ----------

@@ -256,7 +256,7 @@ def simulate_gyro_output(model: GyroModel, time: Array, channels: Channels,
     ----------
     model : effects and noise of the gyro
     time : stamps, s, increasing, shape (n,); the noise is that of samples at their median interval
-    channels : true rate and surroundings at these times, of a log by `history.channels_of`
+    channels : true rate and surroundings at these times, of a log by `channels.channels_from_log`
     generator : source of the noise; without one there is none
 
     """

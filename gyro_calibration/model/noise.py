@@ -90,7 +90,7 @@ class Noise:
         """
         Return the variance, rad², of a heading after `duration` s without white noise.
 
-        The bias is estimated as its mean over the `CALIBRATED` s before.
+        The bias is estimated as its mean over the `BIAS_AVERAGING_TIME` s before.
 
         """
         variance = (self.rate_random_walk ** 2
@@ -110,7 +110,7 @@ class Noise:
 
 def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
     """
-    Return the variance of the mean of a process over `CALIBRATED` s, and a covariance.
+    Return the variance of the mean of a process over `BIAS_AVERAGING_TIME` s, and a covariance.
 
     The process is a Gauss-Markov process of unit variance; the covariance is that of the mean and
     the value at the end of the interval.
@@ -125,8 +125,9 @@ def increment_covariance(noise: Noise, edges: Array) -> Array:
     """
     Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
 
-    Flicker and random walk have no finite variance, but their increments do (`Part.covariance`).
-    The result holds for sums whose weights add up to zero, such as the difference of two biases.
+    Flicker and random walk have no finite variance, but their increments do
+    (`NoiseTerm.angle_covariance`). The result holds for sums whose weights add up to zero, such as
+    the difference of two biases.
 
     """
     apart, lengths = edges[:, None] - edges, np.diff(edges)
@@ -158,7 +159,7 @@ class GaussMarkov:
         return self.density * math.sqrt(0.5 * self.correlation_time)
 
     def angle_covariance(self, time: Number) -> Array:
-        """Return the covariance of the angle, rad², as `Part.covariance` does."""
+        """Return the covariance of the angle, rad², as `NoiseTerm.angle_covariance` does."""
         ratio = np.abs(np.asarray(time, dtype=float)) / self.correlation_time
         # a series where ratio - 1 + exp(-ratio) would lose all digits
         growth = np.where(ratio < 1e-4, ratio ** 2 * (0.5 - ratio / 6.0), ratio + np.expm1(-ratio))

@@ -188,7 +188,7 @@ _NOISE_UNITS = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
 def export_model(parameters: SimulatorParameters, model: GyroModel,
                  simulator: str) -> tuple[str, list[str]]:
     """
-    Write the `figures` of a gyro for one of `SIMULATORS`.
+    Write the `simulator_parameters` of a gyro for one of `SIMULATORS`.
 
     Returns
     -------

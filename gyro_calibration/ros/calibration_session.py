@@ -13,7 +13,8 @@ Calibration runs on a robot, without rclpy: data collection, drive, guards and f
 
 Inputs are samples, odometry and commands with the time of the steady clock; commands are sent
 through `send`. All guards of a drive use the steady clock, not ROS time. A run ends with
-`Run.reason` set ('' where its samples are complete); `CalibrationSession.conclude` then fits it.
+`CalibrationRun.end_reason` set ('' where its samples are complete); `CalibrationSession.conclude`
+then fits it.
 
 A foreign command is one of another node: own commands come back on `cmd_vel` in the order of
 sending, and every other command is foreign, also an additional zero.

@@ -11,9 +11,10 @@
 """
 Tests of the noise and the bias of a gyro at rest against its model.
 
-Samples are collected in stretches of `STRETCH` s with a steady rate, as at rest. In each stretch
-the mean square of differences of neighbouring blocks is tested against the noise of the model, and
-the mean rate against zero. The levels of both tests follow from a stated rate of false alarms.
+Samples are collected in stretches of `STRETCH_DURATION` s with a steady rate, as at rest. In each
+stretch the mean square of differences of neighbouring blocks is tested against the noise of the
+model, and the mean rate against zero. The levels of both tests follow from a stated rate of false
+alarms.
 
 """
 

@@ -12,8 +12,9 @@
 Logs with hidden effects, made independently of the package: nothing of it is imported here.
 
 `hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE_CATALOGUE`
-those that are not in it; `twin` and `part` make the logs on which two causes are confounded, and
-on which they are distinguishable; `oracle_gain` is the improvement with the truth known.
+those that are not in it; `hide_look_alike` and `record_separating` make the logs on which two
+causes are confounded, and on which they are distinguishable; `oracle_gain` is the improvement with
+the truth known.
 
 A size is a multiple of the minimum detectable effect beside a bias of each recording and one scale
 (`size`), with these exceptions: faults of samples are counted, and three are just detectable;

@@ -248,7 +248,8 @@ class Protocol:
         rest of a line
     modulus : of the sequence of the device; 0 where it has none
     normal_ranges : normal ranges of the values of `Sample.health`
-    check_settings : ``check(settings)`` raises ValueError if settings are missing or wrong
+    check_settings : ``check_settings(settings)`` raises ValueError if settings are missing or
+        wrong
 
     """
 
