@@ -545,7 +545,7 @@ def rate_noise_share(log: Log) -> float:
     # a quick swing may have no three blocks in a row without a reversal, but as many half as long
     fast = left = every[:0]
     for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
-        quiet = _quiet(every, block)
+        quiet = _select_quietest(every, block)
         part = every[:len(quiet)][quiet]
         if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
             fast, left = part, rest[:len(quiet)][quiet]
@@ -565,12 +565,12 @@ def rate_noise_share(log: Log) -> float:
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
 
 
-def _quiet(fast: Array, block: int) -> Mask:
+def _select_quietest(fast: Array, block: int) -> Mask:
     """Tell which third differences of a rate are in the quietest blocks."""
     blocks = len(fast) // block
     energy = np.sum(fast[:blocks * block].reshape(blocks, block) ** 2, axis=1)
-    # by the blocks on both sides, for those that are quiet themselves are so by chance; one with
-    # far more energy than these is a motion between two rests
+    # selected by the blocks on both sides, as a block that is quiet itself may be so by chance;
+    # one with far more energy than these is a motion between two rests
     sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
     most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
     return np.asarray(np.repeat((sides <= most) & (energy <= 3.0 * most), block))
