@@ -99,11 +99,11 @@ def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
                 held[name].append(found[name].low <= value <= found[name].high)
             estimates.append([found[name].estimate for name in true])
             for name, wanted, value in (
-                    ('mean', pooled.linear_functions(), np.array([3.0])),
-                    ('unit', pooled.linear_functions(unit=np.arange(units)), values),
-                    ('new', pooled.linear_functions(units=1.0),
+                    ('mean', {}, np.array([3.0])),
+                    ('unit', {'unit': np.arange(units)}, values),
+                    ('new', {'units': 1.0},
                      3.0 + between * generator.standard_normal(1))):
-                interval = pooled.estimate(wanted)
+                interval = pooled.estimate(**wanted)
                 held[name].extend((interval.low < value) & (value < interval.high))
         size = np.sqrt(np.mean(np.square(estimates), axis=0))
         yield (f'| {fleet[0]}, {fleet[1]} | ' + ', '.join(f'{each:.3g}' for each in true.values())
@@ -208,11 +208,8 @@ def _predicted(value: Array, sigma: Array, unit: Any, drive: Any, left: Any, kno
     pooled = PooledValue(
         Observations(value[~left], sigma[~left], unit[~left],
                      drive[~left] if known else np.unique(drive[~left], return_inverse=True)[1]))
-    wanted = (pooled.linear_functions(unit=unit[left], drive=drive[left], error=sigma[left],
-                                      power_ons=1.0) if known else pooled.linear_functions(
-                                          unit=unit[left], error=sigma[left], power_ons=1.0,
-                                          drives=1.0))
-    found = pooled.estimate(wanted)
+    found = pooled.estimate(unit=unit[left], error=sigma[left], power_ons=1.0,
+                            **({'drive': drive[left]} if known else {'drives': 1.0}))
     return (value[left] - found.value,
             (found.low < value[left]) & (value[left] < found.high))
 
@@ -233,7 +230,7 @@ def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
             observed, _ = drawn(generator, fleet)
             # all units have the age of the drive, and temperatures of their own
             columns = np.column_stack([observed.drive, generator.uniform(-2.0, 2.0,
-                                                                         len(observed))])
+                                                                         len(observed.value))])
             columns = columns - columns.mean(axis=0)
             true = mean + between * generator.standard_normal((fleet[0], 2))
             pooled = PooledValue(replace(
@@ -244,9 +241,9 @@ def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
                 held.setdefault(name, []).append(of.low <= value <= of.high)
             for place in range(2):
                 row = np.eye(3)[1 + place:2 + place]
-                of_type = pooled.estimate(pooled.linear_functions(fixed=row))
-                of_units = pooled.estimate(pooled.linear_functions(
-                    unit=np.arange(fleet[0]), fixed=np.tile(row, (fleet[0], 1)), part=1 + place))
+                of_type = pooled.estimate(fixed=row)
+                of_units = pooled.estimate(
+                    unit=np.arange(fleet[0]), fixed=np.tile(row, (fleet[0], 1)), part=1 + place)
                 for name, interval, value in (('type', of_type, mean[place:place + 1]),
                                               ('units', of_units, true[:, place])):
                     held.setdefault(f'{name}_{place}', []).extend(
@@ -312,7 +309,7 @@ def smallest(generator: Generator, fleets: int = 20) -> Iterator[str]:
             observed = Observations(generator.standard_normal(units), np.full(units, 0.3),
                                     np.arange(units), np.full(units, -1))
             pooled = PooledValue(observed)
-            found = pooled.estimate(pooled.linear_functions())
+            found = pooled.estimate()
             sizes.append(float(ndtri(0.995) * found.deviation[0]))
         yield f'| {units} | {np.mean(sizes):.3g} | {np.mean(sizes) * np.sqrt(units):.3g} |'
 
@@ -348,7 +345,7 @@ def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]
                             for what in ('value', 'deviation'))
             single += int(np.sum(np.abs(value) > 2.576 * sigma))
             pooled = PooledValue(Observations(value, sigma, np.arange(logs), np.full(logs, -1)))
-            pooled_found += bool(pooled.p_value(pooled.linear_functions())[0] < level)
+            pooled_found += bool(pooled.p_value()[0] < level)
         yield f'| {name} | {single} of {fleets * logs} | {pooled_found} of {fleets} |'
 
 

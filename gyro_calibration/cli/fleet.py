@@ -26,9 +26,7 @@ from gyro_calibration.calibration.course_over_ground import TECHNOLOGY_PRIORS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio
-from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.files import to_printable, write_atomically
-from gyro_calibration.fleet.pooling import DRIVES, POWER_ONS, UNITS
 from gyro_calibration.fleet.report import render_report, table_files
 from gyro_calibration.fleet.run import (
     cluster_executors,
@@ -39,15 +37,13 @@ from gyro_calibration.fleet.run import (
 )
 from gyro_calibration.fleet.summary import (
     build_models,
+    COMPONENT_LABELS,
     describe_type,
     FALSE_ALARM_RATE,
-    format_interval,
     summarize_types,
     TypeSummary,
 )
-from gyro_calibration.fleet.summary import (
-    data as type_data,
-)
+from gyro_calibration.fleet.summary import data as type_data
 from gyro_calibration.fleet.table import compile_file_pattern, find_logs
 from gyro_calibration.fleet.work import (
     DONE,
@@ -59,9 +55,6 @@ from gyro_calibration.fleet.work import (
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model
 import numpy as np
-
-_COMPONENT_LABELS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
-                     (DRIVES, 'between drives'))
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -160,17 +153,12 @@ def _type_lines(summary: TypeSummary) -> Iterator[str]:
         (summary.records, 'log'), (summary.units, 'unit'), (summary.drives, 'drive')) if each)
     yield f'{summary.name or "Type not stated, pooled as one"}: {counts}.'
     for each in summary.values.values():
-        # the upper bound of a standard deviation that may be zero
-        parts = [f'{spoken} {"" if of.low > 0.0 else "less than "}'
-                 f'{format_amount(of.estimate if of.low > 0.0 else of.high, each.unit, each.name)}'
-                 for name, spoken in _COMPONENT_LABELS if (of := each.components.get(name))]
-        mean = format_interval(each.mean, 0, each.unit, each.name)
-        yield f'  {each.name}: {mean}; {", ".join(parts)}'
+        parts = [f'{label} {each.format_component(name)}'
+                 for name, label in COMPONENT_LABELS.items() if name in each.components]
+        yield f'  {each.name}: {each.format(each.mean)}; {", ".join(parts)}'
         if not each.is_slow:
-            yield '    ' + '; '.join(f'unit {to_printable(name)} '
-                                     f'{format_interval(each.units, place, each.unit, each.name)}'
-                                     for place, name in enumerate(summary.units)
-                                     if np.isfinite(each.units.value[place]))
+            yield '    ' + '; '.join(f'unit {to_printable(name)} {each.format(interval)}'
+                                     for name, interval in each.units.items())
     yield from (f'  {text}.' for text in describe_type(summary))
 
 

@@ -23,25 +23,19 @@ from gyro_calibration.diagnosis.report import render_page
 from gyro_calibration.diagnosis.words import (
     as_sentence,
     display_unit,
-    format_amount,
     format_quantity,
     readable_name,
 )
-from gyro_calibration.fleet.pooling import Component, DRIVES, Interval, POWER_ONS, UNITS
+from gyro_calibration.fleet.pooling import Interval
 from gyro_calibration.fleet.summary import (
+    COMPONENT_LABELS,
     describe_type,
-    format_interval,
     TypeSummary,
     ValueSummary,
 )
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 import numpy as np
 
-_COMPONENT_LABELS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
-                     (DRIVES, 'common to a drive'))
-_SLOPE_UNITS = {'age': 'year', 'temperature': 'K'}
-#: Tables with more rows are scrolled inside the page and have a search field.
-_MAX_UNSCROLLED_ROWS = 12
 _COLUMNS = ('log', 'type', 'unit', 'drive', 'date', 'temperature', 'status', 'reason', 'method',
             'samples', 'duration_s', 'sha256', 'page')
 #: Sorts a table by the clicked column, and shows the rows that contain a text.
@@ -102,64 +96,62 @@ def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, A
         element('header', element('p', 'Fleet', class_='about'), element('h1', title),
                 element('p', about, class_='gained') if about else None),
         element('main', *(part for place, found in enumerate(types)
-                          for part in _type_sections(found, place)), _log_section(records)),
+                          for part in _type_sections(found, f't{place}')), _log_section(records)),
         _STYLE, _SCRIPT)
     return render_page(f'Fleet: {title}', body)
 
 
-def _type_sections(summary: TypeSummary, index: int) -> Iterator[Markup]:
+def _type_sections(summary: TypeSummary, key: str) -> Iterator[Markup]:
+    """Give the sections of a type: its values, units, drives and dates."""
     name = summary.name or 'Type not stated'
     items = [element('li', as_sentence(text)) for text in describe_type(summary)]
     yield element('section', element('h2', name), element('ul', *items), _variance_table(summary))
     values = [each for each in summary.values.values() if not each.is_slow]
-    yield element(
-        'section', element('h2', f'{name}: units'), element(
-            'p', 'Bars: 95 % intervals of the mean of a unit over its power-ons.', class_='quiet'),
-        element('div', *(draw_chart(_interval_chart(each, f't{index}-{each.name}-units', 'unit',
-                                                    summary.units, each.units, 'after'))
-                         for each in values), class_='pairs'), _unit_table(summary, values))
-    shared = [each for each in summary.values.values() if DRIVES in each.components]
-    if shared:
-        yield element('section', element('h2', f'{name}: drives'),
-                      element('p', 'An error that all units of a drive have in common is '
-                              'assigned to its reference or to the vehicle.', class_='quiet'),
-                      element('div', *(draw_chart(_interval_chart(
-                          each, f't{index}-{each.name}-drives', 'drive', summary.drives,
-                          each.drives, 'before')) for each in shared), class_='pairs'))
-    if len(summary.dates) > 1:
-        yield element(
-            'section', element('h2', f'{name}: over time'),
-            element('div', *(draw_chart(_dates_chart(summary, each, f't{index}-{each.name}-dates'))
-                             for each in values), class_='pairs'))
+    units = [_interval_chart(each, key, 'unit', each.units, 'after') for each in values]
+    drives = [_interval_chart(each, key, 'drive', each.drives, 'before')
+              for each in summary.values.values() if each.drives]
+    dates = [_dates_chart(summary, each, key) for each in values if len(summary.dates) > 1]
+    for heading, charts, text, more in (
+            ('units', units, 'Bars: 95 % intervals of the mean of a unit over its power-ons.',
+             _unit_table(summary, values)),
+            ('drives', drives, 'An error that all units of a drive have in common is assigned to '
+             'its reference or to the vehicle.', None),
+            ('over time', dates, '', None)):
+        if charts or more:
+            yield element('section', element('h2', f'{name}: {heading}'),
+                          element('p', text, class_='quiet') if text else None,
+                          element('div', *map(draw_chart, charts), class_='pairs'), more)
 
 
 def _variance_table(summary: TypeSummary) -> Markup:
+    per = {'age': '/year', 'temperature': '/K'}
     drifts = any(each.slopes for each in summary.values.values())
-    heads = ['value', 'mean of the type', 'one more unit',
-             *(text for _, text in _COMPONENT_LABELS), *(['drift'] if drifts else [])]
-    rows = [[_cell(readable_name(each.name)), _interval_cell(each, each.mean, 0),
-             _interval_cell(each, each.new_unit, 0),
-             *(_component_cell(each, each.components.get(name)) for name, _ in _COMPONENT_LABELS),
-             *([_cell('; '.join(format_interval(slope, 0, f'{each.unit}/{_SLOPE_UNITS[name]}',
-                                                each.name)
-                                for name, slope in each.slopes.items()))] if drifts else [])]
-            for each in summary.values.values()]
+    heads = ['value', 'mean of the type', 'one more unit', *COMPONENT_LABELS.values(),
+             *(['drift'] if drifts else [])]
+    rows = []
+    for each in summary.values.values():
+        drift = '; '.join(each.format(slope, per[name]) for name, slope in each.slopes.items())
+        rows.append([
+            _cell(readable_name(each.name)), _interval_cell(each, each.mean),
+            _interval_cell(each, each.new_unit),
+            *(_cell(each.format_component(name), each.components[name].estimate
+                    if name in each.components else -1.0) for name in COMPONENT_LABELS),
+            *([_cell(drift)] if drifts else [])])
     return _table(heads, rows)
 
 
 def _unit_table(summary: TypeSummary, values: Sequence[ValueSummary]) -> Markup:
-    outlying = {summary.units[outlier.group] for each in summary.values.values()
-                for outlier in each.outlying_units}
-    changed = {summary.units[change.unit] for each in summary.values.values()
-               for change in each.changes}
+    alarms = {'stands out': {alarm.name for each in summary.values.values()
+                             for alarm in each.outlying_units},
+              'changed': {alarm.name for each in summary.values.values()
+                          for alarm in each.changes}}
     heads = ['unit', 'logs', *(readable_name(each.name) for each in values), 'remark']
     rows = []
-    for place, name in enumerate(summary.units):
+    for name in summary.units:
         logs = sum(each['unit'] == name for each in summary.records)
-        remark = ', '.join([*(['stands out'] if name in outlying else []),
-                            *(['changed'] if name in changed else [])])
         rows.append([_cell(name), _cell(str(logs), logs),
-                     *(_interval_cell(each, each.units, place) for each in values), _cell(remark)])
+                     *(_interval_cell(each, each.units.get(name)) for each in values),
+                     _cell(', '.join(text for text, names in alarms.items() if name in names))])
     return _table(heads, rows)
 
 
@@ -171,29 +163,25 @@ def _log_section(records: Sequence[Mapping[str, Any]]) -> Markup:
     for each in records:
         file = each['log'].rpartition('/')[2]
         link = element('a', file, href=each['page']) if each.get('page') else file
-        values = each.get('values', {})
-        shown = [_value_cell(values[name], name) if name in values else _cell('')
-                 for name in names]
+        cells = []
+        for name in names:
+            value = each.get('values', {}).get(name)
+            cells.append(_cell('') if value is None else _cell(str(format_quantity(
+                Estimate.from_half_width(value['value'], NORMAL_QUANTILE_975 * value['deviation'],
+                                         value['unit']), name)), value['value']))
         rows.append([element('td', link, data_key=file),
-                     *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *shown,
+                     *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *cells,
                      _cell((each.get('diagnosis') or {}).get('verdict', '')),
                      _cell(each['reason'])])
     return element('section', element('h2', 'Logs'), _table(heads, rows))
 
 
-def _value_cell(value: Mapping[str, Any], name: str) -> Markup:
-    size = NORMAL_QUANTILE_975 * value['deviation']
-    return _cell(str(format_quantity(Estimate(value['value'], (
-        value['value'] - size, value['value'] + size), value['unit']), name)), value['value'])
-
-
 def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
+    """Return a table to sort; one of many rows is scrolled and has a search field."""
     head = element('tr', *(element('th', each, scope='col') for each in heads))
     table = element('table', element('thead', head),
                     element('tbody', *(element('tr', *row) for row in rows)), class_='sortable')
-    return element('div', table,
-                   class_=f'scroll fold{" tall" * (len(rows) > _MAX_UNSCROLLED_ROWS)}',
-                   tabindex='0')
+    return element('div', table, class_=f'scroll fold{" tall" * (len(rows) > 12)}', tabindex='0')
 
 
 def _cell(text: str, key: float | None = None) -> Markup:
@@ -201,52 +189,46 @@ def _cell(text: str, key: float | None = None) -> Markup:
     return element('td', text, data_key=text if key is None else f'{key:.9g}')
 
 
-def _interval_cell(value: ValueSummary, interval: Interval, index: int) -> Markup:
-    return _cell(format_interval(interval, index, value.unit, value.name),
-                 float(interval.value[index]))
+def _interval_cell(value: ValueSummary, interval: Interval | None) -> Markup:
+    return (_cell('') if interval is None
+            else _cell(value.format(interval), interval.value))
 
 
-def _component_cell(value: ValueSummary, component: Component | None) -> Markup:
-    if component is None:
-        return _cell('not shown', -1.0)
-    low, high = (format_amount(end, value.unit, value.name)
-                 for end in (component.low, component.high))
-    text = (f'{format_amount(component.estimate, value.unit, value.name)} ({low} to '
-            f'{high})' if component.low > 0.0 else f'less than {high}')
-    return _cell(text, component.estimate)
-
-
-def _interval_chart(value: ValueSummary, name: str, kind: str, names: Sequence[str],
-                    interval: Interval, style: str) -> Chart:
+def _interval_chart(value: ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
+                    style: str) -> Chart:
+    """Return the intervals of units or drives."""
     unit, factor = display_unit(value.unit, value.name)
-    middle = 0.5 * (interval.high + interval.low)
-    half = 0.5 * (interval.high - interval.low) / NORMAL_QUANTILE_975
-    return Chart(name, f'{readable_name(value.name)} by {kind}',
+    low, high = (np.array([getattr(each, end) for each in intervals.values()])
+                 for end in ('low', 'high'))
+    lines = [Line(kind, style, 0.5 * factor * (high + low),
+                  0.5 * factor * (high - low) / NORMAL_QUANTILE_975, draw_dots=True)]
+    return Chart(f'{key}-{value.name}-{kind}s', f'{readable_name(value.name)} by {kind}',
                  f'{kind.capitalize()}s whose bars do not overlap differ; the sign of a bar '
-                 f'across zero is not determined. {kind.capitalize()}s: {", ".join(names)}.',
-                 kind, '', np.arange(1.0, len(names) + 1.0), readable_name(value.name), unit,
-                 [Line(kind, style, factor * middle, factor * half, draw_dots=True)],
-                 x_names=names)
+                 f'across zero is not determined. {kind.capitalize()}s: {", ".join(intervals)}.',
+                 kind, '', np.arange(1.0, len(intervals) + 1.0), readable_name(value.name), unit,
+                 lines, x_names=list(intervals))
 
 
-def _dates_chart(found: TypeSummary, each: ValueSummary, name: str) -> Chart:
+def _dates_chart(summary: TypeSummary, value: ValueSummary, key: str) -> Chart:
     """Return the values of logs, less those of their units, over their dates."""
-    unit, factor = display_unit(each.unit, each.name)
-    dated = [record for record in each.records if record['date']]
-    place = np.array([found.dates.index(record['date']) + 1.0 for record in dated])
-    value: Array = np.array(
-        [record['slow' if each.is_slow else 'values'][each.name]['value']
-         - float(each.units.value[found.units.index(record['unit'])]) for record in dated])
-    return Chart(name, f'{readable_name(each.name)} less that of the unit',
-                 f'dates: {", ".join(found.dates)}', 'date', '', place, readable_name(each.name),
-                 unit, [Line('log', 'measured', factor * value, draw_dots=True)],
-                 x_names=found.dates)
+    unit, factor = display_unit(value.unit, value.name)
+    dated = [each for each in value.records if each['date']]
+    place = np.array([summary.dates.index(each['date']) + 1.0 for each in dated])
+    difference: Array = np.array([
+        each['values'][value.name]['value'] - value.units[each['unit']].value for each in dated])
+    return Chart(f'{key}-{value.name}-dates', f'{readable_name(value.name)} less that of the unit',
+                 f'dates: {", ".join(summary.dates)}', 'date', '', place,
+                 readable_name(value.name), unit,
+                 [Line('log', 'measured', factor * difference, draw_dots=True)],
+                 x_names=summary.dates)
 
 
 def table_files(types: Sequence[TypeSummary],
                 records: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
     """
     Return the content of files by name: values of logs, and of units, one row each, in SI.
+
+    They are CSV, and Parquet where pyarrow is installed.
 
     Parameters
     ----------
@@ -264,9 +246,16 @@ def table_files(types: Sequence[TypeSummary],
         writer.writeheader()
         writer.writerows(rows)
         found[f'{name}.csv'] = text.getvalue().encode()
-        packed = _parquet_content(columns, rows)
-        if packed is not None:
-            found[f'{name}.parquet'] = packed
+        try:
+            import pyarrow
+            from pyarrow import parquet
+        except ImportError:
+            continue
+        stream = io.BytesIO()
+        parquet.write_table(
+            pyarrow.table({column: [row.get(column) for row in rows] for column in columns}),
+            stream)
+        found[f'{name}.parquet'] = stream.getvalue()
     return found
 
 
@@ -280,30 +269,19 @@ def _log_row(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def _unit_rows(types: Sequence[TypeSummary]) -> Iterator[dict[str, Any]]:
     for found in types:
-        for place, unit in enumerate(found.units):
+        for unit in found.units:
             for name, each in found.values.items():
-                outlying = {one.group for one in each.outlying_units}
-                yield {'type': found.name, 'unit': unit, 'value': name, 'si_unit': each.unit,
-                       'estimate': float(each.units.value[place]),
-                       'standard_deviation': float(each.units.deviation[place]),
-                       'low': float(each.units.low[place]), 'high': float(each.units.high[place]),
-                       'from_type': float(each.type_deviation.value[place]),
-                       'next_low': float(each.next_power_on.low[place]),
-                       'next_high': float(each.next_power_on.high[place]),
-                       'stands_out': place in outlying,
-                       **{f'{over}_slope{end}': float(value[place])
-                          for over, slope in each.unit_slopes.items() for end, value in (
-                              ('', slope.value), ('_low', slope.low), ('_high', slope.high))}}
-
-
-def _parquet_content(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> bytes | None:
-    """Return a table in Parquet; None where pyarrow is not installed."""
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        return None
-    stream = io.BytesIO()
-    parquet.write_table(pyarrow.table({name: [row.get(name) for row in rows] for name in columns}),
-                        stream)
-    return stream.getvalue()
+                if unit not in each.units:
+                    continue
+                estimate, following = each.units[unit], each.next_power_on[unit]
+                row = {'type': found.name, 'unit': unit, 'value': name, 'si_unit': each.unit,
+                       'estimate': estimate.value, 'standard_deviation': estimate.deviation,
+                       'low': estimate.low, 'high': estimate.high,
+                       'from_type': each.type_deviation[unit].value,
+                       'next_low': following.low, 'next_high': following.high,
+                       'stands_out': unit in {alarm.name for alarm in each.outlying_units}}
+                for over, slopes in each.unit_slopes.items():
+                    row |= {f'{over}_slope': slopes[unit].value,
+                            f'{over}_slope_low': slopes[unit].low,
+                            f'{over}_slope_high': slopes[unit].high}
+                yield row

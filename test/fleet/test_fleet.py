@@ -304,7 +304,7 @@ def test_balanced_data_give_the_variances_of_an_analysis_of_variance():
 def test_the_interval_of_one_more_unit_is_that_of_student():
     values = np.random.default_rng(6).standard_normal(6)
     pooled = PooledValue(Observations(values, np.full(6, 1e-6), np.arange(6), np.full(6, -1)))
-    found = pooled.estimate(pooled.linear_functions(units=1.0))
+    found = pooled.estimate(units=1.0)
     half = stats.t.ppf(0.975, 5) * np.std(values, ddof=1) * np.sqrt(1.0 + 1.0 / 6.0)
     assert found.low[0] == pytest.approx(values.mean() - half, abs=0.03 * half)
     assert found.high[0] == pytest.approx(values.mean() + half, abs=0.03 * half)
@@ -316,7 +316,7 @@ def test_what_the_units_of_a_drive_share_does_not_move_a_unit():
                        [4.0, 4.0, 4.1, 4.0]]) + np.array([0.0, 0.0, 0.0, 40.0])
     pooled = PooledValue(crossed(values))
     rows = np.zeros((4, 1))
-    apart = pooled.estimate(pooled.linear_functions(unit=np.arange(4), fixed=rows)).value
+    apart = pooled.estimate(unit=np.arange(4), fixed=rows).value
     assert apart - apart[0] == pytest.approx([0.0, 1.0, 2.0, 3.0], abs=0.1)
 
 
@@ -324,12 +324,12 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     generator = np.random.default_rng(8)
     values = generator.standard_normal((12, 1)) + 0.2 * generator.standard_normal((12, 6))
     date = np.tile(np.arange(6), 12)
-    assert find_outliers(crossed(values), 'units', 0.01) == []
-    assert find_changes(crossed(values), date, 0.01) == []
+    assert find_outliers(PooledValue(crossed(values)), 'units', 0.01) == []
+    assert find_changes(PooledValue(crossed(values)), date, 0.01) == []
     values[3] += 12.0
     values[7, 4:] += 3.0
-    assert [each.group for each in find_outliers(crossed(values), 'units', 0.01)] == [3]
-    (change,) = find_changes(crossed(values), date, 0.01)
+    assert [each.group for each in find_outliers(PooledValue(crossed(values)), 'units', 0.01)] == [3]
+    (change,) = find_changes(PooledValue(crossed(values)), date, 0.01)
     assert ((change.unit, change.first_date) == (7, 4)
             and change.size == pytest.approx(3.0, abs=0.5))
 
@@ -343,11 +343,9 @@ def test_units_that_drift_apart_have_slopes_of_their_own():
               + 0.1 * generator.standard_normal(48))
     pooled = PooledValue(Observations(values, np.full(48, 0.1), unit, drive, age[:, None], 1))
     assert pooled.components['slopes_0'].low < np.std(slopes) < pooled.components['slopes_0'].high
-    apart = pooled.estimate(
-        pooled.linear_functions(unit=np.arange(8), fixed=np.zeros((8, 2)), part=1))
+    apart = pooled.estimate(unit=np.arange(8), fixed=np.zeros((8, 2)), part=1)
     assert apart.value - apart.value.mean() == pytest.approx(slopes - 1.0, abs=0.2)
-    whole = pooled.estimate(
-        pooled.linear_functions(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)), part=1))
+    whole = pooled.estimate(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)), part=1)
     # the mean slope contains that of the references, the differences between units do not
     assert (whole.high - whole.low).min() > 2.0 * (apart.high - apart.low).max()
 
@@ -379,6 +377,21 @@ def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
     json.dumps(data(found), allow_nan=False)
 
 
+@pytest.mark.parametrize('unit', ['0', '4'])
+def test_a_unit_whose_logs_lack_a_value_is_left_out_of_that_value_only(unit):
+    """As where one gyro rested only: by name the first one or the last."""
+    logs = [{**each, 'values': {'bias': each['values']['bias']}, 'slow': {}}
+            if each['unit'] == unit else each for each in records()]
+    (found,) = summarize_types(logs)
+    assert set(found.values['bias'].units) == {*'01234'}
+    assert set(found.values['time_offset'].units) == {*'01234'} - {unit}
+    assert set(data(found)['values']['rate_ramp']['units']) == {*'01234'} - {unit}
+    assert set(dict(build_models(found))) == {'', *'01234'}
+    rows = list(csv.DictReader(table_files([found], logs)['units.csv'].decode().splitlines()))
+    assert sum(row['unit'] == unit for row in rows) == 1
+    assert unit in render_report([found], [{**each, 'reason': ''} for each in logs])
+
+
 def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
     shown = {'hysteresis': lambda unit, drive: True, 'reference_scale': lambda unit, drive: True,
              'bandwidth': lambda unit, drive: unit == '2', 'outliers': lambda unit, drive: drive
@@ -403,15 +416,15 @@ def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
     said = dict(build_models(found))
     assert set(said) == {'', *'01234'}
     bias = found.values['bias']
-    for name, interval, place in (('', bias.new_unit, 0), ('3', bias.next_power_on, 3)):
+    for name, interval in (('', bias.new_unit), ('3', bias.next_power_on['3'])):
         write_model(tmp_path / 'model.yaml', said[name])
         model = read_model(tmp_path / 'model.yaml')
         values = {term.effect.name: term.values[0] for term in model.terms}
         assert np.isinf(model.prior_deviations[0])  # the logs do not determine the scale
         spread = model.prior_deviations[1]
         assert set(values) == {'bias'} and model.gyro['name'] == 'DOT'
-        assert values['bias'] - 1.96 * spread == pytest.approx(interval.low[place])
-        assert values['bias'] + 1.96 * spread == pytest.approx(interval.high[place])
+        assert values['bias'] - 1.96 * spread == pytest.approx(interval.low)
+        assert values['bias'] + 1.96 * spread == pytest.approx(interval.high)
     assert GyroModel(tolerance=Tolerance(bias=1.0)).prior_deviations is None
 
 
