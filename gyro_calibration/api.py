@@ -13,14 +13,14 @@ The public interface: the functions of the command line for scripts and notebook
 
 All quantities are in SI: s, rad, rad/s; temperatures are in degC. Each function takes a `Log` and
 returns a record that prints its answer, as the verb of the same name does. Data that allow no
-answer raise `DataRefused`, files that cannot be read `LogError` or `ModelError`; all of them are
-a `ValueError` whose text says what to do.
+answer raise `DataRefused`, files that cannot be read `LogError` or `ModelError`, arguments that
+are not possible `InputError`; all of them are a `ValueError` whose text says what to do.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -33,6 +33,7 @@ from gyro_calibration.allan import (
     fit_noise,
     NoiseFit,
 )
+from gyro_calibration.calibration.course_over_ground import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.dwells import extract_dwells, join_dwells
 from gyro_calibration.calibration.encoder import (
     calibrate_encoder,
@@ -49,6 +50,7 @@ from gyro_calibration.cli.compensate import CompensatedBlock, integrate_log, tra
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
+from gyro_calibration.diagnosis.data_quality import REFERENCE_KINDS
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
@@ -78,10 +80,7 @@ MotionLike = str | Path | tuple[Any, Any] | Log | Motion
 
 
 class _PrintedResult:
-    """A record that prints itself in words, also in a notebook."""
-
-    def __str__(self) -> str:
-        raise NotImplementedError
+    """A record with a text, that a notebook shows too."""
 
     def _repr_html_(self) -> str:
         return f'<pre>{escape(str(self))}</pre>'
@@ -106,10 +105,6 @@ def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
     unwrap : the reference heading jumps by whole turns; make it continuous
     topic, reference_topic, temperature_topic : of a recording
 
-    Raises
-    ------
-    ValueError : the source is no log; the text says where and what to do
-
     """
     if not isinstance(source, (str, Path)):
         log = log_from_table(source, columns, axis)
@@ -126,14 +121,10 @@ def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
 
 def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
     """
-    Return the model of a file, or of a mapping with the keys of a model file.
+    Return the model of a file, or of a mapping; raise `ValueError` where it is none.
 
     ``read_model({'effects': {'bias': {'bias': 0.002}}, 'noise': {'angle_random_walk': 7e-4}})``
     is a gyro with a bias and white noise.
-
-    Raises
-    ------
-    ValueError : missing, damaged, or no model; the text says where
 
     """
     return (parse_model(dict(source)) if isinstance(source, Mapping)
@@ -207,9 +198,7 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     """
     Correct the rates of a log by a model, and integrate them to a heading.
 
-    Raises
-    ------
-    ValueError : no row of the log is plausible
+    `ValueError` says that no row of the log is plausible.
 
     """
     return _make_headings(log, list(integrate_log([log], model, Threshold(0.0), 'the log')))
@@ -224,10 +213,6 @@ def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     log : with time
     model : with an angle random walk in its noise, which `allan` finds
     hindsight : smooth the heading by all later samples
-
-    Raises
-    ------
-    ValueError : the log has no time, or no row of it is plausible
 
     """
     if not model.noise.angle_random_walk:
@@ -286,18 +271,13 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
     model : that corrects first, and whose noise counts
     method : likelihood, heading or rate
 
-    Raises
-    ------
-    ValueError : the run is refused, with the reason and the remedy
-
     """
-    model = model or GyroModel()
-    time, _ = _require_time(log)
-    if motion is None:
-        run = calibrate_run(log, model, *_to_motion(log), method, ReferenceErrors())
-    else:
-        driven, _ = _to_motion(motion)
-        run = calibrate_run(log, model, driven, time[0], method, default_reference_errors(driven))
+    model, begin = model or GyroModel(), _require_time(log)[0][0]
+    _require_choice('method', method, ('likelihood', 'heading', 'rate'))
+    driven, reference_begin = _to_motion(log if motion is None else motion)
+    run = (calibrate_run(log, model, driven, reference_begin, method, ReferenceErrors())
+           if motion is None else
+           calibrate_run(log, model, driven, begin, method, default_reference_errors(driven)))
     calibration = make_self_calibration(run.fit, method, log, run.is_used)
     return Run(with_self_calibration(model, calibration), run.fit.scale_factor_error,
                run.fit.bias, *calibration.standard_deviations, run.fit, run)
@@ -346,14 +326,11 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
     technology : open_loop_fog, closed_loop_fog or mems; decides where effects look alike
     method : dwells, likelihood, course or rate; None takes what the logs hold
 
-    Raises
-    ------
-    ValueError : the logs do not determine the effects, or a name is wrong
-
     """
-    if unknown := [name for name in effects or () if name not in STATIC_EFFECTS]:
-        raise InputError(f'{unknown[0]} is no effect that fit knows; wanted of '
-                         f'{", ".join(STATIC_EFFECTS)}')
+    for name in effects or ():
+        _require_choice('effects', name, STATIC_EFFECTS)
+    _require_choice('technology', technology, TECHNOLOGY_PRIORS)
+    _require_choice('method', method, ('dwells', 'likelihood', 'course', 'rate'))
     alone = len(logs) == 1 and logs[0].time is not None and logs[0].reference_rate is None
     if method in (None, 'likelihood', 'course', 'rate') and (
             method or alone and not set(effects or ()) - {'bias', 'scale_factor_error'}):
@@ -376,19 +353,10 @@ def _set_technology(model: GyroModel, technology: str | None) -> GyroModel:
 
 @dataclass(frozen=True)
 class NoiseFigures(_PrintedResult):
-    """
-    The noise of a gyro at rest.
+    """The noise of a gyro at rest: angle random walk, bias instability and so on."""
 
-    Attributes
-    ----------
-    chart : Allan deviations with their bounds
-    fit : the noise figures: angle random walk, bias instability, rate random walk, quantization,
-        ramp
-
-    """
-
-    chart: AllanChart
-    fit: NoiseFit
+    chart: AllanChart  # Allan deviations with their bounds
+    fit: NoiseFit  # the noise figures
     _lines: tuple[str, ...] = field(repr=False)
 
     def __str__(self) -> str:
@@ -407,9 +375,7 @@ def allan(log: Log) -> NoiseFigures:
     """
     Find the noise figures of a gyro in a log at rest, by its Allan deviation.
 
-    Raises
-    ------
-    ValueError : the gyro moved, is dead, or its stamps are uneven
+    `ValueError` says that the gyro moved, is dead, or has uneven stamps.
 
     """
     time, output = _require_time(log)
@@ -420,18 +386,10 @@ def allan(log: Log) -> NoiseFigures:
 
 @dataclass(frozen=True)
 class Diagnosed(_PrintedResult):
-    """
-    The error of a simulation against a log, and its causes.
+    """The error of a simulation against a log, and its causes."""
 
-    Attributes
-    ----------
-    model : the extended model; the given one where no extension is offered
-    found : findings, gates, gain and all further results, as in diagnosis.json
-
-    """
-
-    model: GyroModel
-    found: Diagnosis = field(repr=False)
+    model: GyroModel  # the extended model; the given one where no extension is offered
+    found: Diagnosis = field(repr=False)  # findings, gates, gain and so on, as in diagnosis.json
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -459,13 +417,15 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
     kind : of the reference: rate_command, encoder, motion_capture, course, odometry, gyro or rest;
         None takes what the log shows
 
-    Raises
-    ------
-    ValueError : the logs allow no diagnosis
-
     """
+    _require_choice('kind', kind, REFERENCE_KINDS)
     found = diagnose_logs(logs, model, seed, kind)
     return Diagnosed(found.model, found)
+
+
+def _require_choice(argument: str, value: str | None, choices: Collection[str]) -> None:
+    if value is not None and value not in choices:
+        raise InputError(f'{argument} is {value!r}, but must be of {", ".join(choices)}')
 
 
 def _require_time(log: Log) -> tuple[Array, Array]:

@@ -231,7 +231,7 @@ def called_with_names(path):
 def test_every_topic_that_a_node_can_make_is_in_the_policy():
     """Also one that none of the settings of the test above brings."""
     ruled = {rule.text for rules in POLICY.iter('profile') for kind in rules for rule in kind}
-    for module in ('driver_node', 'compensation_node', 'diagnostics', 'runner'):
+    for module in ('driver_node', 'compensation_node', 'runner'):
         assert called_with_names(PACKAGE / 'ros' / f'{module}.py') <= ruled, module
 
 

@@ -42,8 +42,9 @@ from gyro_calibration.heading.integration import filter_rates, integrate, Thresh
 from gyro_calibration.logs.log import Array, DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.motion import CALIBRATION_MOTION, constant_rate_motion, Motion
+from gyro_calibration.model.motion import CALIBRATION_MOTION, constant_rate_motion
 from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import XV3500
 from gyro_calibration.ros.runner import SENSOR_QOS
 from gyro_calibration_reproduction.hong_park import TABLE_1
 import numpy as np
@@ -56,7 +57,6 @@ from tqdm import tqdm
 PROTOCOL = 'kvh_dsp3000'
 _NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
 SAMPLE_INTERVAL = 0.01  # s between samples
-MAX_ACCELERATION = 3.0  # rad/s², limit of the robot's wheels
 MAX_ATTEMPTS = 3  # to calibrate
 DRIVE_MOTION = constant_rate_motion([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20),
                                      (4, 0), (5, -20), (4, 0), (1, 0)])
@@ -69,88 +69,69 @@ class CallRefused(OSError):
 @dataclass
 class SimulatedRobot:
     """
-    A robot that turns as commanded, within the acceleration limit, with the gyro of a model.
+    A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model.
 
     Where this process is delayed, the samples are late, but the robot has turned meanwhile as
     commanded. Each phase has its own noise, so that the noise of a seed does not depend on the
     beginning of a phase.
 
-    Attributes
-    ----------
-    phase_noise : of each phase (start, each attempt to calibrate, drive), rad/s
-    phase : number of the phase
-    commands : not yet applied, each with the time of its receipt, s, and the rate, rad/s
-    true_headings : of each sample the time by the clock of this machine, s, and the true heading,
-        rad
-
     """
 
     model: GyroModel
-    phase_noise: list[Array]
+    phase_noise: list[Array]  # of each phase (start, each attempt to calibrate, drive), rad/s
     phase: int = 0
+    #: Not yet applied, each with the time of its receipt, s, and the rate, rad/s.
     commands: deque[tuple[float, float]] = field(default_factory=deque)
+    #: Of each sample the time by the clock of this machine, s, and the true heading, rad.
     true_headings: list[tuple[float, float]] = field(default_factory=list)
-
-    def set_rate(self, message: Twist) -> None:
-        """Turn from now on as commanded."""
-        self.commands.append((time.monotonic(), message.angular.z))
 
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
         command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
-        for number, noise in enumerate(self._phase_samples()):
+        noises = (noise for phase, values in enumerate(self.phase_noise) for noise in values
+                  if self.phase <= phase)
+        for number, noise in enumerate(noises):
             due = begin + number * SAMPLE_INTERVAL
             time.sleep(max(0.0, due - time.monotonic()))
             while self.commands and self.commands[0][0] <= due:
                 command = self.commands.popleft()[1]
-            change = np.clip(command - rate, -MAX_ACCELERATION * SAMPLE_INTERVAL,
-                             MAX_ACCELERATION * SAMPLE_INTERVAL)
+            largest = 3.0 * SAMPLE_INTERVAL
+            change = min(max(command - rate, -largest), largest)
             heading += SAMPLE_INTERVAL * (rate + 0.5 * change)
             rate += change
             self.true_headings.append((time.time() - (time.monotonic() - due), heading))
             yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
                          time=number * SAMPLE_INTERVAL)
 
-    def _phase_samples(self) -> Iterator[float]:
-        for phase, values in enumerate(self.phase_noise):
-            for value in values:
-                if self.phase > phase:
-                    break
-                yield value
-
 
 class DemoClient:
-    """
-    Subscribes to the nodes and calls their services, spinning in a thread of its own.
-
-    Attributes
-    ----------
-    raw_rates, headings : of each message the time, s, with the raw rate, rad/s, and with the
-        published heading, rad
-
-    """
+    """Subscribes to the nodes and calls their services, spinning in a thread of its own."""
 
     def __init__(self, robot: SimulatedRobot):
         """Subscribe; the robot receives ``cmd_vel`` from now on."""
-        self.raw_rates: list[tuple[float, float]] = []
-        self.headings: list[tuple[float, float]] = []
+        self.raw_rates: list[tuple[float, float]] = []  # s and rad/s
+        self.headings: list[tuple[float, float]] = []  # s and rad
         self._node = rclpy.create_node('demonstration', namespace=_NAMESPACE)
-        self._node.create_subscription(Imu, 'imu/data_raw', self._add_raw, SENSOR_QOS)
-        self._node.create_subscription(Imu, 'imu/data', self._add_heading, SENSOR_QOS)
-        self._node.create_subscription(Twist, 'cmd_vel', robot.set_rate, 10)
+
+        def add_raw(message: Imu) -> None:
+            self.raw_rates.append((_seconds(message), message.angular_velocity.z))
+
+        def add_heading(message: Imu) -> None:
+            yaw = 2.0 * math.atan2(message.orientation.z, message.orientation.w)
+            self.headings.append((_seconds(message), yaw))
+
+        def add_command(message: Twist) -> None:
+            robot.commands.append((time.monotonic(), message.angular.z))
+
+        self._node.create_subscription(Imu, 'imu/data_raw', add_raw, SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data', add_heading, SENSOR_QOS)
+        self._node.create_subscription(Twist, 'cmd_vel', add_command, 10)
         self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
-
-    def _add_raw(self, message: Imu) -> None:
-        self.raw_rates.append((_seconds(message), message.angular_velocity.z))
-
-    def _add_heading(self, message: Imu) -> None:
-        yaw = 2.0 * math.atan2(message.orientation.z, message.orientation.w)
-        self.headings.append((_seconds(message), yaw))
 
     def _spin(self) -> None:
         while not self._stop.is_set():
@@ -211,9 +192,7 @@ def run_demo(out: Path, seed: int) -> Answer:
     """
     Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
 
-    Raises
-    ------
-    OSError : a node does not answer, or the folder cannot be written to
+    Raise `OSError` where a node does not answer, or the folder cannot be written to.
 
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -224,12 +203,11 @@ def run_demo(out: Path, seed: int) -> Answer:
     # it needs no permissions in a secured one.
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
-    model = read_model(_find_shared_file('config', 'xv3500.yaml'))
-    write_model(model_file, GyroModel(noise=model.noise))  # only the noise of the gyro is known
+    write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
     generator = np.random.default_rng(seed)
-    start, run, drive = (simulate_noise(model.noise, 6000, SAMPLE_INTERVAL, generator)
+    start, run, drive = (simulate_noise(XV3500.noise, 6000, SAMPLE_INTERVAL, generator)
                          for _ in range(3))
-    robot = SimulatedRobot(model, [start, *[run] * MAX_ATTEMPTS, drive])
+    robot = SimulatedRobot(XV3500.model, [start, *[run] * MAX_ATTEMPTS, drive])
     with ExitStack() as stack:
         stack.enter_context(Emulator(find_protocol(PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))
@@ -245,42 +223,34 @@ def run_demo(out: Path, seed: int) -> Answer:
     return _evaluate(out, robot, client, begin, seed)
 
 
-def _find_shared_file(*parts: str) -> Path:
-    """Return a file of the package's share folder, or of its sources where it runs from them."""
-    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
-    roots = [Path(prefix, 'share', 'gyro_calibration') for prefix in prefixes if prefix]
-    for root in (*roots, Path(__file__).parents[1]):
-        if root.joinpath(*parts).exists():
-            return root.joinpath(*parts)
-    raise FileNotFoundError(f'{"/".join(parts)} is not installed; install the package again')
-
-
 def _calibrate_and_drive(client: DemoClient, robot: SimulatedRobot) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
     total = round(CALIBRATION_MOTION.duration + 4.0 + DRIVE_MOTION.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
               disable=None) as bar:
         bar.set_description('starting driver and compensation')
-        _wait_until(client.is_ready, 60.0)
+        deadline = time.monotonic() + 60.0
+        while not client.is_ready():
+            if time.monotonic() > deadline:
+                raise OSError('driver and compensation were not ready within 60 s; stop other '
+                              'programs, and run the demo again')
+            time.sleep(0.02)
         bar.set_description('calibrating on the motion profile')
         calibrate(client, robot, bar)
         client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
         robot.phase = len(robot.phase_noise) - 1
-        begin = time.time()
-        _drive(client, DRIVE_MOTION, bar)
+        begin, started = time.time(), time.monotonic()
+        while (elapsed := time.monotonic() - started) < DRIVE_MOTION.duration:
+            client.command_rate(float(DRIVE_MOTION.rate_at(np.array(elapsed))))
+            _wait(bar, 0.02)
+        client.command_rate(0.0)
+        _wait(bar, 0.5)
     return begin
 
 
 def calibrate(client: DemoClient, robot: SimulatedRobot, bar: tqdm) -> None:
-    """
-    Calibrate; a refused run is repeated, since this robot turns late on a busy machine.
-
-    Raises
-    ------
-    Refused : so is the last attempt
-
-    """
+    """Calibrate; a refused run is repeated, since this robot turns late on a busy machine."""
     for attempt in range(1, MAX_ATTEMPTS + 1):
         robot.phase = attempt
         try:
@@ -294,36 +264,19 @@ def calibrate(client: DemoClient, robot: SimulatedRobot, bar: tqdm) -> None:
             _wait(bar, 2.0)  # until the robot stands
 
 
-def _wait_until(condition: Callable[[], object], timeout: float) -> None:
-    deadline = time.monotonic() + timeout
-    while not condition():
-        if time.monotonic() > deadline:
-            raise OSError(f'driver and compensation were not ready within {timeout:g} s; stop '
-                          'other programs, and run the demo again')
-        time.sleep(0.02)
-
-
 def _wait(bar: tqdm, seconds: float) -> None:
     time.sleep(seconds)
     bar.update(seconds)
 
 
-def _drive(client: DemoClient, motion: Motion, bar: tqdm) -> None:
-    begin = time.monotonic()
-    while (now := time.monotonic() - begin) < motion.duration:
-        client.command_rate(float(motion.rate_at(np.array(now))))
-        _wait(bar, 0.02)
-    client.command_rate(0.0)
-    _wait(bar, 0.5)
-
-
 def _evaluate(out: Path, robot: SimulatedRobot, client: DemoClient, begin: float,
               seed: int) -> Answer:
-    """Compare five headings of the drive with the truth."""
+    """Compare five headings of the drive with the truth, beside the values of Hong and Park."""
     clock, truth = np.array(robot.true_headings).T
     time_, raw = np.array([pair for pair in client.raw_rates if pair[0] >= begin]).T
     stamp, yaw = np.array([pair for pair in client.headings if pair[0] >= begin]).T
     true = np.interp(time_, clock, truth)
+    true -= true[0]
     calibration = read_model(out / 'calibration.yaml').self_calibration
     assert calibration is not None  # calibrate succeeded, so it is stored
     corrected, threshold = calibration.correct(raw), Threshold()
@@ -333,28 +286,23 @@ def _evaluate(out: Path, robot: SimulatedRobot, client: DemoClient, begin: float
         'threshold filter': integrate(time_, filter_rates(threshold, time_, raw)),
         'both': integrate(time_, filter_rates(threshold, time_, corrected)),
         'rests tracked': np.interp(time_, stamp, np.unwrap(yaw) - yaw[0])}
-    draw_headings(out / 'heading.png', time_ - begin, true - true[0], headings)
-    write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0],
-                                   reference_heading=true - true[0]))
-    errors = {name: np.abs(heading - (true - true[0])) / DEGREE
-              for name, heading in headings.items()}
-    table = _table(errors)
+    draw_headings(out / 'heading.png', time_ - begin, true, headings)
+    write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0], reference_heading=true))
+    errors = {name: np.abs(heading - true) / DEGREE for name, heading in headings.items()}
+    means = {name: float(error.mean()) for name, error in errors.items()}
+    lines = ['| heading | mean error | standard deviation | off pure integration '
+             '| Hong and Park, table 1 |', '|---|---|---|---|---|']
+    for name, error in errors.items():
+        theirs = ''
+        if name in TABLE_1:
+            mean, deviation = TABLE_1[name]
+            gain = 100 * (1 - mean / TABLE_1['pure integration'][0])
+            theirs = f'{mean:.3f} deg, {deviation:.3f} deg, {gain:.0f} %'
+        gain = 100 * (1 - means[name] / means['pure integration'])
+        lines.append(f'| {name} | {means[name]:.3f} deg | {error.std():.3f} deg | {gain:.0f} % '
+                     f'| {theirs} |')
+    table = '\n'.join(lines) + '\n'
     write_atomically(out / 'table.md', table.encode())
     text = (f'{table}\nSelf-calibration: {calibration}.\n'
             f'Seed {seed}. Picture, table and log are in {out}.')
-    means = {name: float(error.mean()) for name, error in errors.items()}
     return Answer([text], {'seed': seed, **calibration.to_dict(), 'mean_error_deg': means})
-
-
-def _table(errors: dict[str, Array]) -> str:
-    """Return the table as Markdown, with the values of Hong and Park."""
-    lines = ['| heading | mean error | standard deviation | off pure integration '
-             '| Hong and Park, table 1 |', '|---|---|---|---|---|']
-    pure, published = errors['pure integration'].mean(), TABLE_1['pure integration'][0]
-    for name, error in errors.items():
-        mean, deviation = TABLE_1.get(name, (math.nan, math.nan))
-        theirs = '' if math.isnan(mean) else (
-            f'{mean:.3f} deg, {deviation:.3f} deg, {100 * (1 - mean / published):.0f} %')
-        lines.append(f'| {name} | {error.mean():.3f} deg | {error.std():.3f} deg '
-                     f'| {100 * (1 - error.mean() / pure):.0f} % | {theirs} |')
-    return '\n'.join(lines) + '\n'

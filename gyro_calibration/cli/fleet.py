@@ -155,9 +155,9 @@ def _type_lines(summary: TypeSummary) -> Iterator[str]:
     for each in summary.values.values():
         parts = [f'{label} {each.format_component(name)}'
                  for name, label in COMPONENT_LABELS.items() if name in each.components]
-        yield f'  {each.name}: {each.format(each.mean)}; {", ".join(parts)}'
+        yield f'  {each.name}: {each.format_interval(each.mean)}; {", ".join(parts)}'
         if not each.is_slow:
-            yield '    ' + '; '.join(f'unit {to_printable(name)} {each.format(interval)}'
+            yield '    ' + '; '.join(f'unit {to_printable(name)} {each.format_interval(interval)}'
                                      for name, interval in each.units.items())
     yield from (f'  {text}.' for text in describe_type(summary))
 

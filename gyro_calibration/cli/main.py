@@ -37,8 +37,6 @@ from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.effects import add_effects
 import numpy as np
 
-_EXIT_DONE, _EXIT_NO_ANSWER, _EXIT_WRONG_USE = 0, 1, 2
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb, print its answer, and return 0 (done), 1 (no answer) or 2 (wrong use)."""
@@ -56,20 +54,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 else json.dumps(_replace_non_finite(answer.data), allow_nan=False))
     except DataRefused as error:
         print_message(error)
-        return _EXIT_NO_ANSWER
+        return 1
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
         print_message(f'the values exceed the range of computation ({describe_error(error)}); '
                       'check columns and units')
-        return _EXIT_NO_ANSWER
+        return 1
     except InputError as error:
         print_message(error)
-        return _EXIT_WRONG_USE
+        return 2
     except OSError as error:
         print_message(describe_os_error(error))
-        return _EXIT_WRONG_USE
+        return 2
     if text is not None:
         _print_text(text)
-    return _EXIT_DONE
+    return 0
 
 
 def _load_effects(path: str) -> None:
@@ -77,10 +75,6 @@ def _load_effects(path: str) -> None:
     Run a Python file and add the effects of its list EFFECTS to the catalogue.
 
     Only the command line names such a file; models and logs cannot.
-
-    Raises
-    ------
-    UsageError : if the file cannot be run, or its effects cannot be used
 
     """
     spec = spec_from_file_location('effects_of_the_user', path)

@@ -205,30 +205,22 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
     across, up = np.meshgrid(output, temperature)
     error = (across - model.rate(across.ravel(), up.ravel()).reshape(across.shape)) / DEGREE
     low, high = float(error.min()), float(error.max())
-    levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(
-        low, high if high > low else low + 1e-6)
+    levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(low, max(high, low + 1e-6))
     largest = float(np.abs(levels).max())
     axes.grid(False)
     axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING_COLORMAP, alpha=0.8,
                   vmin=-largest, vmax=largest, extend='both')
     lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
+    # each line has its label away from its ends and from the labels of its neighbours
+    places = [tuple(line[round((0.35, 0.5, 0.65)[number % 3] * (len(line) - 1))].tolist())
+              for number, level in enumerate(lines.allsegs) for line in level if len(line) > 10]
+    for text in axes.clabel(lines, fontsize=9, manual=places):
+        text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
+    title = 'Error of the gyro by the model [deg/s]'
     if dwells is not None and dwells.temperature is not None:
         axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
-    for text in axes.clabel(lines, fontsize=9, manual=_label_places(lines.allsegs)):
-        text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
-    axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]',
-             title='Error of the gyro by the model [deg/s]; dots: dwells' if dwells is not None
-             else 'Error of the gyro by the model [deg/s]')
-
-
-def _label_places(levels: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
-    """Return a place on each contour line, away from its ends and from those of its neighbours."""
-    places = []
-    for number, lines in enumerate(levels):
-        part = (0.35, 0.5, 0.65)[number % 3]
-        places += [tuple(line[round(part * (len(line) - 1))].tolist())
-                   for line in lines if len(line) > 10]
-    return places
+        title += '; dots: dwells'
+    axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]', title=title)
 
 
 def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:

@@ -64,14 +64,15 @@ def show_progress(activity: str) -> Iterator[Callable[[float | None, str], None]
     finished = Event()
 
     def show() -> None:
-        wait = PROGRESS_DELAY
-        while not finished.wait(wait):
+        if finished.wait(PROGRESS_DELAY):
+            return
+        while True:
             text = f'{status_text[0]}  {time.monotonic() - begin:.0f} s'
             width = shutil.get_terminal_size().columns - 1
             print(f'\r\033[K{text[:width]}', end='', file=sys.stderr, flush=True)
-            wait = 0.5
-        if wait != PROGRESS_DELAY:
-            print('\r\033[K', end='', file=sys.stderr, flush=True)
+            if finished.wait(0.5):
+                print('\r\033[K', end='', file=sys.stderr, flush=True)
+                return
 
     thread = Thread(target=show, daemon=True)
     thread.start()
@@ -181,37 +182,31 @@ def parse_columns(text: str) -> dict[str, str]:
 
 
 def positive_number(text: str) -> float:
-    value = float(text)
-    if not 1.0 / MAX_MAGNITUDE <= value <= MAX_MAGNITUDE:
-        raise argparse.ArgumentTypeError(f'{text} is out of range; give a number from '
-                                         f'{1.0 / MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}')
-    return value
-
-
-def degrees_celsius(text: str) -> float:
-    value = float(text)
-    if not -273.15 <= value <= 1e4:
-        raise argparse.ArgumentTypeError(f'{text} degC is out of range; give a temperature from '
-                                         '-273.15 to 10000 degC')
-    return value
+    return _bounded(float(text), 1.0 / MAX_MAGNITUDE, MAX_MAGNITUDE)
 
 
 def non_negative_number(text: str) -> float:
     return 0.0 if float(text) == 0.0 else positive_number(text)
 
 
+def degrees_celsius(text: str) -> float:
+    return _bounded(float(text), -273.15, 1e4, ' degC')
+
+
 def positive_integer(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is below 1; give an integer of 1 or more')
-    return value
+    return int(_bounded(int(text), 1))
 
 
 def non_negative_integer(text: str) -> int:
     """Return a seed, as a numpy Generator takes it."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'{text} is below 0; give an integer of 0 or more')
+    return int(_bounded(int(text), 0))
+
+
+def _bounded(value: float, low: float, high: float = math.inf, unit: str = '') -> float:
+    if not low <= value <= high:
+        wanted = f'from {low:g} to {high:g}' if high < math.inf else f'of {low:g} or more'
+        raise argparse.ArgumentTypeError(f'{value:g}{unit} is out of range; give a number '
+                                         f'{wanted}{unit}')
     return value
 
 

@@ -44,7 +44,7 @@ outliers (generalized extreme studentized deviate, Rosner 1983).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
@@ -70,26 +70,15 @@ _SAMPLE_POINTS = 512
 
 @dataclass(frozen=True)
 class Observations:
-    """
-    One value over the logs of a type.
-
-    Attributes
-    ----------
-    value, deviation : in one unit, shape (n,)
-    unit : number of the unit of each log, from 0 on, shape (n,)
-    drive : number of the drive, from 0 on, or -1 where a log stands alone, shape (n,)
-    columns : fixed effects in addition to the mean, such as age, shape (n, k)
-    slope_count : the number of the first columns whose effect may differ from unit to unit, at
-        most 2
-
-    """
+    """One value over the logs of a type; arrays have the shape (n,)."""
 
     value: Array
-    deviation: Array
-    unit: IntegerArray
-    drive: IntegerArray
+    deviation: Array  # standard deviation that the log states, in the unit of the value
+    unit: IntegerArray  # number of the unit of each log, from 0 on
+    drive: IntegerArray  # number of the drive, from 0 on, or -1 where a log stands alone
+    #: Fixed effects in addition to the mean, such as age, shape (n, k).
     columns: Array = field(default_factory=lambda: np.empty((0, 0)))
-    slope_count: int = 0
+    slope_count: int = 0  # of the first columns whose effect may differ from unit to unit, up to 2
 
     @property
     def fixed_effects(self) -> Array:
@@ -113,12 +102,7 @@ class Interval:
 
 
 def _sum_matrix(place: IntegerArray, terms: Array, size: int) -> Any:
-    """
-    Return the matrix that sums weights of logs times terms into places, for ``matrix @ weight``.
-
-    Places and terms have the shape (logs, ...).
-
-    """
+    """Return the matrix that sums weights of logs times terms, shape (logs, ...), into places."""
     count = terms[0].size
     logs = np.repeat(np.arange(len(terms)), count)
     return csr_array((terms.ravel(), (place.ravel(), logs)), shape=(size, len(terms)))
@@ -384,34 +368,28 @@ class PooledValue:
                  fixed: Array | None = None, part: int = 0, error: Array | float = 0.0,
                  **more: float) -> tuple[Array, Array]:
         """Return means and variances at each point, shape (points, k), in units of the values."""
-        request = self._request(unit, drive, fixed, part)
+        none = np.full(next((len(each) for each in (unit, drive, fixed) if each is not None), 1),
+                       -1)
+        if fixed is None:
+            fixed = np.zeros((len(none), len(self._column_scales)))
+            fixed[:, 0] = 1.0
+        weights = np.eye(self._equations.parts)[part] / self._column_scales[part]
         parts = self._equations.split_points(len(self._sample_points))
         found = []
         for points in parts:
             variances = self._variances_at(self._sample_points[points])
             solved = self._cached_solution or _Solution(self._equations, variances)
             self._cached_solution = solved if len(parts) == 1 else None
-            mean, variance = solved.moments(*request)
+            mean, variance = solved.moments(
+                fixed / self._column_scales, none if unit is None else unit,
+                none if drive is None else drive, weights)
             for name, count in more.items():
                 variance = variance + count * variances.get(name, np.zeros(1))[:, None]
             own_share = variances.get(OWN_SHARE, np.ones(1))[:, None]
             found.append((mean, variance + own_share * (error / self._value_scale) ** 2))
         mean, variance = (np.concatenate(each) for each in zip(*found))
-        constant = self._median * request[0][:, 0] * self._column_scales[0]
-        return (constant + self._value_scale * mean,
+        return (self._median * fixed[:, 0] + self._value_scale * mean,
                 self._value_scale ** 2 * np.maximum(variance, 1e-30))
-
-    def _request(self, unit: IntegerArray | None = None, drive: IntegerArray | None = None,
-                 fixed: Array | None = None,
-                 part: int = 0) -> tuple[Array, IntegerArray, IntegerArray, Array]:
-        """Return linear functions of the scaled values, as `_Solution.moments` takes them."""
-        none = np.full(next((len(each) for each in (unit, drive, fixed) if each is not None), 1),
-                       -1)
-        mean = np.zeros((len(none), len(self._column_scales)))
-        mean[:, 0] = 1.0
-        weights = np.eye(self._equations.parts)[part] / self._column_scales[part]
-        return ((mean if fixed is None else fixed) / self._column_scales,
-                none if unit is None else unit, none if drive is None else drive, weights)
 
     def estimate(self, **wanted: Any) -> Interval:
         """Return estimates with intervals that hold with 95 %."""
@@ -428,31 +406,28 @@ class PooledValue:
         below = self._sample_weights @ ndtr(-mean / np.sqrt(variance))
         return np.minimum(2.0 * np.minimum(below, 1.0 - below), 1.0)
 
-    def test_last_column(self) -> tuple[float, float]:
-        """Return the last fixed effect and its p-value."""
-        row = np.eye(len(self._column_scales))[-1:]
-        return float(self.estimate(fixed=row).value[0]), float(self.p_value(fixed=row)[0])
+    def add_strongest(self, columns: Sequence[Array]) -> tuple[int, PooledValue, float, float]:
+        """
+        Add the most significant one of several fixed effects.
 
-    def score_column(self, column: Array) -> float:
-        """Return the approximate z-score of one more fixed effect."""
-        fixed = np.column_stack([self._fixed, column])
-        equations = _Equations(self._scaled, fixed, DRIVES in self.variance_names)
-        solved = _Solution(equations, self._variances_at(self._best_point[None]))
-        none = np.array([-1])
-        mean, variance = solved.moments(np.eye(fixed.shape[1])[-1:], none, none,
-                                        np.zeros(equations.parts))
-        return float(mean[0, 0] / math.sqrt(variance[0, 0]))
+        Returns
+        -------
+        its place, the value pooled with it, its size, and the p-value of the largest of so many
 
-    def standardized_effects(self, kind: str) -> Array:
-        """Return the approximate z-score of each unit or drive against the others."""
-        number = self.observed.unit if kind == UNITS else self.observed.drive
-        variances = self._variances_at(self._best_point[None])
-        size = np.maximum(variances.get(kind, np.zeros(1)), 1e-4)
-        groups = np.arange(number.max() + 1)
-        rows = np.zeros((len(groups), len(self._column_scales)))
-        request = self._request(**{'unit' if kind == UNITS else 'drive': groups}, fixed=rows)
-        mean, variance = _Solution(self._equations, {**variances, kind: size}).moments(*request)
-        return np.asarray(mean[0] / np.sqrt(np.maximum(size - variance[0], 1e-12 * size)))
+        """
+        scores, none = [], np.array([-1])
+        for column in columns:
+            fixed = np.column_stack([self._fixed, column])
+            equations = _Equations(self._scaled, fixed, DRIVES in self.variance_names)
+            solved = _Solution(equations, self._variances_at(self._best_point[None]))
+            mean, variance = solved.moments(np.eye(fixed.shape[1])[-1:], none, none,
+                                            np.zeros(equations.parts))
+            scores.append(abs(mean[0, 0]) / math.sqrt(variance[0, 0]))
+        place = int(np.argmax(scores))
+        extended = PooledValue(self.observed.add_column(columns[place].astype(float)))
+        row = np.eye(len(extended._column_scales))[-1:]
+        return (place, extended, float(extended.estimate(fixed=row).value[0]),
+                min(float(extended.p_value(fixed=row)[0]) * len(columns), 1.0))
 
 
 def _identifiable_variances(observed: Observations) -> list[str]:
@@ -542,32 +517,20 @@ class Outlier:
 
 def find_outliers(pooled: PooledValue, kind: str, significance: float) -> list[Outlier]:
     """
-    Return the outlying units or drives.
+    Return the outlying units or drives; `kind` is `UNITS` or `DRIVES`.
 
-    Parameters
-    ----------
-    pooled : one value over the logs of a type
-    kind : `UNITS` or `DRIVES`
-    significance : probability of an outlier where there is none
+    The significance is the probability of an outlier where there is none.
 
     """
-    extended = pooled.observed
-    number = extended.unit if kind == UNITS else extended.drive
-    groups = np.unique(number[number >= 0])
-    if len(groups) < 4 or len(number) < 5:
+    number = pooled.observed.unit if kind == UNITS else pooled.observed.drive
+    groups = np.unique(number[number >= 0]).tolist()
+    if len(groups) < 4 or len(number) < 5 or kind not in pooled.variance_names:
         return []
     found: list[Outlier] = []
     # Rosner's levels hold from 15 on
     for _ in range(min(len(groups) // 5, 10) if len(groups) >= 15 else 1):
-        if kind not in pooled.variance_names:
-            break
-        effect_sizes = np.abs(pooled.standardized_effects(kind))[groups]
-        effect_sizes[np.isin(groups, [each.group for each in found])] = 0.0
-        farthest = int(groups[np.argmax(effect_sizes)])
-        extended = extended.add_column((number == farthest).astype(float))
-        pooled = PooledValue(extended)
-        excess, chance = pooled.test_last_column()
-        found.append(Outlier(farthest, excess, min(chance * (len(groups) - len(found)), 1.0)))
+        place, pooled, excess, p_value = pooled.add_strongest([number == each for each in groups])
+        found.append(Outlier(groups.pop(place), excess, p_value))
     last = max((place for place, each in enumerate(found, 1) if each.p_value < significance),
                default=0)
     return found[:last]
@@ -587,11 +550,8 @@ def find_changes(pooled: PooledValue, date: IntegerArray, significance: float) -
     """
     Return the most significant change of a unit between dates, beyond the scatter of power-ons.
 
-    Parameters
-    ----------
-    pooled : one value over the logs of a type
-    date : number of the date of each log, in their order, or -1, shape (n,)
-    significance : probability of a change where there is none
+    `date` is the number of the date of each log, or -1, shape (n,); the significance is the
+    probability of a change where there is none.
 
     """
     unit = pooled.observed.unit
@@ -599,8 +559,6 @@ def find_changes(pooled: PooledValue, date: IntegerArray, significance: float) -
                   for since in np.unique(date[(unit == one) & (date >= 0)])[1:]]
     if not candidates or POWER_ONS not in pooled.variance_names:
         return []
-    columns = [((unit == one) & (date >= since)).astype(float) for one, since in candidates]
-    place = int(np.argmax([abs(pooled.score_column(column)) for column in columns]))
-    size, chance = PooledValue(pooled.observed.add_column(columns[place])).test_last_column()
-    chance = min(chance * len(candidates), 1.0)
-    return [Change(*candidates[place], size, chance)] if chance < significance else []
+    place, _, size, p_value = pooled.add_strongest(
+        [(unit == one) & (date >= since) for one, since in candidates])
+    return [Change(*candidates[place], size, p_value)] if p_value < significance else []

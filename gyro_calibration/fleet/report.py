@@ -79,15 +79,7 @@ input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-w
 
 
 def render_report(types: Sequence[TypeSummary], records: Sequence[Mapping[str, Any]]) -> str:
-    """
-    Return the page, HTML in UTF-8.
-
-    Parameters
-    ----------
-    types : as `summary.summarize_types` returns them
-    records : of all logs, including excluded ones
-
-    """
+    """Return the page, HTML in UTF-8; the records are of all logs, including excluded ones."""
     used = sum(len(found.records) for found in types)
     title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
              f'{len(types)} {"type" if len(types) == 1 else "types"}')
@@ -130,7 +122,8 @@ def _variance_table(summary: TypeSummary) -> Markup:
              *(['drift'] if drifts else [])]
     rows = []
     for each in summary.values.values():
-        drift = '; '.join(each.format(slope, per[name]) for name, slope in each.slopes.items())
+        drift = '; '.join(each.format_interval(slope, per[name])
+                          for name, slope in each.slopes.items())
         rows.append([
             _cell(readable_name(each.name)), _interval_cell(each, each.mean),
             _interval_cell(each, each.new_unit),
@@ -191,7 +184,7 @@ def _cell(text: str, key: float | None = None) -> Markup:
 
 def _interval_cell(value: ValueSummary, interval: Interval | None) -> Markup:
     return (_cell('') if interval is None
-            else _cell(value.format(interval), interval.value))
+            else _cell(value.format_interval(interval), interval.value))
 
 
 def _interval_chart(value: ValueSummary, key: str, kind: str, intervals: Mapping[str, Interval],
@@ -229,11 +222,6 @@ def table_files(types: Sequence[TypeSummary],
     Return the content of files by name: values of logs, and of units, one row each, in SI.
 
     They are CSV, and Parquet where pyarrow is installed.
-
-    Parameters
-    ----------
-    types : as `summary.summarize_types` returns them
-    records : of all logs
 
     """
     found = {}

@@ -40,8 +40,6 @@ from typing import Any, TypeVar
 Task = TypeVar('Task')
 Found = TypeVar('Found')
 _WorkFunction = Callable[[Task], Found]
-#: Tasks submitted for each worker.
-_TASKS_PER_WORKER = 2
 
 
 class WorkerLost(Exception):
@@ -54,11 +52,8 @@ def process_executors(workers: int, memory: float | None = None,
     """
     Give a function that makes executors of processes on this machine; shut all down at the end.
 
-    Parameters
-    ----------
-    workers : largest number in an executor
-    memory : bytes that a worker may allocate; None without a limit
-    preload : modules that are imported once, and not by each new worker
+    `workers` is the largest number in an executor, `memory` the number of bytes that each may
+    allocate; modules of `preload` are imported once, and not by each new worker.
 
     """
     context = get_context('forkserver')
@@ -111,28 +106,22 @@ def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
 def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: int,
               create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | WorkerLost]]:
     """
-    Yield each task with its result when it is finished.
+    Yield each task with its result when it is finished, or with `WorkerLost`.
 
-    The result is `WorkerLost` where the worker of a task was killed.
-
-    Parameters
-    ----------
-    work : a function of a module, which raises nothing
-    tasks : may be endless
-    workers : that work at a time
-    create : makes an executor of so many workers, of `process_executors` or `cluster_executors`
+    `work` is a function of a module, which raises nothing; `tasks` may be endless; `create` makes
+    an executor of so many workers, of `process_executors` or `cluster_executors`.
 
     """
     remaining = iter(tasks)
     executor = create(workers)
     pending: dict[Future[Any], Any] = {}
     while True:
-        while len(pending) < _TASKS_PER_WORKER * workers and (new := list(islice(remaining, 1))):
+        for task in islice(remaining, 2 * workers - len(pending)):
             try:
-                pending[executor.submit(work, new[0])] = new[0]
+                pending[executor.submit(work, task)] = task
             except BrokenExecutor:
                 executor = create(workers)
-                pending[executor.submit(work, new[0])] = new[0]
+                pending[executor.submit(work, task)] = task
         if not pending:
             return
         ready, suspects = wait(pending, return_when=FIRST_COMPLETED)[0], []
@@ -148,22 +137,15 @@ def run_tasks(work: _WorkFunction[Task, Found], tasks: Iterable[Task], workers: 
                 yield task, WorkerLost(_describe_failure(error))
         if suspects:
             executor.shutdown(wait=True, cancel_futures=True)
-            yield from _run_one_by_one(work, suspects, create)
-            executor = create(workers)
-
-
-def _run_one_by_one(
-        work: _WorkFunction[Task, Found], tasks: Iterable[Task],
-        create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | WorkerLost]]:
-    executor = create(1)
-    for task in tasks:
-        try:
-            yield task, executor.submit(work, task).result()
-        except BrokenExecutor as error:
-            yield task, WorkerLost(_describe_failure(error))
-            executor.shutdown(wait=True, cancel_futures=True)
+        for task in suspects:  # one by one, each with an executor of its own
             executor = create(1)
-    executor.shutdown(wait=True)
+            try:
+                yield task, executor.submit(work, task).result()
+            except BrokenExecutor as error:
+                yield task, WorkerLost(_describe_failure(error))
+            executor.shutdown(wait=True, cancel_futures=True)
+        if suspects:
+            executor = create(workers)
 
 
 def _describe_failure(error: Exception) -> str:

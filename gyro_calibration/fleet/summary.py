@@ -72,48 +72,29 @@ class Alarm:
 
 @dataclass(frozen=True)
 class ValueSummary:
-    """
-    One value of a type; mappings over units and drives hold those with a log that has the value.
-
-    Attributes
-    ----------
-    name, unit : of the value, in SI
-    is_slow : whether it is an effect that one log does not distinguish from the wander of the bias
-    records : of the logs that hold it
-    components : standard deviations by name
-    mean : of the type
-    p_value : of the mean against zero
-    new_unit : prediction for one more unit of the type
-    units : of each, as the mean over power-ons
-    type_deviation : difference of each unit from the mean of the type
-    next_power_on : prediction for a further power-on of each unit, without an error of the
-        reference
-    drives : error common to the logs of each drive, apart from type and unit
-    slopes : name -> drift of the type, over age in years or over temperature in K
-    unit_slopes : the same of each unit, where the logs determine the difference between units
-    outlying_units, outlying_drives, changes : outliers and changes
-
-    """
+    """One value of a type; mappings over units and drives hold those with a log that has it."""
 
     name: str
-    unit: str
-    is_slow: bool
-    records: Sequence[Record]
-    components: Mapping[str, Component]
-    mean: Interval
-    p_value: float
-    new_unit: Interval
-    units: Mapping[str, Interval]
-    type_deviation: Mapping[str, Interval]
+    unit: str  # of the value, in SI
+    is_slow: bool  # an effect that one log does not distinguish from the wander of the bias
+    records: Sequence[Record]  # of the logs that hold it
+    components: Mapping[str, Component]  # standard deviations
+    mean: Interval  # of the type
+    p_value: float  # of the mean against zero
+    new_unit: Interval  # prediction for one more unit of the type
+    units: Mapping[str, Interval]  # of each, as the mean over power-ons
+    type_deviation: Mapping[str, Interval]  # difference of each unit from the mean of the type
+    #: Prediction for a further power-on of each unit, without an error of the reference.
     next_power_on: Mapping[str, Interval]
-    drives: Mapping[str, Interval]
-    slopes: Mapping[str, Interval]
+    drives: Mapping[str, Interval]  # error common to the logs of a drive, apart from type and unit
+    slopes: Mapping[str, Interval]  # drift of the type over age, years, or temperature, K
+    #: The same of each unit, where the logs determine the difference between units.
     unit_slopes: Mapping[str, Mapping[str, Interval]]
     outlying_units: Sequence[Alarm]
     outlying_drives: Sequence[Alarm]
     changes: Sequence[Alarm]
 
-    def format(self, interval: Interval, per: str = '') -> str:
+    def format_interval(self, interval: Interval, per: str = '') -> str:
         """Return an estimate of the value with its interval, or of its slope per unit of time."""
         return str(format_quantity(Estimate(interval.value, (interval.low, interval.high),
                                             self.unit + per), self.name))
@@ -130,37 +111,19 @@ class ValueSummary:
 
 @dataclass(frozen=True)
 class TypeSummary:
-    """
-    The results of one type.
+    """The results of one type."""
 
-    Attributes
-    ----------
-    name : of the type, or ''
-    units, drives, dates : their names, in natural order
-    records : of the logs
-    values : by name
-    significance : probability of a false alarm of each kind and value
-
-    """
-
-    name: str
-    units: Sequence[str]
+    name: str  # or ''
+    units: Sequence[str]  # names in natural order
     drives: Sequence[str]
     dates: Sequence[str]
-    records: Sequence[Record]
+    records: Sequence[Record]  # of the logs
     values: Mapping[str, ValueSummary]
-    significance: float
+    significance: float  # probability of a false alarm of each kind and value
 
 
 def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
-    """
-    Return the results of each type, by the records of logs that are not excluded.
-
-    Parameters
-    ----------
-    records : as `work.process_log` returns them
-
-    """
+    """Return the results of each type by records of `work.process_log` that are not excluded."""
     types = sorted({str(each['type']) for each in records})
     logs = {kind: [each for each in records if each['type'] == kind] for kind in types}
     values = {}  # the names in more than one log, and whether each is a slow effect
@@ -179,9 +142,9 @@ def summarize_types(records: Sequence[Record]) -> list[TypeSummary]:
                 found[value] = _summarize_value(value, slow, logs[kind], FALSE_ALARM_RATE / tests)
             except (DataRefused, np.linalg.LinAlgError):  # too few logs hold it
                 continue
-        summaries.append(TypeSummary(
-            kind, *(_names(logs[kind], key) for key in ('unit', 'drive', 'date')), logs[kind],
-            found, FALSE_ALARM_RATE / tests))
+        units, drives, dates = (_names(logs[kind], key) for key in ('unit', 'drive', 'date'))
+        summaries.append(TypeSummary(kind, units, drives, dates, logs[kind], found,
+                                     FALSE_ALARM_RATE / tests))
     return summaries
 
 
@@ -224,9 +187,10 @@ def _summarize_value(name: str, slow: bool, records: Sequence[Record],
         {over: of_units(row, part=part)
          for part, (over, row) in enumerate(zip(columns, slopes), 1)
          if SLOPES[part - 1] in pooled.variance_names},
-        *([Alarm(names[each.group], each.excess, each.p_value)
-           for each in find_outliers(pooled, kind, significance)]
-          for kind, names in ((UNITS, units), (DRIVES, drives))),
+        [Alarm(units[each.group], each.excess, each.p_value)
+         for each in find_outliers(pooled, UNITS, significance)],
+        [Alarm(drives[each.group], each.excess, each.p_value)
+         for each in find_outliers(pooled, DRIVES, significance)],
         [Alarm(units[each.unit], each.size, each.p_value, dates[each.first_date])
          for each in find_changes(pooled, day, significance)])
 
@@ -242,7 +206,8 @@ def _covariates(records: Sequence[Record], unit: IntegerArray) -> dict[str, Arra
     temperatures = [float(each['temperature'])
                     for each in records if each['temperature'] is not None]
     columns = {}
-    for name, column in (('age', np.array(days) / 365.25), ('temperature', np.array(temperatures))):
+    for name, column in (('age', np.array(days) / 365.25),
+                         ('temperature', np.array(temperatures))):
         if len(column) == len(records):
             within = column - (np.bincount(unit, column) / np.bincount(unit))[unit]
             if np.std(within) > 1e-9 * (1.0 + np.abs(column).max()):
@@ -261,7 +226,7 @@ def describe_type(summary: TypeSummary) -> Iterator[str]:
         names = join_list([readable_name(each.name) for each in others], 'or')
         alternatives = f'; not distinguishable from {names}' if others else ''
         yield (f'{readable_name(first.name)}: it repeats in all units, so the model of the type '
-               f'lacks it: {first.format(first.mean)}{alternatives}')
+               f'lacks it: {first.format_interval(first.mean)}{alternatives}')
     elif slow:
         yield (f'{join_list([readable_name(each.name) for each in slow])}: none repeats; in '
                'single logs they are the random walk of the bias')

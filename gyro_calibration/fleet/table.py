@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from datetime import date
 from glob import glob
 import gzip
+from itertools import takewhile
 import math
 import os
 from pathlib import Path
@@ -33,8 +34,8 @@ from gyro_calibration.model.settings_file import read_settings
 ENTRY_KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 LOG_SUFFIXES = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
-#: Largest numbers of bytes that are read of a table, and of the notes of a log.
-_MAX_TABLE_BYTES, _MAX_NOTE_BYTES = 50_000_000, 4096
+#: Largest number of bytes that are read of the notes of a log.
+_MAX_NOTE_BYTES = 4096
 #: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
 _KEYED_NOTE = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)',
                          re.IGNORECASE)
@@ -49,27 +50,16 @@ _FILE_NAME_PATTERNS = {
 
 @dataclass(frozen=True)
 class FleetLog:
-    """
-    A log of a fleet.
+    """A log of a fleet; '' where a text is not known."""
 
-    Attributes
-    ----------
-    log : its path
-    unit : which gyro; '' where it is not known
-    type : of the gyro; logs of one type are pooled
-    drive : name common to units that were moved together with one reference; '' for a log that is
-        a drive of its own
-    date : ISO 8601, or ''
-    temperature : degC; None where it is not known
-
-    """
-
-    log: str
-    unit: str = ''
-    type: str = ''  # noqa: A003
+    log: str  # its path
+    unit: str = ''  # which gyro
+    type: str = ''  # noqa: A003  of the gyro; logs of one type are pooled
+    #: Name common to units that were moved together with one reference; '' for a log that is a
+    #: drive of its own.
     drive: str = ''
-    date: str = ''
-    temperature: float | None = None
+    date: str = ''  # ISO 8601
+    temperature: float | None = None  # degC
 
     def fill_missing(self, stated: Mapping[str, str]) -> FleetLog:
         """Return the entry with its empty fields filled."""
@@ -77,7 +67,13 @@ class FleetLog:
                                for name, text in stated.items() if name in ENTRY_KEYS
                                and text.strip() and getattr(self, name) in ('', None)}
         if 'temperature' in new:
-            new['temperature'] = _parse_temperature(self.log, new['temperature'])
+            text = new['temperature']
+            try:
+                value = new['temperature'] = float(re.sub(r'\s*(deg)?[°cC]*$', '', text))
+            except ValueError:
+                value = math.nan
+            if not -273.15 <= value <= 1e4:
+                raise InputError(f'{self.log}: its temperature is given as {text!r}; wanted degC')
         if 'date' in new:
             try:
                 new['date'] = date.fromisoformat(new['date'][:10]).isoformat()
@@ -102,12 +98,7 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
     Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
 
     A log that is named several times is one entry. A table inside a folder is used as well; the
-    results of an earlier fleet are not.
-
-    Parameters
-    ----------
-    paths : as a user gives them
-    excluded_folder : a folder that is not searched, such as that of the results
+    results of an earlier fleet, and of this one in `excluded_folder`, are not.
 
     Raises
     ------
@@ -136,9 +127,9 @@ def _expand_path(path: str, visited: set[str]) -> Iterator[FleetLog]:
         for each in sorted(glob(path, recursive=True)):
             yield from _expand_path(each, visited)
     elif path.endswith('.txt'):
-        lines = (line.strip() for line in _read_text(path).splitlines())
-        yield from (FleetLog(_resolve_log_path(path, line)) for line in lines
-                    if line and line[0] != '#')
+        yield from (FleetLog(_resolve_log_path(path, line.strip()))
+                    for line in _read_text(path).splitlines()
+                    if line.strip() and not line.strip().startswith('#'))
     elif path.endswith('.csv') and os.path.exists(path) and (columns := _read_header(path)):
         yield from _read_rows(path, columns)
     else:
@@ -161,9 +152,7 @@ def _search_folder(folder: Path, visited: set[str]) -> Iterator[FleetLog]:
 
 def _read_text(path: str) -> str:
     try:
-        return read_bytes(path, _MAX_TABLE_BYTES).decode('utf-8-sig')
-    except OSError:
-        raise
+        return read_bytes(path, 50_000_000).decode('utf-8-sig')
     except ValueError as error:
         raise InputError(f'{path}: {to_printable(error)}; give a text file in UTF-8') from error
 
@@ -234,82 +223,47 @@ def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -
     """
     Return an entry with its empty fields filled from file name, notes or metadata.
 
-    The order of precedence is: table, pattern of the user, notes and metadata, usual file names.
-
-    Parameters
-    ----------
-    entry : with a log that exists
-    file_pattern : pattern of the file names, by `compile_file_pattern`
+    The order of precedence is: table, pattern of the user (by `compile_file_pattern`), notes and
+    metadata, usual file names.
 
     """
     stem = re.sub(f'({"|".join(map(re.escape, sorted(LOG_SUFFIXES, key=len, reverse=True)))})$',
                   '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):
         entry = entry.fill_missing(found.groupdict())
-    return entry.fill_missing(_read_notes(entry.log)).fill_missing(_parse_file_name(stem))
-
-
-def _parse_file_name(stem: str) -> dict[str, str]:
-    """Return the fields in a file name; the rest apart from unit and date is the drive."""
     stated, rest = {}, stem
     for name, shape in _FILE_NAME_PATTERNS.items():
         if found := shape.search(rest):
             stated[name] = found[1]
             rest = rest.replace(found[0], '')
-    if 'unit' in stated and rest.strip('_.-'):
+    if 'unit' in stated and rest.strip('_.-'):  # the rest of the name is the drive
         stated.setdefault('drive', rest.strip('_.-'))
-    return stated
+    return entry.fill_missing(_read_notes(entry.log)).fill_missing(stated)
 
 
 def _read_notes(path: str) -> dict[str, str]:
     """Return the fields in the notes of a log, or in the metadata of a recording."""
+    stated: dict[str, str] = {}
+    recordings = [Path(path)] if path.endswith('.mcap') else []
     if os.path.isdir(path):
-        return {**_read_custom_data(Path(path)),
-                **_read_recording_metadata(sorted(Path(path).glob('*.mcap')))}
-    if path.endswith('.mcap'):
-        return _read_recording_metadata([Path(path)])
-    if not path.lower().endswith(('.csv', '.csv.gz')):
-        return {}
+        recordings = sorted(Path(path).glob('*.mcap'))
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            content = read_settings(Path(path) / 'metadata.yaml')
+            custom = content['rosbag2_bagfile_information']['custom_data'] or {}
+            stated.update({str(name).lower(): str(value) for name, value in custom.items()})
+    for each in recordings:
+        with suppress(OSError):  # reported where the log is read
+            stated.update({name.lower(): value for name, value in read_metadata(each).items()})
+    if os.path.isdir(path) or not path.lower().endswith(('.csv', '.csv.gz')):
+        return stated
     with open_regular_file(path) as file:
         try:
             data = (gzip.GzipFile(fileobj=file).read(_MAX_NOTE_BYTES) if path.endswith('.gz')
                     else file.read(_MAX_NOTE_BYTES))
         except (OSError, EOFError):  # read again, and reported, where the log is read
             return {}
-    lines = []
-    for line in data.decode(errors='replace').splitlines():
-        if not line.startswith('#'):
-            break
-        lines.append(line)
-    text = '\n'.join(lines)  # such as "unit: 7" or "unit 7, drive h"
-    found = {name.lower(): value for name, value in reversed(_WORDED_NOTE.findall(text))}
-    return {**found,
-            **{name.lower(): value for name, value in reversed(_KEYED_NOTE.findall(text))}}
-
-
-def _read_custom_data(folder: Path) -> dict[str, str]:
-    """Return the custom data in metadata.yaml of a rosbag2 folder."""
-    try:
-        content = read_settings(folder / 'metadata.yaml')
-        stated = content['rosbag2_bagfile_information']['custom_data'] or {}
-        return {str(name).lower(): str(value) for name, value in stated.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}
-
-
-def _read_recording_metadata(paths: Sequence[Path]) -> dict[str, str]:
-    stated: dict[str, str] = {}
-    for path in paths:
-        with suppress(OSError):  # reported where the log is read
-            stated |= {name.lower(): value for name, value in read_metadata(path).items()}
-    return stated
-
-
-def _parse_temperature(log: str, text: str) -> float:
-    try:
-        value = float(re.sub(r'\s*(deg)?[°cC]*$', '', text))
-    except ValueError:
-        value = math.nan
-    if not -273.15 <= value <= 1e4:
-        raise InputError(f'{log}: its temperature is given as {text!r}; wanted degC')
-    return value
+    lines = takewhile(lambda line: line.startswith('#'),
+                      data.decode(errors='replace').splitlines())
+    text = '\n'.join(lines)
+    return {name.lower(): value for notes in (_WORDED_NOTE, _KEYED_NOTE)
+            for name, value in reversed(notes.findall(text))}

@@ -20,7 +20,7 @@ not.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass
 import hashlib
 import json
@@ -34,7 +34,6 @@ from gyro_calibration import __version__
 from gyro_calibration.calibration.dwells import extract_dwells
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.noise_grid import (
-    BandedNoise,
     bias_wander_columns,
     fit_noise_grid,
     heading_noise,
@@ -69,10 +68,51 @@ from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
-#: Number of spans in a log, and the shortest one, s.
-_SPAN_COUNT, _MIN_SPAN_DURATION = 60, 2.0
 #: Shortest log for slow effects and for the bias at rest, s.
 _MIN_LOG_DURATION = 60.0
+#: Status of a log that was calibrated, and of one that is excluded.
+DONE, NO_EVIDENCE = 'done', 'no evidence'
+#: Schema of the records; records of another one are not read.
+SCHEMA = 'gyro_calibration/fleet_log/2'
+
+
+class _SpanFit:
+    """Increments of the heading over spans of a log; `edges` of the spans are in s."""
+
+    def __init__(self, log: Log, time_offset: float, heading: tuple[Array, Array] | None):
+        """Take time and heading, s and rad, of a reference; None at rest."""
+        assert log.time is not None and log.output is not None
+        known = np.isfinite(log.output)
+        time = log.time[known] - time_offset
+        # 60 spans of at least 2 s
+        self.edges = np.arange(time[0], time[-1] + 1e-9, max((time[-1] - time[0]) / 60.0, 2.0))
+        self._turns: list[Array] = []
+        rate = np.zeros(len(self.edges))
+        if heading is not None:
+            place = np.searchsorted(heading[0], self.edges).clip(0, len(heading[0]) - 1)
+            self.edges = heading[0][np.unique(place)]
+            true = np.interp(self.edges, *heading)
+            self._turns = [np.diff(true)]
+            rate = np.gradient(true, self.edges) if len(true) > 1 else 0.0 * true
+        self._increments = np.diff(
+            np.interp(self.edges, time, integrate(time, log.output[known])))
+        noise = heading_noise(self.edges, rate)
+        self._noise = noise if self._turns else noise[:1]
+
+    def fit(self, *column: Array) -> tuple[float, float]:
+        """Fit scale factor error, bias and a column; return the last value and its deviation."""
+        found = fit_noise_grid(
+            self._increments, np.column_stack([*self._turns, np.diff(self.edges), *column]),
+            self._noise, *bias_wander_columns(self.edges),
+            noisy_column=0 if self._turns else None, wandering_value=len(self._turns))
+        return float(found.values[-1]), float(found.deviations[-1])
+
+
+def _duration(log: Log) -> float:
+    """Return the time from the first to the last output, s; 0 with less than 100 of them."""
+    assert log.time is not None and log.output is not None
+    time = log.time[np.isfinite(log.output)]
+    return float(time[-1] - time[0]) if len(time) >= 100 else 0.0
 
 
 def fit_slow_effects(log: Log, time_offset: float = 0.0,
@@ -80,143 +120,62 @@ def fit_slow_effects(log: Log, time_offset: float = 0.0,
     """
     Return the slow effects of a log in time, by name: value, standard deviation and unit.
 
-    Parameters
-    ----------
-    log : with a reference, or at rest
-    time_offset : by which the gyro lags its reference, s
-    names : of the effects; None for all
+    The log has a reference, which the gyro lags by the time offset, s, or is at rest. `names` are
+    those of the effects; None for all.
 
     """
-    assert log.time is not None and log.output is not None
-    known = np.isfinite(log.output)
-    time = log.time[known] - time_offset
-    if time[-1] - time[0] < _MIN_LOG_DURATION:
-        return {}
-    gyro_angle, heading = integrate(time, log.output[known]), _reference_heading(log)
-    step = max((time[-1] - time[0]) / _SPAN_COUNT, _MIN_SPAN_DURATION)
-    ends = np.arange(time[0], time[-1] + 1e-9, step)
-    if heading is None:
-        span_edges, columns, rate = ends, [], np.zeros(len(ends))
-    else:
-        span_edges = (
-            heading[0][np.unique(np.searchsorted(heading[0], ends).clip(0, len(heading[0]) - 1))])
-        true_heading = np.interp(span_edges, *heading)
-        columns, rate = [np.diff(true_heading)], np.gradient(true_heading, span_edges)
-    if len(span_edges) < 10:
-        return {}
-    increments = np.diff(np.interp(span_edges, time, gyro_angle))
-    noise = _noise_parts(span_edges, rate, is_rest=heading is None)
-    found: dict[str, dict[str, Any]] = {}
-    for name, (unit, column) in _slow_effect_columns(log, span_edges).items():
-        if names is not None and name not in names:
-            continue
-        fit = fit_noise_grid(increments, np.column_stack([*columns, np.diff(span_edges), column]),
-                             noise, *bias_wander_columns(span_edges),
-                             noisy_column=0 if columns else None, wandering_value=len(columns))
-        found[name] = {'value': float(fit.values[-1]), 'deviation': float(fit.deviations[-1]),
-                       'unit': unit}
-    return {name: each for name, each in found.items()
-            if math.isfinite(each['deviation']) and each['deviation'] > 0.0}
-
-
-def _estimate_rest_bias(log: Log) -> tuple[float, float]:
-    """
-    Return the bias of a log at rest, rad/s, and its standard deviation with the wander.
-
-    Raises
-    ------
-    DataRefused : it lasts too short a time
-
-    """
-    assert log.time is not None and log.output is not None
-    known = np.isfinite(log.output)
-    time = log.time[known]
-    if known.sum() < 100 or time[-1] - time[0] < _MIN_LOG_DURATION:
-        raise DataRefused(f'rests for less than {_MIN_LOG_DURATION:.0f} s: record for longer')
-    span_edges = np.linspace(time[0], time[-1], _SPAN_COUNT + 1)
-    increments = np.diff(np.interp(span_edges, time, integrate(time, log.output[known])))
-    fit = fit_noise_grid(increments, np.diff(span_edges)[:, None],
-                         _noise_parts(span_edges, np.zeros(len(span_edges)), is_rest=True),
-                         *bias_wander_columns(span_edges), wandering_value=0)
-    return float(fit.values[0]), float(fit.deviations[0])
-
-
-def _reference_heading(log: Log) -> tuple[Array, Array] | None:
-    """Return times and headings of the reference; None at rest."""
     assert log.time is not None
-    if log.reference_heading is not None:
+    heading = None
+    if log.reference_heading is not None and np.isfinite(log.reference_heading).sum() > 1:
         known = np.isfinite(log.reference_heading)
-        if known.sum() > 1:
-            return log.time[known], log.reference_heading[known]
-    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        return log.time, integrate(log.time, bridge_gaps(log.reference_rate))
-    return None
-
-
-def _noise_parts(time: Array, rate: Array, is_rest: bool) -> list[BandedNoise]:
-    parts = heading_noise(time, rate)
-    return parts[:1] if is_rest else parts
-
-
-def _slow_effect_columns(log: Log, span_edges: Array) -> dict[str, tuple[str, Array]]:
-    """Return the unit and the column of each effect in the increments."""
-    assert log.time is not None
-    elapsed = span_edges - log.time[0]
-    middle = 0.5 * elapsed[-1]
-    found = {'rate_ramp': ('rad/s²', np.diff(0.5 * (elapsed - middle) ** 2))}
-    for constant in (60.0, 300.0):  # s; the same for all logs, as they are pooled
-        found[f'warm_up_{constant:.0f}s'] = (
-            'rad/s', np.diff(-constant * np.exp(-elapsed / constant)))
-    if log.temperature is not None and np.isfinite(log.temperature).all():
-        temperature_deviation = log.temperature - log.temperature.mean()
-        if np.ptp(temperature_deviation) > 0.0:
-            found['bias_temperature'] = 'rad/s/K', np.diff(
-                np.interp(span_edges, log.time, integrate(log.time, temperature_deviation)))
+        heading = log.time[known], log.reference_heading[known]
+    elif log.reference_rate is not None and np.isfinite(log.reference_rate).any():
+        heading = log.time, integrate(log.time, bridge_gaps(log.reference_rate))
+    if _duration(log) < _MIN_LOG_DURATION:
+        return {}
+    spans, found = _SpanFit(log, time_offset, heading), {}
+    if len(spans.edges) < 10:
+        return {}
+    for name, unit, angle in _slow_effects(log, spans.edges):
+        if names is None or name in names:
+            value, deviation = spans.fit(np.diff(angle))
+            if math.isfinite(deviation) and deviation > 0.0:
+                found[name] = _value_record(value, deviation, unit)
     return found
 
 
-#: Status of a log that was calibrated, and of one that is excluded.
-DONE, NO_EVIDENCE = 'done', 'no evidence'
-#: Schema of the records; records of another one are not read.
-SCHEMA = 'gyro_calibration/fleet_log/2'
+def _slow_effects(log: Log, time: Array) -> Iterator[tuple[str, str, Array]]:
+    """Give name, unit and integral over time of each effect, to some constant."""
+    assert log.time is not None
+    elapsed = time - log.time[0]
+    yield 'rate_ramp', 'rad/s²', 0.5 * (elapsed - 0.5 * elapsed[-1]) ** 2
+    for constant in (60.0, 300.0):  # s; the same for all logs, as they are pooled
+        yield f'warm_up_{constant:.0f}s', 'rad/s', -constant * np.exp(-elapsed / constant)
+    if log.temperature is not None and np.ptp(log.temperature) > 0.0:  # False with nan
+        angle = integrate(log.time, log.temperature - log.temperature.mean())
+        yield 'bias_temperature', 'rad/s/K', np.interp(time, log.time, angle)
 
 
 @dataclass(frozen=True)
 class LogTask:
-    """
-    The work on a log, with its options.
-
-    Attributes
-    ----------
-    entry : the log
-    folder : of the results
-    technology : of the gyros, one of `course_over_ground.TECHNOLOGY_PRIORS`
-    file_pattern : pattern of the file names, by `table.compile_file_pattern`
-    generator : for the diagnosis, the same for each log; None without a diagnosis
-    default_type : of logs whose type is not stated
-    sample_rate : Hz, of the samples of logs without a usable time
-
-    """
+    """The work on a log, with its options."""
 
     entry: FleetLog
-    folder: str
-    technology: str = 'mems'
-    file_pattern: re.Pattern[str] | None = None
+    folder: str  # of the results
+    technology: str = 'mems'  # of the gyros, one of `course_over_ground.TECHNOLOGY_PRIORS`
+    file_pattern: re.Pattern[str] | None = None  # by `table.compile_file_pattern`
+    #: For the diagnosis, the same for each log; None without a diagnosis.
     generator: np.random.Generator | None = None
-    default_type: str = ''
-    sample_rate: float | None = None
-
-    @property
-    def name(self) -> str:
-        """Return the name of the log's files among the results, which is unique for its path."""
-        stem = re.sub(r'[^A-Za-z0-9_.-]', '_', Path(self.entry.log).name.partition('.')[0])
-        path = os.path.abspath(self.entry.log).encode(errors='surrogateescape')
-        return f'{stem[:60]}-{hashlib.sha256(path).hexdigest()[:8]}'
+    default_type: str = ''  # of logs whose type is not stated
+    sample_rate: float | None = None  # Hz, of logs without a usable time
 
     @property
     def record_path(self) -> Path:
-        """Return the path of the stored record."""
-        return Path(self.folder) / 'logs' / f'{self.name}.json'
+        """Return the path of the stored record; its name is unique for the path of the log."""
+        stem = re.sub(r'[^A-Za-z0-9_.-]', '_', Path(self.entry.log).name.partition('.')[0])
+        path = os.path.abspath(self.entry.log).encode(errors='surrogateescape')
+        name = f'{stem[:60]}-{hashlib.sha256(path).hexdigest()[:8]}.json'
+        return Path(self.folder) / 'logs' / name
 
 
 def process_log(task: LogTask) -> dict[str, Any]:
@@ -238,7 +197,10 @@ def process_log(task: LogTask) -> dict[str, Any]:
         entry = describe_log(task.entry, task.file_pattern).fill_missing(
             {'type': task.default_type})
         content = sha256_digest(*list_recording_files(task.entry.log))
-        key = _record_key(task, content)
+        state = None if task.generator is None else task.generator.bit_generator.state
+        identity = [SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log,
+                    content, state]  # all that the record depends on
+        key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
         found = _load_record(task.record_path, key)
         if found is None:
             found = {'schema': SCHEMA, 'key': key, 'sha256': content,
@@ -270,14 +232,6 @@ def _format_reason(error: Exception, path: str) -> str:
     return describe_error(error)
 
 
-def _record_key(task: LogTask, content: str) -> str:
-    """Return a hash of all that the record depends on."""
-    generator_state = None if task.generator is None else task.generator.bit_generator.state
-    identity = [SCHEMA, __version__, task.technology, task.sample_rate, task.entry.log, content,
-                generator_state]
-    return hashlib.sha256(json.dumps(identity).encode()).hexdigest()
-
-
 def _load_record(path: Path, key: str) -> dict[str, Any] | None:
     try:
         kept = json.loads(path.read_bytes())
@@ -290,33 +244,41 @@ def _calibrate_and_diagnose(task: LogTask) -> dict[str, Any]:
     path = task.entry.log
     log = (read_recording(path, rate=task.sample_rate) if is_recording(path)
            else read_log(path, rate=task.sample_rate))
-    method, model, extra_values = calibrate_log(log, task.technology)
+    method, model, offset = calibrate_log(log, task.technology)
+    # by parameter where it is named as its effect
+    values = {parameter.name if parameter.name == effect else f'{effect}.{parameter.name}':
+              _value_record(value, deviation, parameter.unit)
+              for effect, parameter, value, deviation in model.estimates()}
+    if offset is not None:
+        values['time_offset'] = _value_record(*offset, 's')
     temperature = (None if log.temperature is None or not np.isfinite(log.temperature).any()
                    else float(np.nanmean(log.temperature)))
     content = hashlib.sha256()
-    for values in (getattr(log, quantity) for quantity in QUANTITIES):
-        content.update(b'' if values is None else values.tobytes())
-    offset = extra_values['time_offset']['value'] if extra_values else 0.0
+    for column in (getattr(log, quantity) for quantity in QUANTITIES):
+        content.update(b'' if column is None else column.tobytes())
     found: dict[str, Any] = {
         'content': content.hexdigest(), 'mean_temperature': temperature, 'status': DONE,
         'reason': '', 'method': method, 'samples': len(log),
         'duration_s': None if log.time is None else float(log.time[-1] - log.time[0]),
-        'values': {**_value_records(model), **extra_values},
-        'slow': {} if log.time is None else fit_slow_effects(log, offset),
+        'values': values,
+        'slow': {} if log.time is None else fit_slow_effects(log, offset[0] if offset else 0.0),
         'noise': {name: float(value) for name, value in vars(model.noise).items()},
         'diagnosis': None, 'page': ''}
-    if task.generator is not None:
-        found |= _summarize_diagnosis(task, log)
-    return found
+    return found if task.generator is None else {**found, **_summarize_diagnosis(task, log)}
 
 
-def calibrate_log(log: Log,
-                  technology: str = 'mems') -> tuple[str, GyroModel, dict[str, dict[str, Any]]]:
+def _value_record(value: float, deviation: float, unit: str) -> dict[str, Any]:
+    return {'value': float(value), 'deviation': float(deviation), 'unit': unit}
+
+
+def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
+                                                               tuple[float, float] | None]:
     """
-    Return the method of calibration of a log, its model, and values that a model does not hold.
+    Return the method of calibration of a log, its model, and the time offset of its reference.
 
-    A log in time with a reference heading is calibrated by `calibrate_encoder`, a log at rest
-    gives the bias only, and any other one is calibrated by dwells.
+    A log in time with a reference heading is calibrated by `calibrate_encoder`, which finds the
+    offset and its standard deviation, s; a log at rest gives the bias only, and any other one is
+    calibrated by dwells.
 
     Raises
     ------
@@ -330,32 +292,22 @@ def calibrate_log(log: Log,
         raise DataRefused(f'{failed.evidence}: {failed.remedy}')
     if log.time is not None and log.reference_rate is None and log.reference_heading is not None:
         found = calibrate_encoder(log, technology=technology)
-        offset = {} if math.isnan(found.fit.time_offset) else {'time_offset': _value_record(
-            found.fit.time_offset, found.fit.time_offset_deviation, 's')}
-        return found.method, found.model, offset
+        offset = found.fit.time_offset, found.fit.time_offset_deviation
+        return found.method, found.model, None if math.isnan(offset[0]) else offset
     refuse_unusable(log)
     if log.time is not None and is_at_rest(log):
-        bias, deviation = _estimate_rest_bias(log)
+        if _duration(log) < _MIN_LOG_DURATION:
+            raise DataRefused(f'rests for less than {_MIN_LOG_DURATION:.0f} s: record for longer')
+        bias, deviation = _SpanFit(log, 0.0, None).fit()
         walk = (white_noise_deviation(log.output, order=1)
                 * math.sqrt(float(np.median(np.diff(log.time)))))
         return 'rest', GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
-                                 noise=Noise(angle_random_walk=walk)), {}
+                                 noise=Noise(angle_random_walk=walk)), None
     table_quality = None if log.time is not None else inspect_record(log)
     if table_quality is not None and is_implausible_factor(table_quality.unit_factor):
         raise DataRefused(f'{table_quality.findings[0].evidence}: correct the unit or the sign of '
                           'the column of the gyro')
-    return 'dwells', select_effects(extract_dwells(log), technology).calibration.model, {}
-
-
-def _value_records(model: GyroModel) -> dict[str, dict[str, Any]]:
-    """Return the fitted values of a model, by parameter where it is named as its effect."""
-    return {parameter.name if parameter.name == effect else f'{effect}.{parameter.name}':
-            _value_record(value, deviation, parameter.unit)
-            for effect, parameter, value, deviation in model.estimates()}
-
-
-def _value_record(value: float, deviation: float, unit: str) -> dict[str, Any]:
-    return {'value': float(value), 'deviation': float(deviation), 'unit': unit}
+    return 'dwells', select_effects(extract_dwells(log), technology).calibration.model, None
 
 
 def _summarize_diagnosis(task: LogTask, log: Log) -> dict[str, Any]:

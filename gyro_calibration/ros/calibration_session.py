@@ -62,30 +62,36 @@ from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-#: Duration of a calibration of the bias alone, s.
-_REST_DURATION = 15.0
 #: Duration of the rest after whole turns, s.
 REST_AFTER_TURNS = 2.5
 #: Longest duration of a run that waits for `finish`, s.
 FINISH_TIMEOUT = 600.0
 #: Time without a sample after which a run without a drive ends, s.
 SAMPLE_TIMEOUT = 5.0
-#: Time without a sample, s or intervals, after which a drive ends; the longer one applies.
-DRIVE_SAMPLE_TIMEOUT, _DRIVE_TIMEOUT_INTERVALS = 0.25, 4.0
+#: Time without a sample after which a drive ends, s; four intervals of a slower gyro.
+DRIVE_SAMPLE_TIMEOUT = 0.25
 #: Longest wait for a node that receives the commands, s; discovery may take 3 s.
 DISCOVERY_TIMEOUT = 5.0
 #: Longest turn of the robot after the last command, s: latency and deceleration.
 STOPPING_DURATION = 1.5
 #: Least change of the odometry heading over a run that shows a turn, rad.
 _MIN_TURN_ANGLE = 1.0 * DEGREE
-#: Largest number of own commands that have not come back; 5 s at 50 Hz.
-_MAX_PENDING_COMMANDS = 256
 #: Longest pause of the node in a drive, s: after it the base has stopped by itself, or turned on.
 _MAX_NODE_PAUSE = 1.0
-#: Time over which stamps and clock are compared in a drive, s; it shows a jump of the stamps.
-_DRIVE_COMPARISON_TIME = 2.0
-#: Duration of repeated zero commands after a drive, s: the link to the base may lose some.
-_STOP_REPEAT_DURATION = 1.0
+
+ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '
+                   'or set use_sim_time to false')
+_NO_RECEIVER = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel to its '
+                'topic, or change cmd_vel_stamped')
+
+
+@dataclass(frozen=True)
+class AcceptanceRules:
+    """Criteria for accepting a run; with 0 `turns` the gyro determines their number."""
+
+    limits: RunLimits = RunLimits()
+    odometry: ReferenceErrors = ReferenceErrors()
+    turns: int = 0
 
 
 @dataclass
@@ -93,8 +99,8 @@ class CalibrationRun:
     """A calibration in progress."""
 
     kind: str  # PROFILE, ODOMETRY, TURNS or REST
-    duration: float  # of the compared motion, s; inf until `CalibrationSession.finish`
-    extra_duration: float  # duration of samples after the motion, s
+    duration: float  # of the compared motion, s; inf until `finish`
+    rules: AcceptanceRules
     last_received: float  # time of the last sample, or of the request, s of the steady clock
     motion: Motion | None = None  # the profile
     end_reason: str | None = None  # reason of the end; '' where the samples are complete
@@ -116,23 +122,27 @@ class CalibrationRun:
     def finish(self) -> str:
         """End the motion now; return the remaining instruction for the user."""
         self.duration = min(self.duration, self.elapsed)
-        left = self.duration + self.extra_duration - self.elapsed
-        return f'leave the robot at rest for {left:.1f} s more'
+        return f'leave the robot at rest for {self.max_duration - self.elapsed:.1f} s more'
 
     @property
     def due_end_reason(self) -> str | None:
         """Return '' if the samples are complete, the reason of a time-out, or None."""
-        if self.elapsed >= self.duration + self.extra_duration:
-            return ''
         if math.isinf(self.duration) and self.elapsed > FINISH_TIMEOUT:
             return (f'finish_calibration was not called within {FINISH_TIMEOUT:g} s: call it when '
                     'the robot stands on the mark again')
-        return None
+        return '' if self.elapsed >= self.duration + self.extra_duration else None
 
     @property
     def elapsed(self) -> float:
         """Return the time from the first sample to the last, s."""
         return self.times[-1] - self.times[0] if self.times else 0.0
+
+    @property
+    def extra_duration(self) -> float:
+        """Return the duration of samples after the motion, s."""
+        limits = self.rules.limits
+        return {REST: 0.0, TURNS: REST_AFTER_TURNS}.get(
+            self.kind, limits.max_time_offset + SETTLING_TIME + limits.rest_duration)
 
     @property
     def max_duration(self) -> float:
@@ -147,38 +157,9 @@ class CalibrationRun:
     @property
     def status(self) -> str:
         """Return the progress in words."""
-        if not math.isinf(self.duration):
-            return f'{self.elapsed:.0f} of {self.max_duration:.0f} s'
-        return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call '
-                'finish_calibration')
-
-    @property
-    def temperature(self) -> float | None:
-        """Return the mean temperature, degC; None where none came."""
-        return float(np.mean(self.temperatures)) if self.temperatures else None
-
-
-@dataclass(frozen=True)
-class AcceptanceRules:
-    """Criteria for accepting a run; with 0 `turns` the gyro determines their number."""
-
-    limits: RunLimits = RunLimits()
-    odometry: ReferenceErrors = ReferenceErrors()
-    turns: int = 0
-
-    def extra_duration(self, kind: str) -> float:
-        """Return the duration of samples after the motion, s."""
-        if kind in (TURNS, REST):
-            return REST_AFTER_TURNS if kind == TURNS else 0.0
-        return self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration
-
-
-def rules_from_parameters(values: SimpleNamespace) -> AcceptanceRules:
-    """Return the rules by the parameters of the node."""
-    return AcceptanceRules(
-        RunLimits(max_bias=values.calibration_maximum_bias),
-        ReferenceErrors(scale_deviation=values.calibration_odometry_scale_deviation),
-        values.calibration_turns)
+        return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call finish_calibration'
+                if math.isinf(self.duration)
+                else f'{self.elapsed:.0f} of {self.max_duration:.0f} s')
 
 
 class Drive:
@@ -192,16 +173,13 @@ class Drive:
     INTERVAL = 0.02
     """Time between commands, s."""
 
-    def __init__(self, run: CalibrationRun, clock: Clock, sample_timeout: Callable[[], float]):
-        """Start to wait for a receiver of the commands; `sample_timeout` returns s."""
-        assert run.motion is not None
-        self._run, self._motion, self._clock, self._sample_timeout = (
-            run, run.motion, clock, sample_timeout)
+    def __init__(self, run: CalibrationRun, motion: Motion, clock: Clock):
+        """Start to wait for a receiver of the commands."""
+        self._run, self._motion, self._clock = run, motion, clock
         self._start_time = self._last_poll = clock.steady()
-        self._has_receiver = self._silence_suspected = False
-        self._had_callers = self._lost_callers = False
+        self._has_receiver = self._had_callers = self._lost_callers = False
         self._next_command_time = -math.inf
-        self._stamp_delay = StampDelay(clock, DRIVE_SAMPLE_TIMEOUT, _DRIVE_COMPARISON_TIME)
+        self._stamp_delay = StampDelay(clock, DRIVE_SAMPLE_TIMEOUT, window=2.0)
         self.command_lateness = self.sample_lateness = 0.0
 
     def add_sample(self, time: float) -> None:
@@ -218,22 +196,15 @@ class Drive:
         now = self._clock.steady()
         pause, self._last_poll = now - self._last_poll, now
         if self.is_waiting(receivers):
-            return self._no_receiver_message if now - self._start_time > DISCOVERY_TIMEOUT else ''
+            return _NO_RECEIVER if now - self._start_time > DISCOVERY_TIMEOUT else ''
         if not receivers:
-            return self._no_receiver_message
+            return _NO_RECEIVER
         if is_ros_time_paused:
             return ROS_TIME_PAUSED
         if pause > _MAX_NODE_PAUSE:
             return (f'this computer was busy: the node was held up for {pause:.1f} s while it '
                     'drove the robot; reduce its load and run again')
-        if fault := self._stamp_delay.find_fault():
-            return fault
-        # Decided at the second poll: after a pause of this process, queued samples are delivered
-        # after its timers.
-        silence = now - self._run.last_received
-        before, self._silence_suspected = self._silence_suspected, silence > self._sample_timeout()
-        return (f'no sample came for {silence:.2f} s while the robot was driven: check the gyro '
-                'and its driver') if before and self._silence_suspected else ''
+        return self._stamp_delay.find_fault()
 
     def is_abandoned(self, callers: int) -> bool:
         """Tell whether the service has lost its callers at two polls in a row."""
@@ -241,8 +212,8 @@ class Drive:
         before, self._lost_callers = self._lost_callers, self._had_callers and not callers
         return before and self._lost_callers
 
-    def next_command(self) -> float | None:
-        """Return the rate to command now, rad/s; None if no command is due."""
+    def next_command(self, is_silent: bool) -> float | None:
+        """Return the rate to command now, rad/s, 0 in a silence; None if no command is due."""
         now = node_time(self._clock)
         left = self._next_command_time - now  # more than an interval if ROS time has jumped back
         if 0.5 * self.INTERVAL < left <= 1.5 * self.INTERVAL:
@@ -252,14 +223,11 @@ class Drive:
         self._next_command_time = now + self.INTERVAL
         # After a pause of this process, queued samples may be delivered before the next poll.
         held_up = self._clock.steady() - self._last_poll > _MAX_NODE_PAUSE
-        if self._silence_suspected or held_up or not self._run.times:
+        if is_silent or held_up or not self._run.times:
             return 0.0
         # By the stamps, but delayed samples do not delay the motion.
         elapsed = max(now - self._stamp_delay.min_delay - self._run.times[0], self._run.elapsed)
         return float(self._motion.rate_at(np.array(elapsed)))
-
-    _no_receiver_message = ('no other node receives cmd_vel: start what moves the robot, remap '
-                            'cmd_vel to its topic, or change cmd_vel_stamped')
 
     def describe_lateness(self, limits: RunLimits) -> str:
         """Return a sentence on the lateness of commands and samples beyond the residual limit."""
@@ -275,43 +243,26 @@ def _max_rate(motion: Motion) -> float:
     return float(np.abs(motion.rate_at(motion.time)).max())
 
 
-ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '
-                   'or set use_sim_time to false')
-
-
 class CalibrationSession:
     """
-    Calibrations on request.
+    Calibrations on request; `run` is the one in progress, or None.
 
-    Attributes
-    ----------
-    run : the run in progress, or None
-    warning : that the robot kept turning after a drive, in a sentence; ''
-    max_lateness : largest lateness of commands and of samples in the last drive, s
+    `warning` says that the robot kept turning after a drive, in a sentence or ''; `max_lateness`
+    is that of commands and of samples in the last drive, s.
 
     """
 
     def __init__(self, estimator: HeadingEstimator, store: StateStore, monitor: HealthMonitor,
                  send: Callable[[float], None], clock: Clock):
-        """
-        Start without a run.
-
-        Parameters
-        ----------
-        estimator, store, monitor : of the pipeline
-        send : publishes a rate about z on cmd_vel, rad/s
-        clock : of the node
-
-        """
+        """Start without a run; `send` publishes a rate about z on cmd_vel, rad/s."""
         self.run: CalibrationRun | None = None
         self.warning, self.max_lateness = '', (0.0, 0.0)
         self._estimator, self._store, self._monitor = estimator, store, monitor
         self._send, self._clock = send, clock
-        self._rules = AcceptanceRules()
         self._drive: Drive | None = None
-        self._pending_commands: deque[float] = deque(maxlen=_MAX_PENDING_COMMANDS)
+        self._pending_commands: deque[float] = deque(maxlen=256)  # own, that have not come back
         self._last_foreign_command = self._stop_time = self._stop_repeat_end = -math.inf
-        self._start_time, self._silence_suspected = 0.0, False
+        self._start_time, self._is_silent = 0.0, False
 
     @property
     def is_driving(self) -> bool:
@@ -322,26 +273,17 @@ class CalibrationSession:
 
     def begin(self, kind: str, values: SimpleNamespace, obstacle: str = '') -> str:
         """
-        Begin a run.
+        Begin a run of a kind by the parameters of the node; return '', or why it is refused.
 
-        Parameters
-        ----------
-        kind : PROFILE, ODOMETRY, TURNS or REST
-        values : the parameters of the node
-        obstacle : why the robot must not be driven now; ''
-
-        Returns
-        -------
-        '', or the reason of the refusal
+        `obstacle` is why the robot must not be driven now, or ''.
 
         """
         if self.run:
-            return 'a calibration is in progress; wait for its end, or call ' 'cancel_calibration'
+            return 'a calibration is in progress; wait for its end, or call cancel_calibration'
         if self._store.problem:
             return self._store.problem
         motion, drives = None, kind == PROFILE and values.calibration_drive
-        duration = {ODOMETRY: values.calibration_duration, REST: _REST_DURATION}.get(
-            kind, math.inf)
+        duration = {ODOMETRY: values.calibration_duration, REST: 15.0}.get(kind, math.inf)
         if kind == PROFILE:
             try:
                 file = values.calibration_profile_file
@@ -357,20 +299,18 @@ class CalibrationSession:
                         'calibration.profile_file')
         if drives and obstacle:
             return obstacle
-        if drives and self._clock.steady() - self._last_foreign_command < 1.0:
+        now = self._clock.steady()
+        if drives and now - self._last_foreign_command < 1.0:
             return 'another node sends commands on cmd_vel: stop it, and run again'
-        self._rules, self._silence_suspected, self.warning = (
-            rules_from_parameters(values), False, '')
-        self._start_time = node_time(self._clock)
-        self.run = run = CalibrationRun(kind, duration, self._rules.extra_duration(kind),
-                                        self._clock.steady(), motion)
-        self._drive = Drive(run, self._clock, self._sample_timeout) if drives else None
+        rules = AcceptanceRules(
+            RunLimits(max_bias=values.calibration_maximum_bias),
+            ReferenceErrors(scale_deviation=values.calibration_odometry_scale_deviation),
+            values.calibration_turns)
+        self._start_time, self._is_silent, self.warning = node_time(self._clock), False, ''
+        self.run = CalibrationRun(kind, duration, rules, now, motion)
+        self._drive = Drive(self.run, motion, self._clock) if motion and drives else None
         self._monitor.restart()
         return ''
-
-    def _sample_timeout(self) -> float:
-        usual = _DRIVE_TIMEOUT_INTERVALS * self._estimator.tracker.intervals.usual_interval
-        return min(max(DRIVE_SAMPLE_TIMEOUT, usual), self._rules.limits.max_gap)
 
     # Inputs
 
@@ -389,8 +329,7 @@ class CalibrationSession:
                 None if estimator.is_temperature_lost else estimator.temperature)
         if (reason := run.due_end_reason) is not None:
             self.end(reason)
-        elif self._drive:
-            self._command_if_due(self._drive)
+        self._command_if_due()
 
     def add_odometry(self, time: float, heading: float, rate: float) -> None:
         """Add a heading, rad, and a rate, rad/s, of the odometry."""
@@ -399,7 +338,7 @@ class CalibrationSession:
         late = self._clock.steady() - self._stop_time
         alone = self._last_foreign_command < self._stop_time
         if (alone and STOPPING_DURATION < late < 2.0 * STOPPING_DURATION
-                and abs(rate) > math.radians(1.0)):
+                and abs(rate) > 1.0 * DEGREE):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
                             f'{late:.1f} s after it was commanded to stop: set the command '
                             'time-out of its base, and check for other nodes that command it')
@@ -427,38 +366,41 @@ class CalibrationSession:
         """
         Send the next command of a drive, or end a run by its guards.
 
-        To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second.
-
-        Parameters
-        ----------
-        values : the parameters of the node
-        receivers : number of other nodes that receive the commands
-        is_ros_time_paused : ROS time has stood still for longer than `DRIVE_SAMPLE_TIMEOUT`
-        conflict : why the samples cannot be used; ''
+        To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second, with
+        the parameters of the node, the number of other nodes that receive the commands, whether
+        ROS time has stood still for longer than `DRIVE_SAMPLE_TIMEOUT`, and why the samples cannot
+        be used, or ''.
 
         """
-        run = self.run
-        if self._clock.steady() < self._stop_repeat_end and not self._drive:
+        run, drive, now = self.run, self._drive, self._clock.steady()
+        if now < self._stop_repeat_end and not drive:
             self._command(0.0)
         if run is None or run.end_reason is not None:
             return
-        reason = conflict
-        if self._drive:
-            reason = reason or self._drive.find_fault(receivers, is_ros_time_paused)
+        reason, timeout, is_driven = conflict, SAMPLE_TIMEOUT, False
+        if drive:
+            reason = reason or drive.find_fault(receivers, is_ros_time_paused)
             if not values.calibration_drive:
                 reason = ('calibration.drive was set to false while the robot was driven: set it '
                           'to true and run again')
+            if not drive.is_waiting(receivers):
+                usual = self._estimator.tracker.intervals.usual_interval
+                timeout = min(max(DRIVE_SAMPLE_TIMEOUT, 4.0 * usual), run.rules.limits.max_gap)
+                is_driven = True
+        # Decided at the second poll: after a pause of this process, queued samples are delivered
+        # after its timers.
+        silence = now - run.last_received
+        before, self._is_silent = self._is_silent, silence > timeout
+        if before and self._is_silent:
+            lasted = (f'{silence:.2f} s while the robot was driven' if is_driven
+                      else f'{timeout:g} s')
+            reason = reason or f'no sample came for {lasted}: check the gyro and its driver'
+        if node_time(self._clock) - self._start_time > 2.0 * run.max_duration + SAMPLE_TIMEOUT:
+            reason = reason or ('the stamps on imu/data_raw advance too slowly: check the clock '
+                                'of the driver, and use_sim_time')
         if reason:
             self.end(reason)
-        elif self._drive:
-            self._command_if_due(self._drive)
-        if node_time(self._clock) - self._start_time > 2.0 * run.max_duration + SAMPLE_TIMEOUT:
-            self.end('the stamps on imu/data_raw advance too slowly: check the clock of the '
-                     'driver, and use_sim_time')
-        suspected = self._silence_suspected
-        self._silence_suspected = self._clock.steady() - run.last_received > SAMPLE_TIMEOUT
-        if suspected and self._silence_suspected:
-            self.end(f'no sample came for {SAMPLE_TIMEOUT:g} s: check the gyro and its driver')
+        self._command_if_due()
 
     def update_callers(self, count: int) -> None:
         """End a drive without clients of the service; called a few times per second."""
@@ -471,9 +413,10 @@ class CalibrationSession:
         if self.run and self.run.times:
             self.end(f'{reason}: check the cable of the gyro and run again')
 
-    def _command_if_due(self, drive: Drive) -> None:
+    def _command_if_due(self) -> None:
         """Send the next command if it is due, at samples and polls: simulations may be fast."""
-        if (rate := drive.next_command()) is not None:
+        if (self._drive and self.run and self.run.end_reason is None
+                and (rate := self._drive.next_command(self._is_silent)) is not None):
             self._command(rate)
 
     def _command(self, rate: float) -> None:
@@ -495,7 +438,8 @@ class CalibrationSession:
         if self.run and self.run.end_reason is None:
             self.run.end_reason = reason
             if self.stop_robot() and reason:
-                self._stop_repeat_end = self._stop_time + _STOP_REPEAT_DURATION
+                # zero is repeated for 1 s, since the link to the base may lose some
+                self._stop_repeat_end = self._stop_time + 1.0
 
     def finish(self) -> tuple[bool, str]:
         """End the motion of a run by turns or by odometry."""
@@ -526,7 +470,7 @@ class CalibrationSession:
                 raise DataRefused(run.end_reason)
             return True, self._apply_calibration(run)
         except DataRefused as error:
-            late = (drive.describe_lateness(self._rules.limits)
+            late = (drive.describe_lateness(run.rules.limits)
                     if drive and not run.end_reason else '')
             return False, f'{late} (the run shows: {error})' if late else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
@@ -539,7 +483,7 @@ class CalibrationSession:
     def _apply_calibration(self, run: CalibrationRun) -> str:
         estimator, now = self._estimator, datetime.fromtimestamp(self._clock.date(), timezone.utc)
         noise = estimator.model.noise
-        calibration, remark = fit_run(run, self._rules, noise, now.isoformat(timespec='seconds'),
+        calibration, remark = fit_run(run, noise, now.isoformat(timespec='seconds'),
                                       estimator.model.prior_deviations)
         if run.kind == REST:
             calibration = self._with_current_scale(calibration)
@@ -562,21 +506,19 @@ class CalibrationSession:
         return replace(bias, scale_factor_error=last.scale_factor_error, covariance=covariance)
 
 
-def fit_run(run: CalibrationRun, rules: AcceptanceRules, noise: Noise, date: str,
+def fit_run(run: CalibrationRun, noise: Noise, date: str,
             prior: Array | None = None) -> tuple[SelfCalibration, str]:
     """
-    Return the calibration by a complete run, and a remark.
+    Return the calibration by a complete run, and a remark; raise `DataRefused` as its methods do.
 
     The prior is that of a fleet model; it is used in runs against a motion.
 
-    Raises
-    ------
-    DataRefused : with the reason and the remedy
-
     """
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
+    limits, temperature = run.rules.limits, (float(np.mean(run.temperatures))
+                                             if run.temperatures else None)
     if run.kind == REST:
-        bias, deviation = calibrate_bias(time - time[0], rate, rules.limits, noise, output)
+        bias, deviation = calibrate_bias(time - time[0], rate, limits, noise, output)
         turned = 0.0  # rad; by the headings or the rates of odometry
         if len(run.odometry) > 1:
             at, headings, rates = np.array(run.odometry).T
@@ -586,15 +528,32 @@ def fit_run(run: CalibrationRun, rules: AcceptanceRules, noise: Noise, date: str
             raise DataRefused(f'odom shows that the robot turned by {turned / DEGREE:.1f} deg in '
                               f'{run.elapsed:.0f} s of rest: keep it still; if it stood, remap '
                               'odom to an odometry of the wheels')
-        return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), date,
-                               run.temperature, 'rest'), ''
+        return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), date, temperature,
+                               'rest'), ''
     if run.kind == TURNS:
-        found = calibrate_turns(time - time[0], rate, rules.turns or None, rules.limits, noise,
+        found = calibrate_turns(time - time[0], rate, run.rules.turns or None, limits, noise,
                                 output=output)
-        return (to_model_record(found.fit, 'turns', date, run.temperature),
+        return (to_model_record(found.fit, 'turns', date, temperature),
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
     begin, motion = (time[0], run.motion) if run.motion is not None else _odometry_motion(run)
-    return _fit_to_motion(run, time - begin, rate, output, motion, rules, noise, date, prior)
+    by_odometry, time = run.kind == ODOMETRY, time - begin
+    inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
+    fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
+                         reference=run.rules.odometry if by_odometry else None,
+                         output=output[inside], prior=prior)
+    remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
+    if fit.goodness:
+        remarks.append(str(fit.goodness))
+    # After odometry the robot may drive on; a profile ends at rest.
+    after = (find_rest_after(time, rate, fit, motion, limits) if by_odometry
+             else time > motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME)
+    if after is not None:
+        rest = check_rest(time[after], rate[after], fit, noise, limits)
+        fit = rest.fit
+        remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, limit '
+                       f'{rest.limit / DEGREE:.4f} deg/s')
+    method = 'odometry' if by_odometry else 'likelihood'
+    return to_model_record(fit, method, date, temperature), '; '.join(remarks)
 
 
 def _odometry_motion(run: CalibrationRun) -> tuple[float, Motion]:
@@ -612,27 +571,3 @@ def _odometry_motion(run: CalibrationRun) -> tuple[float, Motion]:
     motion = (motion_from_headings(time, heading) if turned
               else motion_from_rates(time - time[0], rate))
     return float(time[0]), motion
-
-
-def _fit_to_motion(run: CalibrationRun, time: Array, rate: Array, output: Array, motion: Motion,
-                   rules: AcceptanceRules, noise: Noise, date: str,
-                   prior: Array | None) -> tuple[SelfCalibration, str]:
-    """Fit a run to its motion, and check the fit by the rest after it."""
-    limits, odometry = rules.limits, run.kind == ODOMETRY
-    inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
-    fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
-                         reference=rules.odometry if odometry else None, output=output[inside],
-                         prior=prior)
-    remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
-    if fit.goodness:
-        remarks.append(str(fit.goodness))
-    # After odometry the robot may drive on; a profile ends at rest.
-    begin = motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME
-    after = find_rest_after(time, rate, fit, motion, limits) if odometry else time > begin
-    if after is not None:
-        rest = check_rest(time[after], rate[after], fit, noise, limits)
-        fit = rest.fit
-        remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, limit '
-                       f'{rest.limit / DEGREE:.4f} deg/s')
-    method = 'odometry' if odometry else 'likelihood'
-    return to_model_record(fit, method, date, run.temperature), '; '.join(remarks)

@@ -16,12 +16,6 @@ from collections import deque
 import math
 from typing import Protocol
 
-#: Window of the least delay of stamps behind the clock, s: few samples are delayed for longer, and
-#: a gyro clock that is 3 % off drifts by 15 ms in it.
-_DELAY_WINDOW = 0.5
-#: Largest difference in rate of stamps and clock, 1; the clocks of gyros are up to 3 % off.
-_MAX_CLOCK_DEVIATION = 0.05
-
 
 class Clock(Protocol):
     """The clocks that a node reads; tests inject their own."""
@@ -64,7 +58,9 @@ class StampDelay:
         while self._min_delays and self._min_delays[-1][1] >= now - time:
             self._min_delays.pop()
         self._min_delays.append((now, now - time))
-        while now - self._min_delays[0][0] > _DELAY_WINDOW:
+        # few samples are delayed for longer than this window, s, and a gyro clock that is 3 % off
+        # drifts by 15 ms in it
+        while now - self._min_delays[0][0] > 0.5:
             self._min_delays.popleft()
         self.min_delay = self._min_delays[0][1]
         return now - time - self.min_delay
@@ -76,7 +72,8 @@ class StampDelay:
         elapsed, grown = now - then, self.min_delay - before
         # In a fast simulation the same delay is more simulated time.
         limit = self._tolerance * (1.0 if self._clock.simulated() is None else 4.0)
-        if abs(grown) > limit + _MAX_CLOCK_DEVIATION * abs(elapsed):
+        # the clocks of gyros are up to 3 % off
+        if abs(grown) > limit + 0.05 * abs(elapsed):
             return (f'this computer was busy, or the clock of the driver is wrong: the stamps on '
                     f'imu/data_raw advanced by {elapsed - grown:.2f} s in {elapsed:.2f} s; reduce '
                     'the load, or check that clock and use_sim_time')
@@ -89,10 +86,8 @@ class RosTime:
     """
     Whether ROS time advances.
 
-    Attributes
-    ----------
-    paused_duration : time since its last advance, s of the steady clock; 0 where it is not
-        simulated, inf before a simulation starts
+    `paused_duration` is the time since its last advance, s of the steady clock; 0 where it is not
+    simulated, inf before a simulation starts.
 
     """
 

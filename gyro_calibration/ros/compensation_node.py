@@ -46,15 +46,17 @@ from gyro_calibration.logs.cdr import (
 )
 from gyro_calibration.ros.calibration_session import Drive, REST
 from gyro_calibration.ros.compensation_report import calibration_status, CompensationReport
-from gyro_calibration.ros.diagnostics import Diagnostics, OK, status_array
 from gyro_calibration.ros.pipeline import CorrectedSample, PARAMETERS, Pipeline
 from gyro_calibration.ros.runner import (
     allow_future_response,
     call_every,
     declare_parameters,
+    Diagnostics,
     LATCHED_QOS,
+    OK,
     publish_on,
     run_node,
+    status_array,
     subscribe_to,
 )
 from gyro_calibration.ros.wheels import Velocity
@@ -68,9 +70,6 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
-
-#: Interval of polls of publishers, receivers and clocks, s.
-_GRAPH_POLL_INTERVAL = 0.2
 
 
 class NodeClock:
@@ -99,31 +98,28 @@ class CompensationNode(Node):
         values = declare_parameters(self, PARAMETERS, self._use_parameters)
         self._values, clock = values, NodeClock(self)
         self._velocity: Publisher | None = None
-        self._is_velocity_stamped = values.cmd_vel_stamped
+        self._velocity_type = TwistStamped if values.cmd_vel_stamped else Twist
         self._pipeline = Pipeline(values, self._calibration_file(), clock, self._publish_command)
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
         self._receivers = 0
         self._pending_answer: tuple[Trigger.Response, Future] | None = None
         self._timer: Timer | None = None
-        self._assumed_variance = values.assumed_bias ** 2
         self._create_topics()
         self._report = CompensationReport(self._pipeline, clock)
         self._diagnostics = Diagnostics(self, 'heading', lambda: self._report.make())
         session = self._pipeline.session
-        self._offer_service(
-            'calibrate',
-            lambda answer: self._calibrate(self._values.calibration_reference, answer))
+        self._offer_service('calibrate', lambda answer: self._calibrate(
+            self._values.calibration_reference, answer))
         self._offer_service('calibrate_bias', lambda answer: self._calibrate(REST, answer))
-        self._offer_service('finish_calibration',
-                            lambda answer: self._fill_response(answer, *session.finish()))
+        self._offer_service('finish_calibration', lambda answer: self._fill_response(
+            answer, *session.finish()))
         self._offer_service('cancel_calibration', self._cancel)
-        self._offer_service(
-            'reset_heading',
-            lambda answer: self._fill_response(answer, True, self._pipeline.reset_heading()))
+        self._offer_service('reset_heading', lambda answer: self._fill_response(
+            answer, True, self._pipeline.reset_heading()))
         # One timer for all: each one, also a cancelled one, costs time at every sample.
         self._poll_count = 0
-        call_every(self, _GRAPH_POLL_INTERVAL, self._poll_graph)
+        call_every(self, 0.2, self._poll_graph)
         self._publish_status()
 
     def _calibration_file(self) -> Path:
@@ -150,8 +146,7 @@ class CompensationNode(Node):
                          _stamp_ns(message.header), message.temperature))
         self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
         subscribe_to(self, Odometry, 'odom', self._on_odometry)
-        subscribe_to(self, TwistStamped if self._is_velocity_stamped else Twist, 'cmd_vel',
-                     self._on_command)
+        subscribe_to(self, self._velocity_type, 'cmd_vel', self._on_command)
         if self._values.calibration_drive:
             self._offer_velocity()  # calibrate reports a failure
 
@@ -173,17 +168,18 @@ class CompensationNode(Node):
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
         self._pipeline.add_command(
-            _to_velocity(message.twist if self._is_velocity_stamped else message))
+            _to_velocity(message if isinstance(message, Twist) else message.twist))
         self._answer_finished_run()
 
     def _on_imu(self, message: Imu) -> None:
-        force = message.linear_acceleration.z
-        reported = message.linear_acceleration_covariance[0] != NOT_REPORTED
-        known = force if reported and math.isfinite(force) else None
+        force: float | None = message.linear_acceleration.z
+        if (message.linear_acceleration_covariance[0] == NOT_REPORTED
+                or not math.isfinite(message.linear_acceleration.z)):
+            force = None
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:
             output = math.nan  # REP-145: the message has no rate
-        found = self._pipeline.add_sample(_stamp_ns(message.header), output, known,
+        found = self._pipeline.add_sample(_stamp_ns(message.header), output, force,
                                           self._receivers, message.header.frame_id)
         if found is not None:
             self._publish(message, found)
@@ -206,7 +202,7 @@ class CompensationNode(Node):
             xx = yy = UNMEASURED_VARIANCE
             xy = yx = 0.0
         elif not (xx or yy):  # all zeros: not known
-            xx = yy = self._assumed_variance
+            xx = yy = self._values.assumed_bias ** 2
         imu.angular_velocity_covariance[:] = (xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0,
                                               corrected.rate_variance)
         covariance = imu.linear_acceleration_covariance.tolist()
@@ -234,8 +230,7 @@ class CompensationNode(Node):
 
     def _publish_status(self) -> None:
         """Publish the latched state of the calibration."""
-        status = calibration_status(self._pipeline.store, self._pipeline.session.run)
-        self._status.publish(status_array(self, 'calibration', status))
+        self._status.publish(status_array(self, 'calibration', calibration_status(self._pipeline)))
 
     def _poll_graph(self) -> None:
         """Poll publishers, receivers, clocks and the level of the report."""
@@ -253,7 +248,7 @@ class CompensationNode(Node):
         if self._pipeline.session.run:
             self._publish_status()
         self._poll_count += 1
-        second = self._poll_count % round(1.0 / _GRAPH_POLL_INTERVAL) == 0
+        second = self._poll_count % 5 == 0
         if second:
             self._pipeline.run_periodic_tasks()
         if second or self._report.level() > (self._diagnostics.level or OK):
@@ -314,9 +309,9 @@ class CompensationNode(Node):
     def _offer_velocity(self) -> str:
         """Create the publisher of cmd_vel before the first drive; return why it failed, or ''."""
         if self._velocity is None:
-            kind = TwistStamped if self._is_velocity_stamped else Twist
             try:
-                self._velocity = publish_on(self, kind, 'cmd_vel', QoSProfile(depth=10))
+                self._velocity = publish_on(self, self._velocity_type, 'cmd_vel',
+                                            QoSProfile(depth=10))
             except RuntimeError as error:  # the policy of a secured graph may forbid it
                 reason = str(error).partition(',')[0]
                 return (f'this node may not publish cmd_vel ({reason}): allow it in the policy, '
@@ -336,11 +331,10 @@ class CompensationNode(Node):
 
     def _publish_command(self, rate: float) -> None:
         """Publish a rate about z, rad/s."""
-        message = TwistStamped() if self._is_velocity_stamped else Twist()
-        twist = message.twist if self._is_velocity_stamped else message
-        if self._is_velocity_stamped:
+        message = self._velocity_type()
+        if isinstance(message, TwistStamped):
             message.header.stamp = self.get_clock().now().to_msg()
-        twist.angular.z = rate
+        (message if isinstance(message, Twist) else message.twist).angular.z = rate
         assert self._velocity is not None  # `_offer_velocity` comes before a run
         self._velocity.publish(message)
 
@@ -355,7 +349,6 @@ class CompensationNode(Node):
 
 
 def _stamp_ns(header: Any) -> int:
-    """Return a stamp in ns."""
     return header.stamp.sec * NSEC_PER_SEC + header.stamp.nanosec
 
 

@@ -18,6 +18,7 @@ thread ends by a fault of the program, the node ends too, so that a launch file 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 import sys
 import threading
 import time
@@ -26,11 +27,12 @@ from types import SimpleNamespace
 from gyro_calibration.driver.connection import (
     AUTO,
     Connection,
+    ConnectionCounts,
     ConnectionState,
     Decimator,
     SampleMean,
 )
-from gyro_calibration.driver.protocols import PROTOCOLS, Settings
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
 from gyro_calibration.driver.timestamps import (
     NodeTimeConverter,
@@ -38,10 +40,18 @@ from gyro_calibration.driver.timestamps import (
     read_steady_clock,
 )
 from gyro_calibration.logs.cdr import NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, z_axis_covariance
-from gyro_calibration.ros.diagnostics import Diagnostics
-from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import Parameter
-from gyro_calibration.ros.runner import call_every, declare_parameters, publish_on, run_node
+from gyro_calibration.ros.runner import (
+    call_every,
+    declare_parameters,
+    Diagnostics,
+    ERROR,
+    OK,
+    publish_on,
+    Report,
+    run_node,
+    WARN,
+)
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, Temperature
 
@@ -80,11 +90,6 @@ PARAMETERS = (
               (1, 10000)),
 )
 
-_REPORT_INTERVAL = 1.0  # s
-_THREAD_CHECK_INTERVAL = 0.5  # s; interval of checks that the thread runs
-# s; interval of readings of the node's clock, each as costly as a message
-_CLOCK_POLL_INTERVAL = 0.01
-
 
 class DriverNode(Node):
     """
@@ -93,10 +98,6 @@ class DriverNode(Node):
     Stamps are those of the node's clock. With ``use_sim_time`` that is the simulated time, and the
     system time before a simulation starts. A gyro on a port measures in real time: its rates are
     wrong in a simulation that runs faster or slower.
-
-    Raises
-    ------
-    ValueError : a parameter is not valid
 
     """
 
@@ -120,8 +121,8 @@ class DriverNode(Node):
             self.get_logger().warning('use_sim_time is set: stamps follow the simulation, but the '
                                       'gyro on the port turns in real time')
         self._thread.start()
-        call_every(self, _REPORT_INTERVAL, self._diagnostics.publish)
-        call_every(self, _THREAD_CHECK_INTERVAL, self._check_thread)
+        call_every(self, 1.0, self._diagnostics.publish)
+        call_every(self, 0.5, self._check_thread)
 
     def destroy_node(self) -> None:
         """Join the thread, which closes the port, and destroy the node."""
@@ -144,22 +145,18 @@ class DriverNode(Node):
             assert protocol is not None and clock is not None  # they made the samples
             self._messages.variance = protocol.sample_variance(self._settings)
             stamps = [self._node_time.convert(stamp) for stamp in chunk.stamps]
-            for mean in self._decimation.add(chunk.samples, stamps, clock.period):
-                self._publish(mean)
-        self._flush()
+            self._publish(self._decimation.add(chunk.samples, stamps, clock.period))
+        self._publish(self._decimation.flush())
 
-    def _flush(self) -> None:
-        for mean in self._decimation.flush():
-            self._publish(mean)
-
-    def _publish(self, mean: SampleMean) -> None:
-        self._messages.fill(mean)
-        if mean.sample.temperature is not None:
-            self._temperature.publish(self._messages.temperature)
-        self._imu.publish(self._messages.imu)
+    def _publish(self, means: Iterable[SampleMean]) -> None:
+        for mean in means:
+            self._messages.fill(mean)
+            if mean.sample.temperature is not None:
+                self._temperature.publish(self._messages.temperature)
+            self._imu.publish(self._messages.imu)
 
     def _poll_clock(self, arrival: float) -> None:
-        if arrival - self._last_clock_poll < _CLOCK_POLL_INTERVAL:
+        if arrival - self._last_clock_poll < 0.01:  # a reading is as costly as a message
             return
         read = read_clock_pair(read_steady_clock, self._read_node_clock)
         if read is None and self._last_clock_poll:
@@ -176,7 +173,7 @@ class DriverNode(Node):
     def _on_change(self, state: ConnectionState) -> None:
         """Log each failure and recovery of the connection once, not each attempt."""
         if state.problem:
-            self._flush()
+            self._publish(self._decimation.flush())
             self._report.clear()
         if state.problem and state.problem != self._last_problem:
             self._last_problem = self._report.event = state.problem
@@ -194,14 +191,91 @@ class DriverNode(Node):
         self._diagnostics.publish()
 
 
+class DriverReport:
+    """Makes reports of a connection; `event` is the last event, in a sentence."""
+
+    def __init__(self, connection: Connection, port: str, settings: Settings,
+                 clock: Callable[[], float]):
+        self._connection, self._port, self._settings = connection, port, settings
+        self._clock, self._last_counts, self._last_time = clock, ConnectionCounts(), clock()
+        self._rate, self._step_count, self._clock_steps, self.event = 0.0, 0, '0', ''
+        self._new_counts: dict[str, int] = {}
+        self._temperature: float | None = None
+        self._health: dict[str, float] = {}
+
+    def add(self, samples: Iterable[Sample]) -> None:
+        """Store temperature and health of the gyro; may be called from another thread."""
+        for sample in samples:
+            if sample.health:
+                self._health = {**self._health, **sample.health}
+            if sample.temperature is not None:
+                self._temperature = sample.temperature
+
+    def add_clock_step(self, step: float) -> None:
+        """Count a step of the clock of the stamps, s."""
+        self._step_count += 1
+        self._clock_steps = f'{self._step_count}, last by {step:+.1f} s'
+        self.event = f'the clock of this computer was set by {step:+.1f} s; the stamps follow it'
+
+    def clear(self) -> None:
+        """Clear temperature and health while the gyro is silent; from any thread."""
+        self._temperature, self._health = None, {}
+
+    def make(self) -> Report:
+        """Return level, message and values."""
+        counts, now, connection = self._connection.counts(), self._clock(), self._connection
+        elapsed = now - self._last_time
+        if elapsed >= 0.5:
+            self._new_counts = {name: count - getattr(self._last_counts, name)
+                                for name, count in vars(counts).items()}
+            self._rate = self._new_counts.pop('samples') / elapsed
+            self._last_counts, self._last_time = counts, now
+        # The other thread may clear these meanwhile.
+        last, clock, protocol = self._temperature, connection.clock, connection.protocol
+        return *self._evaluate(), {
+            'port': self._port, 'device': connection.path, 'state': connection.state.name,
+            'protocol': protocol.name if protocol else '', 'baud': connection.baud,
+            'detected': connection.detected, 'reopened': max(0, connection.open_count - 1),
+            'waiting_s': f'{connection.state.retry_delay:.1f}',
+            'waited_s': f'{connection.waited_duration:.1f}',
+            'last_error': connection.last_error, **vars(counts), 'rate_hz': f'{self._rate:.1f}',
+            'longest_gap_s': f'{connection.longest_gap:.3f}', 'clock_steps': self._clock_steps,
+            **({} if clock is None or protocol is None else {
+                'period_ms': f'{1e3 * clock.period:.6g}',
+                'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
+                'jitter_before_ms': f'{1e3 * clock.jitter[0]:.3g}',
+                'jitter_after_ms': f'{1e3 * clock.jitter[1]:.3g}'}),
+            **({} if last is None else {'temperature_degc': f'{last:.2f}'}),
+            **{name: f'{value:.4g}' for name, value in self._health.items()},
+            'last_event': self.event,
+        }
+
+    def _evaluate(self) -> tuple[bytes, str]:
+        state = self._connection.state
+        if state.name == 'failed':
+            return ERROR, state.problem
+        if state.name != 'reading':
+            return WARN, {'opening': 'opening the port',
+                          'listening': 'listening for a protocol'}[state.name]
+        grown = [f'{name.replace("_", " ")} {count}'
+                 for name, count in self._new_counts.items() if count > 0]
+        warnings = [f'in the last second there were: {", ".join(grown)}'] if grown else []
+        protocol, clock = self._connection.protocol, self._connection.clock
+        if protocol is not None and clock is not None:
+            for name, (low, high) in protocol.normal_ranges.items():
+                value = self._health.get(name)
+                if value is not None and not low <= value <= high:
+                    warnings.append(f'{name} is {value:.4g}, but should be from {low:g} to '
+                                    f'{high:g}: check the supply, then have the gyro checked')
+            if (clock.is_settled
+                    and (wrong := protocol.sample_rate_warning(self._settings, clock.period))):
+                warnings.append(wrong)
+        return (WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (
+            OK, 'samples come')
+
+
 class SampleMessages:
-    """
-    Reusable messages of samples, whose values are set for each sample.
-
-    The variance of the temperature is 0, which stands for unknown; `variance` is that of the rate
-    of one sample, (rad/s)².
-
-    """
+    """Reusable messages of samples; `variance` is that of the rate of one sample, (rad/s)²."""
 
     def __init__(self, frame_id: str):
         self.imu, self.temperature, self.variance = Imu(), Temperature(), 0.0
@@ -231,7 +305,7 @@ class SampleMessages:
 
 
 def settings_from_parameters(values: SimpleNamespace) -> Settings:
-    """Return the settings of a gyro by the parameters; raise as `Settings` does."""
+    """Return the settings of a gyro; raise `ValueError` where they do not fit together."""
     return Settings(values.sensitivity or None, _TRISTATE[values.invert], values.axis,
                     tuple(values.columns), values.full_scale or None,
                     _TRISTATE[values.increments], values.sample_rate or None)

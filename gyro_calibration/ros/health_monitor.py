@@ -31,33 +31,15 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-#: Duration of a stretch, of its parts in the test of steadiness, and of the blocks in the test of
-#: noise, s.
-STRETCH_DURATION, _PART_DURATION, _BLOCK_DURATION = 10.0, 1.0, 0.05
-#: Longest interval between samples in a stretch, s.
-_MAX_SAMPLE_INTERVAL = 0.5
+#: Duration of a stretch, and of its parts in the test of steadiness, s.
+STRETCH_DURATION, _PART_DURATION = 10.0, 1.0
 #: Largest accepted ratio of the noise to that of the model; figures are inexact and change.
 _MAX_NOISE_RATIO = 1.25
 #: Largest accepted ratio of the noise of the model to the measured one: a filtered output has less
 #: noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
-#: Largest ratio of the variance of parts to that by noise; with 9 degrees of freedom chance
-#: exceeds it once in a million stretches.
-_MAX_VARIANCE_RATIO = 6.0
-#: Probability of a false report that a calibration differs from the previous one.
-FALSE_CHANGE_PROBABILITY = 1e-3
-#: Least number and duration, s, of equal values that count as repeated: a gyro with noise of 2
-#: steps of its output, _QUIET times less than in the model, repeats a value with probability 0.2.
-_MIN_REPEATS, _MIN_REPEAT_DURATION = 20, 0.25
-#: Limit of -ln of the probability of as many repeats, beyond which a gyro with larger steps is
-#: dead too: e^-25 for a gyro that sends each sample four times.
-_MIN_REPEAT_EVIDENCE = 100.0
-#: Number of changes after which the step of the output is known.
-_MIN_OUTPUT_CHANGES = 100
 #: Least rate of a turn by odometry, rad/s.
 _MIN_TURN_RATE = 0.05
-#: Largest angular deceleration of a robot, rad/s².
-_MAX_DECELERATION = 20.0
 #: Number of successive stretches that decide in an unannounced rest: a robot on a straight path
 #: may vibrate for some time.
 _DECIDING_STRETCHES = 3
@@ -67,7 +49,6 @@ _DECIDING_STRETCHES = 3
 class RestResult:
     """The result of one stretch at rest."""
 
-    time: float  # of its end, s
     noise_ratio: float  # standard deviation of the noise over that of the model
     is_noise_normal: bool  # within chance and tolerance
     bias: float  # mean rate, rad/s
@@ -81,9 +62,9 @@ class RepeatedOutputDetector:
     """
     Detector of a gyro that repeats one value: it is dead, saturated, or its driver has stopped.
 
-    A value counts as repeated if odometry shows a different rate, if the noise is larger than the
-    steps of the output, or if chance is excluded. Some gyros report zero at rest: a repeated zero
-    counts only after a deceleration that no robot has.
+    20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the noise is
+    larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
+    a repeated zero counts only after a deceleration that no robot has, 20 rad/s².
 
     """
 
@@ -97,39 +78,34 @@ class RepeatedOutputDetector:
         if output != self._value:
             step = abs(output - self._value)
             self._step = min(step, self._step)
-            self._had_sudden_stop = (step > _MIN_TURN_RATE
-                                     + _MAX_DECELERATION * abs(time - self._since))
+            self._had_sudden_stop = step > _MIN_TURN_RATE + 20.0 * abs(time - self._since)
             self._value, self._since, self._count = output, time, 0
             self._changes += 1
             return False
         self._count += 1
         lasts = time - self._since
-        if self._count < _MIN_REPEATS or lasts < _MIN_REPEAT_DURATION:
+        if self._count < 20 or lasts < 0.25:
             return False
         if (lasts > _PART_DURATION and abs(odometry_rate) > _MIN_TURN_RATE
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
-        if (output == 0.0 and not self._had_sudden_stop or self._changes <= _MIN_OUTPUT_CHANGES
-                or not sample):
+        # the step of the output is known after 100 changes
+        if output == 0.0 and not self._had_sudden_stop or self._changes <= 100 or not sample:
             return False
-        # probability of one more equal sample, for low noise around the value
+        # probability of one more equal sample, for low noise around the value; that of all must be
+        # below e^-100, since it is e^-25 for a gyro that sends each sample four times
         repeats = math.erf(_MAX_NOISE_REDUCTION * self._step / (2.0 * math.sqrt(2.0) * sample))
         return (2.0 * _MAX_NOISE_REDUCTION * self._step < sample
-                or -self._count * math.log(max(repeats, 1e-9)) > _MIN_REPEAT_EVIDENCE)
+                or -self._count * math.log(max(repeats, 1e-9)) > 100.0)
 
 
 class HealthMonitor:
     """
     Monitor of noise and bias at rest on a robot.
 
-    Attributes
-    ----------
-    standstill_rate : means below this, rad/s, are rest; one above may be a steady turn, and counts
-        only if it is the same in several stretches
-    noise_alarm, bias_alarm : one sentence each, '' without an alarm
-    last_rest : the last stretch at rest, or None
-    examined_count : number of stretches at rest
+    `noise_alarm` and `bias_alarm` are a sentence each, or ''; `last_rest` is the last stretch at
+    rest, or None, and `examined_count` the number of them.
 
     """
 
@@ -141,7 +117,8 @@ class HealthMonitor:
         ----------
         noise : of the model; without an angle random walk the monitor is off
         false_alarm_rate : largest rate of false alarms at rest, 1/h; 0 switches the monitor off
-        standstill_rate : see above, rad/s
+        standstill_rate : means below this, rad/s, are rest; one above may be a steady turn, and
+            counts only if it is the same in several stretches
 
         """
         self._noise, self.standstill_rate = noise, standstill_rate
@@ -170,33 +147,15 @@ class HealthMonitor:
         self.bias_alarm = ''
 
     def add(self, time: float, output: float, rate: float) -> bool:
-        """
-        Add a sample: its stamp, s, output and corrected rate, rad/s.
-
-        Return whether a stretch is complete and `examine_stretch` is to be called.
-
-        """
-        if self._samples and not 0.0 < time - self._samples[-1][0] <= _MAX_SAMPLE_INTERVAL:
+        """Add a sample, s and rad/s; return whether `examine_stretch` is to be called."""
+        if self._samples and not 0.0 < time - self._samples[-1][0] <= 0.5:
             self.restart()
         self._samples.append((time, output, rate))
         return time - self._samples[0][0] >= STRETCH_DURATION
 
     def examine_stretch(self, bias_variance: float, age: float,
                         is_announced: bool = False) -> RestResult | None:
-        """
-        Test the complete stretch, and start the next one.
-
-        Parameters
-        ----------
-        bias_variance : of the bias by its calibration, (rad/s)²; nan where it is not known
-        age : of that calibration, s
-        is_announced : whether the rest was announced
-
-        Returns
-        -------
-        the result; None where the rate is not steady, so that it is no rest
-
-        """
+        """Test the complete stretch as `examine_stretch` does, and start the next one."""
         time, output, rate = np.array(self._samples).T
         self.restart()
         if np.ptp(output) > 0.0:
@@ -211,8 +170,8 @@ class HealthMonitor:
 
     def _set_alarms(self, rest: RestResult) -> None:
         last, several = self._rests, len(self._rests) == _DECIDING_STRETCHES
-        biases = [each.bias for each in last]
         # the mean was the same in the last stretches, unlike in turns
+        biases = [each.bias for each in last]
         stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)
         if rest.is_noise_normal:
             self.noise_alarm = ''
@@ -246,7 +205,9 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     noise : of the model
     level : probability of each of the four false alarms
     step : quantization step of the output, rad/s; inf where the output never changed
-    bias_variance, age, is_announced : as in `HealthMonitor.examine_stretch`
+    bias_variance : of the bias by its calibration, (rad/s)²; nan where it is not known
+    age : of that calibration, s
+    is_announced : whether the rest was announced
 
     Returns
     -------
@@ -256,76 +217,65 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
     if max(np.abs(output).max(), np.abs(rate).max()) > MAX_MAGNITUDE:
         return None  # the squares may overflow
     interval = (time[-1] - time[0]) / (len(time) - 1)
-    size = max(1, round(_BLOCK_DURATION / interval))
+    size = max(1, round(0.05 / interval))  # blocks of 0.05 s
     if len(time) < 20 * size or step == math.inf:
         return None
-    sample_variance = noise.allan_variance(interval)
-    hidden = step > 2.0 * math.sqrt(sample_variance)
+    hidden = step > 2.0 * math.sqrt(noise.allan_variance(interval))
     rounding = step * step * (0.25 if hidden else 1.0 / 12.0) / size
     # differences of means over neighbouring blocks, each block used once
     blocks = output[:len(output) // (2 * size) * 2 * size].reshape(-1, 2, size).mean(axis=2)
     squares = (blocks[:, 1] - blocks[:, 0]) ** 2
-    measured, claimed = 0.5 * float(np.mean(squares)), noise.allan_variance(size * interval)
-    largest = max(measured, claimed + rounding)
-    if not _is_steady(time, rate, largest * size * interval, noise):
+    count, measured = len(squares), 0.5 * float(np.mean(squares))
+    claimed = noise.allan_variance(size * interval)
+    spectrum = max(measured, claimed + rounding) * size * interval
+
+    # the parts of a steady rate differ within noise; with 9 degrees of freedom chance exceeds the
+    # ratio of 6 once in a million stretches
+    part = ((time - time[0]) / _PART_DURATION).astype(int)
+    samples = np.bincount(part)
+    means = (np.bincount(part, rate) / np.maximum(samples, 1))[samples > 0.5 * samples.max()]
+    explained = (spectrum / _PART_DURATION
+                 + noise.mean_change_variance(STRETCH_DURATION, _PART_DURATION))
+    if len(means) < 2 or not means.var(ddof=1) <= 6.0 * explained:
         return None
-    count = len(squares)
+
     too_much = (chdtrc(count, count * measured / ((claimed + rounding) * _MAX_NOISE_RATIO ** 2))
                 < level)
     too_little = (not hidden
                   and chdtr(count, count * measured * _MAX_NOISE_REDUCTION ** 2 / claimed) < level)
-    return RestResult(float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
-                      *_test_bias(time, rate, largest * size * interval, noise, level,
-                                  bias_variance, age, 0.5 * step if hidden else 0.0), is_announced)
-
-
-def _test_bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
-               bias_variance: float, age: float,
-               rounding_error: float) -> tuple[float, float, bool, float]:
-    """Return the mean rate, its number of sigmas, whether it fits, and its deviation by noise."""
+    rounding_error = 0.5 * step if hidden else 0.0
     duration, mean = float(time[-1] - time[0]), float(rate.mean())
     of_noise = spectrum / duration + rounding_error ** 2
     variance = of_noise + noise.mean_change_variance(age, duration) + bias_variance
     sigmas = (max(abs(mean) - rounding_error, 0.0)
               / math.sqrt(variance) if variance > 0.0 else math.nan)
-    fits = not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level
-    return mean, sigmas, fits, math.sqrt(of_noise + noise.mean_change_variance(duration, duration))
-
-
-def _is_steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
-    """Return whether parts of the stretch differ within noise; False for a single part."""
-    part = ((time - time[0]) / _PART_DURATION).astype(int)
-    count = np.bincount(part)
-    means = (np.bincount(part, rate) / np.maximum(count, 1))[count > 0.5 * count.max()]
-    explained = (spectrum / _PART_DURATION
-                 + noise.mean_change_variance(STRETCH_DURATION, _PART_DURATION))
-    return len(means) > 1 and bool(means.var(ddof=1) <= _MAX_VARIANCE_RATIO * explained)
+    return RestResult(
+        math.sqrt(measured / claimed), not (too_much or too_little), mean, sigmas,
+        not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level,
+        math.sqrt(of_noise + noise.mean_change_variance(duration, duration)), is_announced)
 
 
 def describe_change(previous: SelfCalibration, current: SelfCalibration, noise: Noise, age: float,
-                    level: float = FALSE_CHANGE_PROBABILITY) -> str:
+                    level: float = 1e-3) -> str:
     """
-    Return a sentence on the change of a calibration beyond noise; '' within noise.
+    Return a sentence on the change of a calibration after some time, s, beyond noise, or ''.
 
-    Parameters
-    ----------
-    previous : previous calibration; an infinite variance is that of an unknown value
-    current : new calibration
-    noise : of the model, for the drift of the bias
-    age : time between the two, s
-    level : probability of a false report
+    The noise is that of the model, for the drift of the bias; the level is the probability of a
+    false report. An infinite variance is that of an unknown value.
 
     """
     if previous.covariance is None or current.covariance is None:
         return ''
-    variances = (np.diagonal(previous.covariance) + np.diagonal(current.covariance)
-                 + [0.0, noise.mean_change_variance(age, STRETCH_DURATION)])
-    differences = np.array([current.scale_factor_error - previous.scale_factor_error,
-                            current.bias - previous.bias])
-    sigmas = np.abs(differences) / np.sqrt(variances)
-    found = [f'the {name} changed by {text} ({size:.1f} sigma)' for name, text, size in zip(
-        ('scale factor error', 'bias'),
-        (f'{100 * differences[0]:.3f} %', f'{differences[1] / DEGREE:.4f} deg/s'), sigmas)
-        if math.erfc(size / math.sqrt(2.0)) < 0.5 * level]
+    scale, bias = (np.diagonal(previous.covariance) + np.diagonal(current.covariance)).tolist()
+    found = []
+    change = current.scale_factor_error - previous.scale_factor_error
+    turned = current.bias - previous.bias
+    for name, size, text, variance in (
+            ('scale factor error', change, f'{100.0 * change:.3f} %', scale),
+            ('bias', turned, f'{turned / DEGREE:.4f} deg/s',
+             bias + noise.mean_change_variance(age, STRETCH_DURATION))):
+        sigmas = float(np.abs(size) / np.sqrt(variance))
+        if math.erfc(sigmas / math.sqrt(2.0)) < 0.5 * level:
+            found.append(f'the {name} changed by {text} ({sigmas:.1f} sigma)')
     return (f'{" and ".join(found)}, more than the model predicts; '
             'if this occurs again, diagnose a log' if found else '')

@@ -48,9 +48,7 @@ class Parameter:
         """
         Return the value in the type of the default; an integer is accepted for a float.
 
-        Raises
-        ------
-        ValueError : the value is not valid; the message states the valid ones
+        A `ValueError` states the valid ones.
 
         """
         if isinstance(self.default, float) and type(value) is int and abs(value) < 1 << 63:

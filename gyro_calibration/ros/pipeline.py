@@ -93,29 +93,20 @@ PARAMETERS = (
               'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
-#: Rate of rests that are taken for motion, 1/h of rest.
-_REST_FALSE_ALARMS = 0.1
-#: Rate of false alarms of the monitor of noise and bias, 1/h of rest.
-_HEALTH_FALSE_ALARMS = 0.001
+#: Upper limit of ROS time, ns: `builtin_interfaces/Time` has 31 bits for seconds.
+_MAX_ROS_TIME = NSEC_PER_SEC << 31
 #: Silence after which the gyro may have been without power, s; its bias may have changed.
 _POWER_OFF_SILENCE = 10.0
 #: Averaging time of the rate that must be zero before a drive, s.
 _TURN_CHECK_DURATION = 0.5
-#: Least number of standard deviations of a mean rate that shows a turn.
-_TURN_LIMIT_SIGMAS = 4.0
 #: Largest angular acceleration of a turn between two samples, rad/s²: the default of Nav2's
 #: controllers.
 _MAX_ANGULAR_ACCELERATION = 3.2
 #: Largest step of the temperature that is used at once, K; a larger one must be confirmed by the
 #: next.
 _MAX_TEMPERATURE_STEP = 5.0
-#: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill,
-#: and for how long, s.
-_MAX_HEADING_CHANGE_AT_REST, _ODOMETRY_DISTRUST_DURATION = 1.0 * DEGREE, 600.0
-#: Upper limit of ROS time, ns: `builtin_interfaces/Time` has 31 bits for seconds.
-_MAX_ROS_TIME = NSEC_PER_SEC << 31
-#: Time over which stamps and clock are compared, s; a deviation of 9 % exceeds the tolerance.
-_CLOCK_COMPARISON_TIME = 30.0
+#: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill.
+_MAX_HEADING_CHANGE_AT_REST = 1.0 * DEGREE
 #: Two jumps back of the stamps within this time, s, show several publishers.
 _INTERLEAVING_WINDOW = 1.0
 
@@ -144,25 +135,21 @@ COUNT_NAMES = ('samples', 'refused_samples', 'refused_temperatures', 'lost_sampl
 class Journal:
     """Events and counts so far."""
 
-    #: Time of the last sample, s of the steady clock.
-    last_received: float
-    #: Counts of samples and of their faults.
+    last_received: float  # time of the last sample, s of the steady clock
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNT_NAMES, 0))
-    #: The last event, and the steps of the host clock, as text.
-    event: str = ''
-    clock_steps: str = ''
-    #: Number of refused calibrations, and the last reasons.
+    event: str = ''  # the last one
+    clock_steps: str = ''  # of the host clock
     refused_calibrations: int = 0
     refusal_reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
-    #: Further channels in the samples.
-    channels: set[str] = field(default_factory=set)
+    channels: set[str] = field(default_factory=set)  # further ones in the samples
 
 
 def _tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
     """Return the settings of the tracker; with unknown noise the threshold filter is used."""
     rate = 0.0 if values.stationary_method == 'none' else values.stationary_threshold
     threshold = Threshold(rate, angle_random_walk=noise.angle_random_walk)
-    alarms = _REST_FALSE_ALARMS if values.stationary_method == 'rest' else 0.0
+    # rests that are taken for motion, 1/h of rest
+    alarms = 0.1 if values.stationary_method == 'rest' else 0.0
     return Settings(alarms, threshold, values.maximum_gap)
 
 
@@ -170,15 +157,9 @@ class Pipeline:
     """
     Computes corrected rates and the heading from raw samples.
 
-    Attributes
-    ----------
-    values : the parameters of the node
-    store, estimator, monitor, wheels, session, journal, ros_time : its parts
-    conflict : why samples cannot be used, in a sentence; ''
-    publisher_conflict : that the graph lists several publishers, in a sentence; ''
-    repeat_fault : that the gyro repeats one value, in a sentence; ''
-    clock_fault : that stamps and clock advance differently, in a sentence; ''
-    odometry_fault : why odometry does not show standstill, in a sentence; ''
+    `conflict` says why samples cannot be used, `publisher_conflict` that the graph lists several
+    publishers, `repeat_fault` that the gyro repeats one value, and `clock_fault` that stamps and
+    clock advance differently, each in a sentence or ''.
 
     """
 
@@ -187,27 +168,23 @@ class Pipeline:
         """
         Read model and last calibration; faults of the files are reported.
 
-        Parameters
-        ----------
-        values : record of `PARAMETERS`
-        calibration_file : where self-calibrations are kept
-        clock : of the node
-        send : publishes a rate about z on cmd_vel, rad/s
+        `values` are those of `PARAMETERS`; `send` publishes a rate about z on cmd_vel, rad/s.
 
         """
         self.values, self._clock = values, clock
-        biases = calibration_file.with_name(f'{calibration_file.stem}_biases.yaml')
-        self._assumptions = Assumptions(values.assumed_bias, values.assumed_scale_factor_error,
-                                        values.assumed_bias_temperature_coefficient)
-        prior = Prior(coefficient=values.assumed_bias_temperature_coefficient)
-        self.store = store = StateStore(values.model_file, calibration_file, biases, prior)
+        coefficient = values.assumed_bias_temperature_coefficient
+        self.store = store = StateStore(
+            values.model_file, calibration_file,
+            calibration_file.with_name(f'{calibration_file.stem}_biases.yaml'),
+            Prior(coefficient=coefficient))
         noise = store.model.noise
         self._tracking_settings = _tracker_settings(values, noise)
-        self.estimator = HeadingEstimator(store.model, store.table, self._assumptions,
-                                          self._tracking_settings, TEMPERATURE_TIMEOUT,
-                                          clock.date())
-        self.monitor = HealthMonitor(noise, _HEALTH_FALSE_ALARMS,
-                                     self._tracking_settings.threshold.rate)
+        self.estimator = HeadingEstimator(
+            store.model, store.table,
+            Assumptions(values.assumed_bias, values.assumed_scale_factor_error, coefficient),
+            self._tracking_settings, TEMPERATURE_TIMEOUT, clock.date())
+        # false alarms: 0.001 per hour of rest
+        self.monitor = HealthMonitor(noise, 0.001, self._tracking_settings.threshold.rate)
         self.wheels, self.journal = Wheels(), Journal(clock.steady())
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host_time = RosTime(), HostTimeConverter()
@@ -227,14 +204,18 @@ class Pipeline:
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._frozen_stamp: tuple[float, float] | None = None
         self.repeat_fault, self._repeat_detector = '', RepeatedOutputDetector(noise)
-        self.clock_fault, self._suspected_clock_fault, self._stamp_delay = '', '', StampDelay(
-            clock, _INTERLEAVING_WINDOW, _CLOCK_COMPARISON_TIME)
+        self.clock_fault = self._suspected_clock_fault = ''
+        self._stamp_delay = self._new_stamp_delay()
         self._suspect_temperature = math.nan  # a temperature, degC
         # Odometry heading when its rate became zero, rad, and time of a contradiction, s.
         self._heading_at_rest, self._contradiction_time = math.nan, -math.inf
         self._recent_rates, self._known_beginnings = deque[tuple[float, float]](), 0
 
     # Time
+
+    def _new_stamp_delay(self) -> StampDelay:
+        """Return a comparison of stamps and clock, whose tolerance a deviation of 9 % exceeds."""
+        return StampDelay(self._clock, _INTERLEAVING_WINDOW, window=30.0)
 
     def _since_epoch(self, stamp: int) -> float:
         """Return s since the second of the first stamp, so that a double resolves nanoseconds."""
@@ -247,15 +228,6 @@ class Pipeline:
         since = self._since_epoch(stamp)
         return (since if self._last_time == -math.inf
                 else self._host_time.convert_message(since, self._last_time))
-
-    def _sample_time(self, stamp: int, silence: float) -> float:
-        """Return the time of a sample, s, after a silence, s."""
-        since = self._since_epoch(stamp)
-        if self._clock.simulated() is not None:
-            return since
-        self._update_host_clock()
-        return self._host_time.convert_sample(since, self._last_time, self._usual_interval,
-                                              silence)
 
     def _update_host_clock(self) -> None:
         """Detect steps of the host clock, and correct stored dates by them."""
@@ -312,8 +284,8 @@ class Pipeline:
 
     @property
     def odometry_fault(self) -> str:
-        """Return why odometry does not show standstill, in a sentence; ''."""
-        if self._clock.steady() - self._contradiction_time > _ODOMETRY_DISTRUST_DURATION:
+        """Return why odometry does not show standstill; ''."""
+        if self._clock.steady() - self._contradiction_time > 600.0:  # s
             return ''
         return ('odom turns by its headings while its rate is zero: check its twist, without '
                 'which it does not show that the robot stands')
@@ -326,7 +298,7 @@ class Pipeline:
     def add_sample(self, stamp: int, output: float, specific_force: float | None = None,
                    receivers: int = 0, frame: str = '') -> CorrectedSample | None:
         """
-        Take a sample.
+        Return a sample corrected, or None where it cannot be used.
 
         Parameters
         ----------
@@ -335,10 +307,6 @@ class Pipeline:
         specific_force : along the input axis, m/s²; None if unknown
         receivers : number of other nodes that receive cmd_vel
         frame : of the gyro
-
-        Returns
-        -------
-        the corrected sample, or None where the sample cannot be used
 
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
@@ -363,7 +331,11 @@ class Pipeline:
         if self.conflict:
             counts['refused_samples'] += 1
             return None
-        time = self._sample_time(stamp, silence)
+        time = self._since_epoch(stamp)
+        if self._clock.simulated() is None:
+            self._update_host_clock()
+            time = self._host_time.convert_sample(time, self._last_time, self._usual_interval,
+                                                  silence)
         if time == self._last_time:
             counts['repeated_stamps'] += 1
             first, fastest = self._frozen_stamp or (now, 0.0)
@@ -385,8 +357,18 @@ class Pipeline:
             self.estimator.begin_run(self._clock.date())
         self._last_time = time
         journal.channels = set() if specific_force is None else {'specific_force'}
-        return self._process_sample(stamp, time, (interval, silence), output, specific_force, now,
-                                    receivers)
+        if not self._integrate(time, (interval, silence), output, specific_force, now):
+            return None
+        self._stamp_delay.add(time)
+        self._check_repeats(time, output, now)
+        run = self.session.run
+        if self.monitor.is_enabled and self.monitor.add(time, output,
+                                                        self.estimator.corrected_rate):
+            self.monitor.examine_stretch(self.estimator.bias_variance,
+                                         self.estimator.bias_age(self._clock.date()),
+                                         run is not None and run.kind == REST)
+        self.session.add(time, output, receivers)
+        return self._corrected_sample(stamp, time)
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
@@ -395,55 +377,59 @@ class Pipeline:
             self._refuse_all(f'{what}, as with several gyros on one topic: give each gyro a topic '
                              'of its own')
 
-    def _process_sample(self, stamp: int, time: float, since: tuple[float, float], output: float,
-                        force: float | None, now: float, receivers: int) -> CorrectedSample | None:
-        """Compensate and integrate a sample; `since` is the interval by stamps and arrivals, s."""
-        estimator, counts, refused = (self.estimator, self.journal.counts,
-                                      self.estimator.refused_count)
+    def _integrate(self, time: float, since: tuple[float, float], output: float,
+                   force: float | None, now: float) -> bool:
+        """
+        Compensate and integrate a sample, and tell whether it was used.
+
+        `since` is the interval from the sample before, by stamps and by arrivals, s.
+
+        """
+        estimator, journal, refused = self.estimator, self.journal, self.estimator.refused_count
+        counts, intervals = journal.counts, estimator.tracker.intervals
         sources = _WHEEL_SOURCES[self.values.wheels]
         moving = self.wheels.is_moving(now, sources) if sources else None
-        (interval, silence), received = since, self.journal.last_received
-        lost = estimator.tracker.intervals.lost_samples
+        (interval, silence), lost = since, intervals.lost_samples
         unseen = not 0.0 < interval <= DRIVE_SAMPLE_TIMEOUT
-        if unseen and not moving and not self.wheels.has_stood(received, now, sources):
+        if unseen and not moving and not self.wheels.has_stood(journal.last_received, now,
+                                                               sources):
             moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused_count > refused:
             counts['refused_samples'] += 1
-            self.journal.event = (f'a rate of {output:g} rad/s is beyond the range of this gyro: '
-                                  'the sample is not used')
-            return None
-        self.journal.last_received, tracker = now, estimator.tracker
+            journal.event = (f'a rate of {output:g} rad/s is beyond the range of this gyro: '
+                             'the sample is not used')
+            return False
+        journal.last_received, tracker = now, estimator.tracker
         counts['temperature_clipped'] += int(estimator.last_compensated.temperature_clipped)
         counts['beyond_range'] += int(estimator.last_compensated.beyond_range)
         counts['lost_samples'] = tracker.intervals.lost_samples
         counts['rebuilt'] = tracker.rebuild_count
         if restarted:
-            self._note_restart(restarted)
+            counts['restarts'] += 1
+            journal.event = f'{restarted}: integration was restarted'
+            self.monitor.restart()
+            self._stamp_delay = self._new_stamp_delay()
+            self._recent_rates.clear()
+            self.session.interrupt(restarted)
         elif unseen and moving is not False and tracker.intervals.lost_samples > lost:
             turned = 0.25 * _MAX_ANGULAR_ACCELERATION * interval ** 2
             if silence < 0.5 * interval:  # the stamps may have jumped without a loss
                 turned += abs(estimator.rate) * interval
             self._add_unknown_turn(turned)
-        self._stamp_delay.add(time)
-        self._check_repeats(time, output, now)
-        if self.monitor.is_enabled and self.monitor.add(time, output, estimator.corrected_rate):
-            run = self.session.run
-            self.monitor.examine_stretch(estimator.bias_variance,
-                                         estimator.bias_age(self._clock.date()),
-                                         run is not None and run.kind == REST)
-        if self.session.run:
-            self.session.add(time, output, receivers)
-        known = self._noise_is_known
-        spread = (0.0
-                  if known and self._usual_interval < math.inf else self.values.assumed_bias ** 2)
+        return True
+
+    def _corrected_sample(self, stamp: int, time: float) -> CorrectedSample | None:
+        """Return what is published of the present state; None where it is not finite."""
+        estimator, tracker, known = self.estimator, self.estimator.tracker, self._noise_is_known
+        spread = (0.0 if known and self._usual_interval < math.inf
+                  else self.values.assumed_bias ** 2)
         # After a reset the variance is that of one sample; zero would state an exact heading.
         least = tracker.rate_variance * min(self._usual_interval, 1.0) ** 2
         found = CorrectedSample(stamp + self._stamp_offset, tracker.heading,
                                 max(tracker.variance, least) if known else UNMEASURED_VARIANCE,
                                 estimator.rate, tracker.rate_variance + spread)
-        if not math.isfinite(found.heading + found.heading_variance + found.rate
-                             + found.rate_variance):
+        if not math.isfinite(sum(found[1:])):
             return None
         if estimator.restart_count != self._known_beginnings:  # another calibration is in use
             self._known_beginnings = estimator.restart_count
@@ -469,14 +455,6 @@ class Pipeline:
             self._add_unknown_turn(math.tau)
             if self.session.is_driving:
                 self.session.end(self.repeat_fault)
-
-    def _note_restart(self, reason: str) -> None:
-        self.monitor.restart()
-        self.journal.counts['restarts'] += 1
-        self.journal.event = f'{reason}: integration was restarted'
-        self._stamp_delay = StampDelay(self._clock, _INTERLEAVING_WINDOW, _CLOCK_COMPARISON_TIME)
-        self._recent_rates.clear()
-        self.session.interrupt(reason)
 
     # Conflicts and obstacles
 
@@ -545,8 +523,7 @@ class Pipeline:
         bias, deviation = self.estimator.tracker.bias
         rate = sum(each for _, each in self._recent_rates) / max(len(self._recent_rates), 1) - bias
         noise = self.store.model.noise.angle_random_walk / math.sqrt(_TURN_CHECK_DURATION)
-        if abs(rate) > _TURN_LIMIT_SIGMAS * math.hypot(
-                deviation, noise, self._tracking_settings.threshold.rate):
+        if abs(rate) > 4.0 * math.hypot(deviation, noise, self._tracking_settings.threshold.rate):
             return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: stop the robot, or, if '
                     'it stands, call calibrate_bias first')
         return ''

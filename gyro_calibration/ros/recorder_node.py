@@ -39,9 +39,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-_DRAIN_TIMEOUT = 10.0  # s; longest time for the messages in the queues when a recorder is stopped
-_POLL_INTERVAL = 0.3  # s; interval of queries of the graph
-_MAX_DOMAIN_ID = 232  # beyond it UDP ports exceed 65535, and Fast DDS ends the process
 _TYPE_ALIASES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
 
 
@@ -49,21 +46,8 @@ class RecorderNode(Node):
     """
     Subscribes to topics as they appear, and hands over each message with its definition.
 
-    Parameters
-    ----------
-    topics : sequence of str
-    all_topics : whether all other topics are recorded too
-    on_message : is called with each message and its definition
-
-    Attributes
-    ----------
-    topics : full names of the requested topics
-    unknown_topics : topics whose type is not installed, and the reason
-    message_count : number of received messages
-
-    Raises
-    ------
-    LogError : a topic name is not valid
+    `topics` are the full names of the requested ones; `unknown_topics` those whose type is not
+    installed, with the reason.
 
     """
 
@@ -71,14 +55,20 @@ class RecorderNode(Node):
                  on_message: Callable[[Message, str], None], context: rclpy.Context):
         super().__init__('gyro_calibration_recorder', context=context,
                          start_parameter_services=False, enable_rosout=False)
-        self.topics = tuple(_resolve_topic(self, topic) for topic in topics)
+        self.topics: list[str] = []
+        for topic in topics:
+            try:
+                self.topics.append(self.resolve_topic_name(topic))
+            except (RuntimeError, ValueError) as error:
+                raise LogError(f'{topic} is no topic name ({_describe_error(error)}); give '
+                               'another') from None
         self.unknown_topics: dict[str, str] = {}
         self.message_count = 0
         self._all_topics, self._on_message = all_topics, on_message
         self._subscriptions_of: dict[str, tuple] = {}
         self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         self.poll()
-        call_every(self, _POLL_INTERVAL, self.poll)
+        call_every(self, 0.3, self.poll)
 
     @property
     def missing_topics(self) -> list[str]:
@@ -120,14 +110,6 @@ class RecorderNode(Node):
             load_message_class(kind), topic, take, qos, raw=True)
 
 
-def _resolve_topic(node: Node, topic: str) -> str:
-    try:
-        return str(node.resolve_topic_name(topic))
-    except (RuntimeError, ValueError) as error:
-        raise LogError(f'{topic} is no topic name ({_describe_error(error)}); give '
-                       'another') from None
-
-
 def _describe_error(error: Exception) -> str:
     """Return the text of an error of rclpy, without the place in its source."""
     return str(error).partition(', at /')[0]
@@ -146,12 +128,8 @@ def _compatible_qos(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
 
 
 def load_message_class(kind: str) -> Any:
-    """
-    Return the class of a message type such as ``sensor_msgs/msg/Imu``.
-
-    Other nodes name the types, so only modules of the form ``package.msg`` are imported.
-
-    """
+    """Return the class of a message type such as ``sensor_msgs/msg/Imu``."""
+    # other nodes name the types, so only modules of the form ``package.msg`` are imported
     if not re.fullmatch(r'\w+/msg/\w+', kind):
         raise ImportError(f'{kind} is no kind of messages')
     package, _, name = kind.split('/')
@@ -187,13 +165,10 @@ def take_messages(topics: Sequence[str], all_topics: bool,
                   on_message: Callable[[Message, str], None], tick: Callable[[RecorderNode], None],
                   stop: threading.Event) -> None:
     """
-    Receive the messages of topics until stopped.
+    Receive the messages of these topics, or of all, until an event is set.
 
-    Parameters
-    ----------
-    topics, all_topics, on_message : as for `RecorderNode`
-    tick : is called at least every 50 ms, with the node
-    stop : event that ends the recording
+    `on_message` is called with each message and its definition, and `tick` at least every 50 ms
+    with the node.
 
     Raises
     ------
@@ -203,8 +178,8 @@ def take_messages(topics: Sequence[str], all_topics: bool,
     """
     context = rclpy.Context()
     domain = os.environ.get('ROS_DOMAIN_ID', '')
-    if domain.isdecimal() and int(domain) > _MAX_DOMAIN_ID:
-        raise LogError(f'ROS_DOMAIN_ID is {domain}, but must be from 0 to {_MAX_DOMAIN_ID}')
+    if domain.isdecimal() and int(domain) > 232:  # ports beyond 65535: Fast DDS ends the process
+        raise LogError(f'ROS_DOMAIN_ID is {domain}, but must be from 0 to 232')
     try:
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     except (RuntimeError, ValueError) as error:
@@ -218,19 +193,15 @@ def take_messages(topics: Sequence[str], all_topics: bool,
             while not stop.is_set():
                 executor.spin_once(timeout_sec=0.05)
                 tick(node)
-            _drain_queues(executor, node)
+            # the messages that were in the queues; a call may also serve a timer
+            deadline, idle = time.monotonic() + 10.0, 0
+            while idle < 3 and time.monotonic() < deadline:
+                before = node.message_count
+                executor.spin_once(timeout_sec=0.0)
+                idle = 0 if node.message_count > before else idle + 1
         finally:
             executor.remove_node(node)
             node.destroy_node()
     finally:
         executor.shutdown()
         rclpy.shutdown(context=context)
-
-
-def _drain_queues(executor: SingleThreadedExecutor, node: RecorderNode) -> None:
-    """Receive the messages that were in the queues when the recorder was stopped."""
-    deadline, idle = time.monotonic() + _DRAIN_TIMEOUT, 0
-    while idle < 3 and time.monotonic() < deadline:  # a call may also serve a timer
-        before = node.message_count
-        executor.spin_once(timeout_sec=0.0)
-        idle = 0 if node.message_count > before else idle + 1

@@ -9,10 +9,10 @@
 # under the License.
 
 """
-Common functions of nodes: parameters, QoS of topics, start and shutdown.
+Common functions of nodes: parameters, QoS of topics, diagnostics, start and shutdown.
 
 A node is a subclass of `rclpy.node.Node` that declares its table of parameters in its constructor
-and joins its threads in `destroy_node`. Its ``main`` is ``return run(TheNode)``.
+and joins its threads in `destroy_node`. Its ``main`` is ``return run_node(TheNode)``.
 
 Signals set an event, the loop of `spin_once` ends, threads are joined, and then the node is
 destroyed. The handlers of rclpy invalidate the context while a callback still publishes, which
@@ -22,7 +22,7 @@ ends some runs in a traceback.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import faulthandler
 import signal
 import sys
@@ -30,6 +30,7 @@ import threading
 from types import SimpleNamespace
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from gyro_calibration.ros.parameters import Parameter, parameter_values
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -51,39 +52,31 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.timer import Timer
 
+#: Of subscriptions to samples: best effort, compatible with every publisher (REP-2003). The depth
+#: covers callbacks that are busy for 5 s at 1 kHz.
 SENSOR_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT,
                         durability=DurabilityPolicy.VOLATILE)
-"""
-QoS of subscriptions to samples: best effort, compatible with every publisher (REP-2003).
-
-The depth of 5000 covers callbacks that are busy for 5 s at 1 kHz.
-
-"""
-
+#: Of published samples: reliable, compatible with every subscriber (REP-2003).
 PUBLISHED_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE,
                            durability=DurabilityPolicy.VOLATILE)
-"""QoS of published samples: reliable, compatible with every subscriber (REP-2003)."""
-
+#: Of a state: the last message is kept for late subscribers.
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""QoS of a state: the last message is kept for late subscribers."""
-
-# By default rclpy checks each topic for incompatible QoS at every wake-up, which costs 2 % of a
-# core per topic at 1 kHz. Here every QoS is compatible.
-_UNWATCHED_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
-_UNWATCHED_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
-
+#: Longest time of the shutdown of a node, s; then it is killed.
 SHUTDOWN_TIMEOUT = 10.0
-"""Longest time of the shutdown of a node, s; then it is killed."""
-
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SIGNAL_LATENCY = 0.2  # s; longest time until a signal is handled
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+#: Level, sentence and values by name.
+Report = tuple[bytes, str, Mapping[str, object]]
 
 
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:
     """Return a publisher whose quality of service parameters may override."""
+    # By default rclpy checks each topic for incompatible QoS at every wake-up, which costs 2 % of
+    # a core per topic at 1 kHz. Here every QoS is compatible.
     return node.create_publisher(
-        kind, topic, qos, event_callbacks=_UNWATCHED_PUBLISHER,
+        kind, topic, qos, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
@@ -91,7 +84,8 @@ def subscribe_to(node: Node, kind: type, topic: str, callback: Callable[..., Non
                  qos: QoSProfile = SENSOR_QOS) -> Subscription:
     """Return a subscription whose quality of service parameters may override."""
     return node.create_subscription(
-        kind, topic, callback, qos, event_callbacks=_UNWATCHED_SUBSCRIPTION,
+        kind, topic, callback, qos,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
@@ -101,11 +95,7 @@ def declare_parameters(
     """
     Declare the parameters of a table and return their values as one record.
 
-    Parameters
-    ----------
-    node : Node
-    table : sequence of Parameter
-    on_change : is called with the record of all values after a change
+    `on_change` is called with the record of all values after a change.
 
     Raises
     ------
@@ -134,8 +124,8 @@ def declare_parameters(
 
     for each in table:
         # first with any type: rclpy refuses 100 for 100.0, with a message of several sentences
-        several = not isinstance(each.default, (bool, int, float, str))
-        default = list(each.default) if several else each.default  # type: ignore[arg-type]
+        default = (each.default if isinstance(each.default, (bool, int, float, str))
+                   else list(each.default))
         given = node.declare_parameter(each.name, default,
                                        ParameterDescriptor(dynamic_typing=True)).value
         node.undeclare_parameter(each.name)
@@ -166,25 +156,54 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 
 def call_every(node: Node, period: float, callback: Callable[[], None]) -> Timer:
-    """
-    Create a timer with a period, s, of the steady clock.
-
-    Timers of the node's clock, the default of rclpy, stop for an hour when that clock is set back
-    by an hour, and while a simulation is paused.
-
-    """
+    """Create a timer with a period, s, of the steady clock."""
+    # Timers of the node's clock, the default of rclpy, stop for an hour when that clock is set
+    # back by an hour, and while a simulation is paused.
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def status_array(node: Node, name: str, report: Report, hardware_id: str = '') -> DiagnosticArray:
+    """Return a message with one status, named ``<fully qualified node name>: <name>``."""
+    level, message, values = report
+    status = DiagnosticStatus(
+        level=level, name=f'{node.get_fully_qualified_name()}: {name}', message=message,
+        hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+    array = DiagnosticArray(status=[status])
+    array.header.stamp = node.get_clock().now().to_msg()
+    return array
+
+
+class Diagnostics:
+    """Publisher of reports; `level` is that of the last report, None before the first."""
+
+    def __init__(self, node: Node, name: str, report: Callable[[], Report],
+                 hardware_id: str = 'none'):
+        """
+        Create the publisher of diagnostics with a status name, such as ``'gyro'``.
+
+        `report` is never called concurrently, and must not call `publish`.
+
+        """
+        self.level: bytes | None = None
+        self._node, self._name, self._hardware = node, name, hardware_id
+        self._report, self._lock = report, threading.Lock()
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+
+    def publish(self) -> None:
+        """Make and publish a report; may be called from any thread."""
+        with self._lock:
+            report = self._report()
+            self._publisher.publish(status_array(self._node, self._name, report, self._hardware))
+            self.level = report[0]
 
 
 def run_node(node_class: Callable[[], Node]) -> int:
     """
     Start a node, spin it until SIGINT or SIGTERM, and return the exit code of the process.
 
-    Returns
-    -------
-    int
-        0 after a signal; 2 when an argument or a parameter was refused, with a sentence on
-        standard error.
+    It is 0 after a signal, and 2 where an argument or a parameter was refused, with a sentence on
+    standard error.
 
     """
     stop = threading.Event()
@@ -209,13 +228,7 @@ def run_node(node_class: Callable[[], Node]) -> int:
 
 
 def allow_future_response(service: Service) -> None:
-    """
-    Allow the callback of a service to return a `Future`; its response is sent when it is done.
-
-    This corresponds to an ``async`` callback, works in every executor, and blocks no other
-    callback.
-
-    """
+    """Allow the callback of a service to return a `Future`, in every executor."""
     send = service.send_response
 
     def send_when_done(response: Any, header: Any) -> None:
@@ -241,7 +254,7 @@ def spin(node: Node, stop: threading.Event) -> None:
     try:
         # The timers of a node end the wait of SingleThreadedExecutor, for which a time-out would
         # be one more timer at each message; EventsExecutor returns only with a time-out.
-        timeout = None if isinstance(serving, SingleThreadedExecutor) else _SIGNAL_LATENCY
+        timeout = None if isinstance(serving, SingleThreadedExecutor) else 0.2
         while not stop.is_set():
             serving.spin_once(timeout_sec=timeout)
     except ExternalShutdownException:

@@ -46,10 +46,9 @@ class StateStore:
     ----------
     model : the model with its self-calibration; an empty one if it cannot be read
     table : biases at rest
-    problem : why the rates are uncalibrated, in a sentence; '' if they are calibrated
-    calibration_hint : fault of the calibration file; '' without
-    table_hint : fault of the bias table; '' without
-    shared_hint : that another process has written to a file; '' without
+    problem : why the rates are uncalibrated, in a sentence; ''
+    calibration_hint, table_hint : fault of the calibration file and of the bias table; ''
+    shared_hint : that another process has written to a file; ''
     table_written_time : time when the bias table was last written, s since 1970; None before
 
     """
@@ -79,9 +78,6 @@ class StateStore:
                     'give each node a calibration_file of its own, or restart this one to use '
                     'that file')
 
-    def _note_written(self, file: Path, version: tuple[int, int]) -> None:
-        self.shared_hint, self._file_versions[file] = '', version
-
     def _load_model(self, model_file: str) -> GyroModel:
         model = GyroModel()
         if model_file:
@@ -108,8 +104,9 @@ class StateStore:
         """Use and store a calibration; return the fault of the storage, '' without one."""
         self.model, self.calibration_hint = with_self_calibration(self.model, calibration), ''
         try:
-            self._note_written(self._calibration_file,
-                               write_model(self._calibration_file, self.model))
+            self._file_versions[self._calibration_file] = write_model(self._calibration_file,
+                                                                      self.model)
+            self.shared_hint = ''
         except (OSError, ArithmeticError) as error:
             wanted = (remedy(error, self._calibration_file) if isinstance(error, OSError)
                       else 'check the rates')
@@ -124,8 +121,8 @@ class StateStore:
             return
         try:
             self.table_hint, written = write_bias_table(self._bias_file, self.table, now)
-            self.table_written_time = now
-            self._note_written(self._bias_file, written)
+            self.table_written_time, self.shared_hint = now, ''
+            self._file_versions[self._bias_file] = written
         except OSError as error:
             self.table.mark_write_failed(now)
             self.table_hint = to_printable('the bias table cannot be written '

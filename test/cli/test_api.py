@@ -12,6 +12,7 @@
 
 import json
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -144,3 +145,15 @@ def test_a_diagnosis_names_its_causes_and_writes_its_files(tmp_path):
     assert 'cubic_nonlinearity' in found.causes
     found.write(tmp_path)
     assert read_model(tmp_path / 'model.yaml').terms == found.model.terms
+
+
+@pytest.mark.parametrize(('call', 'sentence'), [
+    (lambda log: fit(log, technology='x'), "technology is 'x', but must be of mems, "),
+    (lambda log: fit(log, method='x'), "method is 'x', but must be of dwells, "),
+    (lambda log: fit(log, effects=['x']), "effects is 'x', but must be of bias, "),
+    (lambda log: diagnose(log, kind='x'), "kind is 'x', but must be of rate_command, "),
+    (lambda log: self_calibrate(log, method='x'), "method is 'x', but must be of likelihood, ")])
+def test_an_unknown_name_is_refused_in_one_sentence_with_those_that_are_known(call, sentence):
+    log = Log([0.0, 0.5, 1.0], [0.0, 0.1, 0.2], reference_heading=[0.0, 0.05, 0.1])
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        call(log)

@@ -209,13 +209,13 @@ WRONG = {
     'allan LOG --model ""': EMPTY, 'plan --limits "" --out x.csv': EMPTY,
     'emulate --protocol morse --model MODEL': "protocol 'morse' is not known",
     'emulate --protocol fizoptika --model MODEL': 'sensitivity is not set',
-    'reproduce ojeda --seed -1': '-1 is below 0', 'dance': 'invalid choice', '': 'required',
-    'reproduce newton': 'hong_park', 'diagnose LOG --seed -1': '-1 is below 0',
+    'reproduce ojeda --seed -1': '-1 is out of range', 'dance': 'invalid choice', '': 'required',
+    'reproduce newton': 'hong_park', 'diagnose LOG --seed -1': '-1 is out of range',
     'diagnose LOG --model missing.yaml --out found': 'missing.yaml: there is no such file',
     'simulate --model MODEL --motion waltz --out x.csv': 'waltz: there is no such motion',
     'simulate --model MODEL --motion rest --out ""': EMPTY,
     **{f'simulate --model MODEL --motion rest --out x.csv {option}': said for option, said in {
-        '--seed -1': '-1 is below 0', '--sample-rate 1e-300': '', '--sample-rate 1e300': '',
+        '--seed -1': '-1 is out of range', '--sample-rate 1e-300': '', '--sample-rate 1e300': '',
         '--sample-rate 1e9': '', '--temperature nan': '', '--temperature 1e9': '',
         '--sample-rate 0.001': 'fewer than two samples; give a higher rate'}.items()}}
 

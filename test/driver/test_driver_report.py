@@ -21,10 +21,14 @@ pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from gyro_calibration.driver.connection import Connection, SampleMean
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
-from gyro_calibration.ros.diagnostics import ERROR, OK, WARN
-from gyro_calibration.ros.driver_node import PARAMETERS, SampleMessages, settings_from_parameters
-from gyro_calibration.ros.driver_report import DriverReport
+from gyro_calibration.ros.driver_node import (
+    DriverReport,
+    PARAMETERS,
+    SampleMessages,
+    settings_from_parameters,
+)
 from gyro_calibration.ros.parameters import parameter_values
+from gyro_calibration.ros.runner import ERROR, OK, WARN
 
 KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
         'device_faults', 'discarded_bytes', 'longest_gap_s', 'clock_steps', 'last_event', 'port',

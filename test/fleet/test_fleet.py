@@ -328,8 +328,9 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     assert find_changes(PooledValue(crossed(values)), date, 0.01) == []
     values[3] += 12.0
     values[7, 4:] += 3.0
-    assert [each.group for each in find_outliers(PooledValue(crossed(values)), 'units', 0.01)] == [3]
-    (change,) = find_changes(PooledValue(crossed(values)), date, 0.01)
+    pooled = PooledValue(crossed(values))
+    assert [each.group for each in find_outliers(pooled, 'units', 0.01)] == [3]
+    (change,) = find_changes(pooled, date, 0.01)
     assert ((change.unit, change.first_date) == (7, 4)
             and change.size == pytest.approx(3.0, abs=0.5))
 

@@ -43,7 +43,7 @@ def ran(kind, motion, given, duration=None, drift=0.0):
     """Return a run over a motion and the rest after it, where it may drift, rad/s."""
     profile = motion if kind == PROFILE else None
     length = motion.duration if duration is None else duration
-    run = CalibrationRun(kind, length, given.extra_duration(kind), 0.0, profile)
+    run = CalibrationRun(kind, length, given, 0.0, profile)
     noise = 1e-4 * np.random.default_rng(0).standard_normal(2000)
     for number in range(2000):
         time = number * INTERVAL
@@ -69,14 +69,14 @@ def ran(kind, motion, given, duration=None, drift=0.0):
 def test_a_run_is_complete_after_its_motion_and_the_rest(kind, motion, duration, takes):
     run, answer = ran(kind, motion, rules(), duration)
     assert answer == '' and run.elapsed == pytest.approx(takes, abs=0.1) and run.progress > 0.99
-    calibration, said = fit_run(run, rules(), Noise(), '2026-01-01')
+    calibration, said = fit_run(run, Noise(), '2026-01-01')
     assert ((calibration.scale_factor_error, calibration.bias)
             == (pytest.approx(S, abs=2e-3), pytest.approx(B, abs=1e-4)) and said)
     assert calibration.temperature == 25.0 and calibration.time == '2026-01-01'
 
 
 def test_turns_that_are_not_finished_are_given_up():
-    run = CalibrationRun(TURNS, math.inf, REST_AFTER_TURNS, 0.0)
+    run = CalibrationRun(TURNS, math.inf, rules(), 0.0)
     for time in (0.0, FINISH_TIMEOUT, FINISH_TIMEOUT + 1.0):
         run.add(time, 0.0, 0.0, None)
     assert 'finish_calibration' in run.due_end_reason and 'rest on the mark' in run.status
@@ -84,7 +84,7 @@ def test_turns_that_are_not_finished_are_given_up():
 
 @pytest.mark.parametrize('kind, duration', [(ODOMETRY, 600.0), (PROFILE, 700.0), (TURNS, 599.0)])
 def test_a_run_of_known_length_may_be_longer_than_one_that_waits_for_a_call(kind, duration):
-    run = CalibrationRun(kind, math.inf if kind == TURNS else duration, 4.0, 0.0)
+    run = CalibrationRun(kind, math.inf if kind == TURNS else duration, rules(), 0.0)
     run.add(0.0, 0.0, 0.0, None)
     run.add(duration, 0.0, 0.0, None)
     if kind == TURNS:
@@ -98,7 +98,7 @@ def test_a_run_of_known_length_may_be_longer_than_one_that_waits_for_a_call(kind
 def test_odometry_without_a_yaw_is_taken_by_its_rates():
     run, _ = ran(ODOMETRY, CALIBRATION_MOTION, rules(), 20.0)
     run.odometry = [(time, 0.0, rate) for time, _, rate in run.odometry]
-    assert fit_run(run, rules(), Noise(), '')[0].scale_factor_error == pytest.approx(S, abs=5e-3)
+    assert fit_run(run, Noise(), '')[0].scale_factor_error == pytest.approx(S, abs=5e-3)
 
 
 @pytest.mark.parametrize('spoil, reason', [(lambda given: [], '0 messages came on odom'),
@@ -109,33 +109,34 @@ def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
     run, _ = ran(ODOMETRY, CALIBRATION_MOTION, rules(), 20.0)
     run.odometry = spoil(run.odometry)
     with pytest.raises(DataRefused, match=reason):
-        fit_run(run, rules(), Noise(), '')
+        fit_run(run, Noise(), '')
 
 
 def test_the_gyro_may_count_the_turns_and_a_wrong_count_is_refused():
     run, _ = ran(TURNS, ROUND, rules(), math.inf)
-    assert '2 whole turns' in fit_run(run, rules(turned=0), Noise(), '')[1]
+    run.rules = rules(turned=0)
+    assert '2 whole turns' in fit_run(run, Noise(), '')[1]
+    run.rules = rules(turned=3)
     with pytest.raises(DataRefused, match='3 were given|turns'):
-        fit_run(run, rules(turned=3), Noise(), '')
+        fit_run(run, Noise(), '')
 
 
 def test_a_drift_after_a_profile_refuses_it():
     run, _ = ran(PROFILE, CALIBRATION_MOTION, rules(), drift=0.05 * DEGREE)
     with pytest.raises(DataRefused, match='after the run'):
-        fit_run(run, rules(), Noise(), '')
+        fit_run(run, Noise(), '')
 
 
 def test_who_drives_on_after_a_run_by_odometry_is_not_checked():
     run, _ = ran(ODOMETRY, CALIBRATION_MOTION, rules(), 20.0, drift=20.0 * DEGREE)
     run.odometry = [each for each in run.odometry if each[0] <= BEGIN + 20.0]
-    assert 'at rest after it' not in fit_run(
-        run, AcceptanceRules(RunLimits(max_time_offset=0.5), ReferenceErrors(0.01), 2), Noise(),
-        '')[1]
+    run.rules = AcceptanceRules(RunLimits(max_time_offset=0.5), ReferenceErrors(0.01), 2)
+    assert 'at rest after it' not in fit_run(run, Noise(), '')[1]
 
 
 def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature():
-    run = CalibrationRun(REST, 10.0, 0.0, 0.0)
+    run = CalibrationRun(REST, 10.0, rules(), 0.0)
     for number, noise in enumerate(1e-5 * np.random.default_rng(1).standard_normal(520)):
         run.add(number * INTERVAL, B, B + noise, 25.0)
     with pytest.raises(DataRefused, match='the gyro is dead'):
-        fit_run(run, rules(), Noise(), '')
+        fit_run(run, Noise(), '')

@@ -16,8 +16,8 @@ pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from gyro_calibration.ros.compensation_node import CompensationNode
-from gyro_calibration.ros.diagnostics import Diagnostics
 from gyro_calibration.ros.driver_node import DriverNode
+from gyro_calibration.ros.runner import Diagnostics
 from rclpy.clock import ClockType
 
 OK, ERROR = DiagnosticStatus.OK, DiagnosticStatus.ERROR
