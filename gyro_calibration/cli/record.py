@@ -198,9 +198,9 @@ class _Session(ABC):
         """Return what was recorded."""
         (samples, lost), seconds = self.counts(), time.monotonic() - self._start_time
         if self._disk_full is not None:
-            written = (f'{self._recorder.size} bytes remain in {self._path}, which is complete '
+            written = (f'{self._recorder.file.size} bytes remain in {self._path}, which is complete '
                        f'but for the last {WRITE_INTERVAL:g} s'
-                       if self._recorder.size else 'nothing was written')
+                       if self._recorder.file.size else 'nothing was written')
             raise DataRefused(f'{self._disk_full.strerror}; {written}: make room, then record '
                               'again')
         if not samples:
@@ -336,7 +336,7 @@ class _TopicSession(_Session):
         self._take_messages = take_messages
         roles = {'gyro': given.topic or _DEFAULT_TOPICS['gyro'],
                  'temperature': given.temperature_topic or _DEFAULT_TOPICS['temperature'],
-                 **{'reference': topic for topic in given.reference_topic[:1]}}
+                 **dict(zip(('reference',), given.reference_topic))}
         roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
         self._roles = {topic: role for role, topic in roles.items()}
         if len(self._roles) < len(roles):
