@@ -28,10 +28,12 @@ No clock is read here, except by `read_steady_clock`: the caller gives the time 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 import math
+from statistics import median
 import time
 
 from gyro_calibration.driver.protocols import Sample
@@ -40,7 +42,7 @@ _Point = tuple[float, float]
 
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
-_MIN_BLOCKS = 32  # least number of blocks in a full window; the largest is twice this
+_WINDOW_BLOCKS = 64  # number of blocks in the window
 _SETTLING_DURATION = 2.0  # s; least span of a line before its period shows lost samples
 _SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line
 _MIN_LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
@@ -50,6 +52,7 @@ _JITTER_DURATION = 10.0  # s; averaging time of the jitter
 _MAX_CLOCK_DRIFT = 2e-5  # largest increase of the device clock rate while counts are uncertain, 1
 _MIN_LATENESS = 0.5e-3  # s; that proves a loss: the host may wake up later than before
 _OUTLIER_LATENESS = 0.02  # s; largest lateness with a correct sequence, above the 16 ms of a burst
+_MAX_ODD_ADVANCES = 8  # in a row, which show that the mean advance is wrong
 _MAX_TIME_JUMP = 3.0  # s; largest continuous step of the time of a device
 _CLOCK_STEP_THRESHOLD = 0.1  # s; largest difference of a clock that is slewed, not set
 _MIXED_STAMPS_DURATION = 10.0  # s; for which older stamps may arrive after a clock was set
@@ -59,19 +62,18 @@ _DIFFERENCE_TIME_CONSTANT = 2.0  # s; time constant of the difference of two clo
 
 class LowerLine:
     """
-    The line below all points with the least sum of distances.
+    The line below all points of the last 20 s with the least sum of distances.
 
     Only the lowest point of each block of time is kept. The line is the edge of their lower hull
-    over their mean. Blocks grow with the time span of the points, up to 20 s in total; older
-    points are dropped. With less than two points, the slope is the given one.
+    over their mean. With less than two points, the slope is the given one.
 
     """
 
     def __init__(self, slope: float):
         self.slope = slope
-        self._points: list[_Point] = []
+        self._points: deque[_Point] = deque(maxlen=_WINDOW_BLOCKS)
         self._anchor = (0.0, 0.0)
-        self._begin, self._block_begin, self._block_length = 0.0, -math.inf, 0.0
+        self._begin, self._block_begin = 0.0, -math.inf
 
     @property
     def is_known(self) -> bool:
@@ -90,10 +92,9 @@ class LowerLine:
         """Add a point that is not lower than the one before; x is larger than before."""
         if not self._points:
             self._begin, self._anchor = y, (x, y)
-        if y - self._block_begin >= self._block_length:
+        if y - self._block_begin >= _LINE_WINDOW / _WINDOW_BLOCKS:
             self._points.append((x, y))
             self._block_begin = y
-            self._merge_blocks()
         elif y - self.slope * x <= self._points[-1][1] - self.slope * self._points[-1][0]:
             self._points[-1] = (x, y)
         else:
@@ -104,19 +105,8 @@ class LowerLine:
         """Shift the points from a height on along x, and drop points that they overtake."""
         moved = [(x + offset, y) for x, y in self._points if y >= start]
         first = moved[0][0] if moved else math.inf
-        self._points = [(x, y) for x, y in self._points if y < start and x < first] + moved
-
-    def _merge_blocks(self) -> None:
-        """Merge blocks in pairs while they are short, then drop the oldest."""
-        if len(self._points) <= 2 * _MIN_BLOCKS:
-            return
-        if self._block_length >= _LINE_WINDOW / 2 / _MIN_BLOCKS:
-            del self._points[0]
-            return
-        pairs = zip(self._points[0::2], [*self._points[1::2], self._points[-1]], strict=False)
-        self._points = [min(pair, key=lambda point: point[1] - self.slope * point[0])
-                        for pair in pairs]
-        self._block_length = max(2.0 * self._block_length, self.time_span() / _MIN_BLOCKS)
+        kept = [(x, y) for x, y in self._points if y < start and x < first]
+        self._points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
     def _fit(self) -> None:
         hull = _lower_hull(self._points)
@@ -128,7 +118,7 @@ class LowerLine:
             self.slope = (right[1] - left[1]) / (right[0] - left[0])
 
 
-def _lower_hull(points: Sequence[_Point]) -> list[_Point]:
+def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
     """Return the corners of the lower convex hull of points in the order of x."""
     hull: list[_Point] = []
     for x, y in points:
@@ -158,6 +148,7 @@ class _SampleCounter:
     def reset(self) -> None:
         self.mean_advance, self.ambiguity, self._unevenness, self._is_sequence_frozen = (
             1.0, 1, 0.0, False)
+        self._odd_advances = list[tuple[float, int]]()
         self._sequence: int | None = None
         self._time: float | None = None
         self._outlier_time: float | None = None
@@ -205,20 +196,31 @@ class _SampleCounter:
             return advance, missing
         self._time, self._outlier_time = time, None
         advance = elapsed * self._rate
-        # damaged bytes show losses that coarse times do not
-        return advance, max(self._count_lost(advance),
-                            min(missing, round(advance / self.mean_advance) - 1))
+        lost = self._count_lost(advance)
+        if lost >= 0:  # damaged bytes show losses that coarse times do not
+            lost = max(lost, min(missing, round(advance / self.mean_advance) - 1))
+        return advance, lost
 
     def _count_lost(self, advance: float) -> int:
         if self._unevenness == 0.0:
             self.mean_advance, self._unevenness = advance, 0.01
             return 0
         steps = advance / self.mean_advance
+        # Times with a resolution near the period do not show single samples.
+        lost = round(steps) - 1 if steps > (1.5 if self._unevenness < 0.15 else 2.5) else 0
         if 0.3 <= steps <= 2.5:
+            self._odd_advances.clear()
             self.mean_advance += 0.05 * (advance - self.mean_advance)
             self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
-        # Times with a resolution near the period do not show single samples.
-        return round(steps) - 1 if steps > (1.5 if self._unevenness < 0.15 else 2.5) else 0
+            return lost
+        self._odd_advances.append((advance, lost))
+        if len(self._odd_advances) < _MAX_ODD_ADVANCES:
+            return lost
+        # the mean advance is wrong, and so are the losses that it showed
+        advances, losses = zip(*self._odd_advances, strict=True)
+        self._odd_advances.clear()
+        self.mean_advance = median(advances)
+        return lost - sum(losses)
 
 
 class _LatenessTest:
