@@ -391,7 +391,8 @@ class Connection:
                 counts.append(
                     (self._read_bytes, decoder.device_faults, decoder.refused_samples))
                 if len(counts) > 1:
-                    self._report_or_raise(self._explain_silence(*counts[-2:], timeout), deadline)
+                    problem = self._explain_silence(counts[-2], counts[-1], timeout)
+                    self._report_or_raise(problem, deadline)
 
     def _explain_silence(self, before: tuple[int, int, int], after: tuple[int, int, int],
                          limit: float) -> str:

@@ -207,14 +207,15 @@ class _ExpansionBudget:
 def _decompress(compression: str, packed: BinaryIO, budget: _ExpansionBudget) -> Iterator[bytes]:
     """Give the data of a compressed stream, up to a truncation or damage."""
     reader: Any
+    errors: tuple[type[Exception], ...]
     if compression == 'zstd':
         zstandard = _import_library('zstandard')
         reader = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).stream_reader(
             packed, read_across_frames=True)
-        errors = zstandard.ZstdError,
+        errors = (zstandard.ZstdError,)
     else:
         reader = _import_library('lz4.frame').open(packed)
-        errors = RuntimeError, EOFError
+        errors = (RuntimeError, EOFError)
     with suppress(*errors):
         while piece := reader.read(_READ_BYTES):
             budget.spend(len(piece))

@@ -19,7 +19,7 @@ from functools import cached_property
 import math
 from typing import Any
 
-from gyro_calibration.logs.log import Array, DEGREE, Mask, Number
+from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.channels import ChannelHistory, clip
 from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
@@ -232,11 +232,9 @@ class GyroModel:
 
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
-        """Return the plausible temperatures, degC: at least -100 to 200, and 3 times the range."""
-        low, high = self.valid_temperatures
-        reach = high - low if math.isfinite(sum(map(abs, self.temperature_range))) else 0.0
-        return (min(low - reach, _PLAUSIBLE_TEMPERATURES[0]),
-                max(high + reach, _PLAUSIBLE_TEMPERATURES[1]))
+        """Return the plausible temperatures, degC: at least -100 to 200."""
+        (low, high), (coldest, hottest) = self.valid_temperatures, _PLAUSIBLE_TEMPERATURES
+        return min(low, coldest), max(high, hottest)
 
     @cached_property
     def valid_temperatures(self) -> tuple[float, float]:
