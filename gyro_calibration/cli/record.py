@@ -198,9 +198,9 @@ class _Session(ABC):
         """Return what was recorded."""
         (samples, lost), seconds = self.counts(), time.monotonic() - self._start_time
         if self._disk_full is not None:
-            written = (f'{self._recorder.file.size} bytes remain in {self._path}, which is complete '
-                       f'but for the last {WRITE_INTERVAL:g} s'
-                       if self._recorder.file.size else 'nothing was written')
+            size = self._recorder.file.size
+            written = (f'{size} bytes remain in {self._path}, which is complete but for the last '
+                       f'{WRITE_INTERVAL:g} s' if size else 'nothing was written')
             raise DataRefused(f'{self._disk_full.strerror}; {written}: make room, then record '
                               'again')
         if not samples:

@@ -74,6 +74,8 @@ _COLUMN_ALIASES = {
     'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
     'supply': r'vdd|vcc|supply|voltage|volts',
 }
+
+
 class Column(NamedTuple):
     """Column of a quantity in a file, and its conversion to SI: ``factor * value + offset``."""
 
@@ -177,7 +179,8 @@ def suggest_columns(header: Sequence[str]) -> str:
 def _guess_unit(name: str, quantity: str) -> str:
     """Return the unit in a name of a quantity, UNIT without one; '' for another quantity."""
     letters = re.sub('[^a-z]', '', name.lower().replace('°', 'deg'))
-    endings = {re.sub('[^a-z]', '', unit.lower()): unit for unit in _OPTION_QUANTITIES[quantity][1]}
+    units = _OPTION_QUANTITIES[quantity][1]
+    endings = {re.sub('[^a-z]', '', unit.lower()): unit for unit in units}
     endings |= {f'{end}ec': unit for end, unit in endings.items() if unit.endswith('/s')}
     for end, unit in {**endings, '': 'UNIT'}.items():
         if letters.endswith(end) and re.fullmatch(_COLUMN_ALIASES[quantity],

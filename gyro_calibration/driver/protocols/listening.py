@@ -30,7 +30,7 @@ BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 46080
 
 _MAX_BYTES = 8192  # number of last bytes that are used, which limits the cost
 _MIN_FRAMES = 3  # least number of frames; fewer may be chance
-_MIN_EXPLAINED_SHARE = 0.5  # least share of the bytes in frames; a line may lose or damage the rest
+_MIN_EXPLAINED_SHARE = 0.5  # least share of the bytes in frames; a line may damage the rest
 _MIN_IDENTICAL_SHARE = 0.95  # least share where all frames are equal: zeros may pass a weak check
 _AMBIGUITY_RATIO = 0.8  # the result is ambiguous if another format has this times the best share
 _NUMBERS_PATTERN = re.compile(NUMBER + rb'(?: *, *' + NUMBER + rb')* *')
