@@ -75,6 +75,10 @@ class Message:
     data: bytes
 
 
+#: Messages or None, each with the number of bytes read where progress is to be shown, else 0.
+_Messages = Iterator[tuple[Message | None, int]]
+
+
 @dataclass
 class Contents:
     """Contents of a recording as far as it was read."""
@@ -260,9 +264,7 @@ MCAP_END = (struct.pack('<BQ4x', _RecordCode.DATA_END, 4)
             + struct.pack('<BQ20x', _RecordCode.FOOTER, 20) + _MAGIC)
 
 
-def _read_mcap(source: Path, path: Path,
-               contents: Contents) -> Iterator[tuple[Message | None, int]]:
-    """Give messages, each None and a place in the file after a record that is no message."""
+def _read_mcap(source: Path, path: Path, contents: Contents) -> _Messages:
     with open(source, 'rb') as file:
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
@@ -513,9 +515,7 @@ _MESSAGES_QUERY = """
 _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
-def _read_database(source: Path, path: Path,
-                   contents: Contents) -> Iterator[tuple[Message | None, int]]:
-    """Give messages with places in the file, as far as rows tell them."""
+def _read_database(source: Path, path: Path, contents: Contents) -> _Messages:
     with _open_database(source, path) as (database, tables):
         channels, budget = _read_topics(database, tables, path, contents), _ExpansionBudget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
