@@ -478,27 +478,19 @@ class McapWriter:
     def pack_summary(self) -> bytes:
         """Return the end of a file: the summary with the index of all chunks."""
         data_end = _pack_record(_RecordCode.DATA_END, struct.pack('<I', 0))
-        begin = self._offset + len(data_end)
         sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
         span = (min((span[0] for span in self._spans), default=0),
                 max((span[1] for span in self._spans), default=0))
         counts = b''.join(struct.pack('<HQ', *pair) for pair in self._counts.items())
-        groups = {_RecordCode.SCHEMA: [record for _, record in self._schemas.values()],
-                  _RecordCode.CHANNEL: [record for _, record in self._channels.values()],
-                  _RecordCode.STATISTICS: [_pack_record(
-                      _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
-                      struct.pack('<QQ', *span), _pack_sized(counts))],
-                  _RecordCode.CHUNK_INDEX: self._chunk_indexes,
-                  _RecordCode.METADATA_INDEX: [self._metadata_index]}
-        summary, offsets = b'', b''
-        for code, records in groups.items():
-            group = b''.join(records)
-            place = struct.pack('<BQQ', code, begin + len(summary), len(group))
-            offsets += _pack_record(_RecordCode.SUMMARY_OFFSET, place)
-            summary += group
-        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, begin, begin + len(summary))
-        checked = zlib.crc32(summary + offsets + footer)
-        return data_end + summary + offsets + footer + struct.pack('<I', checked) + _MAGIC
+        statistics = _pack_record(
+            _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
+            struct.pack('<QQ', *span), _pack_sized(counts))
+        summary = b''.join([*(record for _, record in self._schemas.values()),
+                            *(record for _, record in self._channels.values()),
+                            statistics, *self._chunk_indexes, self._metadata_index])
+        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, self._offset + len(data_end), 0)
+        checked = struct.pack('<I', zlib.crc32(summary + footer))
+        return data_end + summary + footer + checked + _MAGIC
 
 
 # SQLite
