@@ -14,17 +14,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from itertools import chain, repeat
+from itertools import count, repeat
 import json
 import signal
-import sys
 from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.simulate import add_motion_options, simulate_log
 from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.emulator import emulate, Emulator
-from gyro_calibration.driver.protocols import find_protocol, Protocol, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.files import to_printable
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
@@ -61,7 +60,12 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 def _emulate(given: argparse.Namespace) -> None:
     """Print the path at once, since this verb sends until it ends."""
-    protocol, settings = _parse_wire_format(given)
+    try:
+        protocol, settings = find_protocol(given.protocol), Settings(
+            sensitivity=verb.sensitivity(given), columns=tuple(given.columns.split(',')))
+        protocol.check_settings(settings)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
     log = verb.read(given) if given.log else simulate_log(given)[0]
     time, output = verb.require_time(given, log), verb.require_output(given, log)
     if np.isfinite(output).sum() < 2:
@@ -74,6 +78,7 @@ def _emulate(given: argparse.Namespace) -> None:
     def answer(path: str) -> None:
         print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json
               else to_printable(path), flush=True)
+
     try:
         emulate(emulator, answer)
     finally:
@@ -86,16 +91,6 @@ def _handle_signals(handler: Any) -> None:
         signal.signal(number, handler)
 
 
-def _parse_wire_format(given: argparse.Namespace) -> tuple[Protocol, Settings]:
-    try:
-        protocol, settings = find_protocol(given.protocol), Settings(
-            sensitivity=verb.sensitivity(given), columns=tuple(given.columns.split(',')))
-        protocol.check_settings(settings)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    return protocol, settings
-
-
 def _iterate_samples(time: Array, output: Array, temperature: Array | None,
                      repeats: bool) -> Iterator[Sample]:
     """Give the samples of a log that have an output, once or, on request, again and again."""
@@ -103,7 +98,6 @@ def _iterate_samples(time: Array, output: Array, temperature: Array | None,
     times, outputs = time[known] - time[known][0], output[known].tolist()
     temperatures = repeat(None) if temperature is None else temperature[known].tolist()
     length = float(times[-1] + np.median(np.diff(times)))
-    for start in chain([0.0], (length * number
-                               for number in range(1, sys.maxsize if repeats else 1))):
+    for start in count(0.0, length) if repeats else (0.0,):
         yield from (Sample(output, temperature, start + time)
                     for time, output, temperature in zip(times.tolist(), outputs, temperatures))

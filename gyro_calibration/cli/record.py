@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -26,7 +27,7 @@ from typing import Any
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.driver.connection import AUTO, Connection, ConnectionState
-from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
+from gyro_calibration.driver.protocols import PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.recorder import (
     CsvRecorder,
@@ -114,19 +115,18 @@ def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
 
     """
     stop = threading.Event()
-    signals = [signal.SIGINT, signal.SIGTERM,
-               *([signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else [])]
+    numbers = [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+               if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
     previous_handlers = {number: signal.signal(number, lambda *_: stop.set())
-                         for number in signals}
-    timer = threading.Timer(seconds, stop.set) if seconds else None
-    if timer is not None:
-        timer.daemon = True
+                         for number in numbers}
+    timer = threading.Timer(seconds or 0.0, stop.set)
+    timer.daemon = True
+    if seconds:
         timer.start()
     try:
         yield stop
     finally:
-        if timer is not None:
-            timer.cancel()
+        timer.cancel()
         for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
@@ -144,47 +144,34 @@ def _redirect_stdout() -> Iterator[None]:
         os.close(stdout_copy)
 
 
-class _Session:
+def _create_recorder(path: str, notes: NotesCallback) -> _Recorder:
+    try:
+        return (McapRecorder if path.endswith('.mcap') else CsvRecorder)(path, notes)
+    except FileExistsError:
+        raise UsageError(f'{path}: exists already, and recordings are never overwritten; '
+                         'give a new name') from None
+
+
+class _Session(ABC):
     """The common part of recordings from port and topics: file, pieces, progress, answer."""
 
     #: The remedy where no sample was received.
     remedy = ''
 
-    def __init__(self, given: argparse.Namespace, stop: threading.Event):
-        self._given, self._stop = given, stop
-        self._is_mcap = bool(given.out.endswith('.mcap'))
+    def __init__(self, given: argparse.Namespace, stop: threading.Event, path: str,
+                 notes: NotesCallback):
+        self._given, self._stop, self._path = given, stop, path
         self._start_time = self._last_flush = time.monotonic()
         self._disk_full: DiskFull | None = None
-        self._recorder: _Recorder = self._open_recorder()
+        self._recorder = _create_recorder(path, notes)
 
-    @property
-    def samples(self) -> int:
-        """Number of samples received from the gyro."""
-        raise NotImplementedError
+    @abstractmethod
+    def counts(self) -> tuple[int, int]:
+        """Return how many samples were received from the gyro, and how many are known as lost."""
 
-    @property
-    def lost(self) -> int:
-        """Number of samples known to be lost."""
-        raise NotImplementedError
-
-    @property
-    def _path(self) -> str:
-        """Path of the file that is being written."""
-        return str(self._given.out)
-
-    def _open_recorder(self) -> _Recorder:
-        raise NotImplementedError
-
+    @abstractmethod
     def _record_until_stopped(self, tick: Callable[[], None]) -> None:
-        raise NotImplementedError
-
-    @staticmethod
-    def _create_recorder(path: str, notes: NotesCallback) -> _Recorder:
-        try:
-            return (McapRecorder if path.endswith('.mcap') else CsvRecorder)(path, notes)
-        except FileExistsError:
-            raise UsageError(f'{path}: exists already, and recordings are never overwritten; '
-                             'give a new name') from None
+        """Record; call `tick` after each chunk."""
 
     def run(self) -> None:
         """Record until the end, and close the file also after an error."""
@@ -203,38 +190,37 @@ class _Session:
             return
         self._recorder.flush()
         self._last_flush = time.monotonic()
-        bar.set_postfix_str(f'{self.lost} lost', refresh=False)
-        bar.update(self.samples - bar.n)
+        samples, lost = self.counts()
+        bar.set_postfix_str(f'{lost} lost', refresh=False)
+        bar.update(samples - bar.n)
 
     def answer(self) -> Answer:
         """Return what was recorded."""
-        seconds = time.monotonic() - self._start_time
+        (samples, lost), seconds = self.counts(), time.monotonic() - self._start_time
         if self._disk_full is not None:
-            written = (f'{self._recorder.size} bytes remain in {self._path}, '
-                       f'which is complete but for the last {WRITE_INTERVAL:g} s')
-            written = written if self._recorder.size else 'nothing was written'
+            size = self._recorder.file.size
+            written = (f'{size} bytes remain in {self._path}, which is complete but for the last '
+                       f'{WRITE_INTERVAL:g} s' if size else 'nothing was written')
             raise DataRefused(f'{self._disk_full.strerror}; {written}: make room, then record '
                               'again')
-        if not self.samples:
+        if not samples:
             raise DataRefused(f'no sample was received in {seconds:.1f} '
                               f's{self._describe_failure()}; no file was written: {self.remedy}')
-        data = {'out': self._given.out, 'samples': self.samples, 'lost': self.lost,
-                'seconds': seconds, **self._answer_data()}
-        lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, '
-                 f'written to {self._given.out}.', *self._remarks()]
-        return Answer(lines, {**data, 'remarks': self._remarks()})
+        remarks = self._remarks()
+        data = {'out': self._given.out, 'samples': samples, 'lost': lost, 'seconds': seconds,
+                'bytes': os.path.getsize(self._given.out), **self._answer_data()}
+        lines = [f'{samples} samples in {seconds:.1f} s, {lost} lost, '
+                 f'written to {self._given.out}.', *remarks]
+        return Answer(lines, {**data, 'remarks': remarks})
 
     def _describe_failure(self) -> str:
         return ''
 
-    def _answer_data(self) -> dict[str, Any]:
-        return {'bytes': os.path.getsize(self._given.out)}
+    @abstractmethod
+    def _answer_data(self) -> dict[str, Any]: ...
 
-    def _remarks(self) -> list[str]:
-        missed = (sorted(self._recorder.late_columns)
-                  if isinstance(self._recorder, CsvRecorder) else [])
-        return [f'{", ".join(missed)} began after the header of the log was written, and is '
-                'not in it; record into .mcap instead.'] if missed else []
+    @abstractmethod
+    def _remarks(self) -> list[str]: ...
 
 
 class _PortSession(_Session):
@@ -262,33 +248,26 @@ class _PortSession(_Session):
         self._last_message = ''
         # Constant, so that the stamps do not jump when the clock is set.
         self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
-        super().__init__(given, stop)
+        super().__init__(given, stop, given.out, self._file_notes)
 
-    @property
-    def samples(self) -> int:
-        return self._connection.counts().samples
-
-    @property
-    def lost(self) -> int:
-        return self._connection.counts().lost_samples
-
-    def _open_recorder(self) -> _Recorder:
-        return self._create_recorder(self._given.out, self._file_notes)
+    def counts(self) -> tuple[int, int]:
+        counts = self._connection.counts()
+        return counts.samples, counts.lost_samples
 
     def _file_notes(self) -> dict[str, str]:
-        found, protocol = self._connection, self._connection.protocol
-        return recording_notes(port=self._given.port, device=found.path, protocol=protocol.name
-                               if protocol else '', baud=found.baud, axis=self._settings.axis,
-                               **(self._scale_notes(protocol) if protocol else {}))
-
-    def _scale_notes(self, protocol: Protocol) -> dict[str, str]:
-        """Return the scale of the device; columns in rad/s or deg/s have the unit in the name."""
-        settings, factor = self._settings, protocol.unit_scale(self._settings)
-        angles = (f', an angle at {protocol.nominal_rate(settings):g} Hz'
-                  if protocol.sends_angles(settings) else '')
-        sensitivity = ('' if protocol is CSV and settings.sensitivity is None
-                       else f'{abs(factor)!r} rad/s a unit of the device{angles}')
-        return {'sensitivity': sensitivity, 'inverted': 'yes' if factor < 0.0 else 'no'}
+        """Return the notes; columns in rad/s or deg/s have the unit in the name, not here."""
+        found, settings, scale = self._connection, self._settings, dict[str, str]()
+        protocol = found.protocol
+        if protocol:
+            factor = protocol.unit_scale(settings)
+            angles = (f', an angle at {protocol.nominal_rate(settings):g} Hz'
+                      if protocol.sends_angles(settings) else '')
+            scale['inverted'] = 'yes' if factor < 0.0 else 'no'
+            if protocol is not CSV or settings.sensitivity is not None:
+                scale['sensitivity'] = f'{abs(factor)!r} rad/s a unit of the device{angles}'
+        return recording_notes(
+            port=self._given.port, device=found.path, protocol=protocol and protocol.name,
+            baud=found.baud, axis=settings.axis, **scale)
 
     def _record_until_stopped(self, tick: Callable[[], None]) -> None:
         for chunk in self._connection.chunks(self._stop):
@@ -302,37 +281,39 @@ class _PortSession(_Session):
     def _report_state(self, state: ConnectionState) -> None:
         if state.name == 'failed':
             self._recorder.flush()  # without samples no piece is written
-        message = state.problem or state.name
+        message, found = state.problem or state.name, self._connection
         if (state.name == 'opening' or message == self._last_message
                 or state.name == 'listening' and self._last_message):
             return  # it listens again at each attempt
-        found, self._last_message = self._connection, message
-        name = (f'samples of {found.protocol.name} come at {found.baud} bit/s'
-                if found.protocol else '')
-        verb.print_message(name if state.name == 'reading' else message)
+        self._last_message = message
+        if state.name == 'reading' and found.protocol:
+            message = f'samples of {found.protocol.name} come at {found.baud} bit/s'
+        verb.print_message(message)
 
     def _describe_failure(self) -> str:
         return f' ({self._connection.last_error})' if self._connection.last_error else ''
 
     def _answer_data(self) -> dict[str, Any]:
         found = self._connection
-        protocol = found.protocol.name if found.protocol else None
-        return {**super()._answer_data(), 'protocol': protocol, 'baud': found.baud,
+        return {'protocol': found.protocol and found.protocol.name, 'baud': found.baud,
                 'openings': found.open_count}
 
     def _remarks(self) -> list[str]:
-        counts, protocol, clock = (vars(self._connection.counts()), self._connection.protocol,
-                                   self._connection.clock)
-        warning = (protocol.sample_rate_warning(self._settings, clock.period)
-                   if protocol and clock and clock.is_settled else '')
-        counted = {name.replace('_', ' '): count for name, count in counts.items()
-                   if name not in ('samples', 'lost_samples') and count}
-        return [*(f'{count} {name}.' for name, count in counted.items()),
-                *([f'{warning}.'] if warning else []), *super()._remarks()]
+        found, recorder = self._connection, self._recorder
+        remarks = [f'{count} {name.replace("_", " ")}.'
+                   for name, count in vars(found.counts()).items()
+                   if name not in ('samples', 'lost_samples') and count]
+        if found.protocol and found.clock and found.clock.is_settled:
+            warning = found.protocol.sample_rate_warning(self._settings, found.clock.period)
+            remarks += [f'{warning}.'] if warning else []
+        if isinstance(recorder, CsvRecorder) and recorder.late_columns:
+            remarks.append(f'{", ".join(sorted(recorder.late_columns))} began after the header '
+                           'of the log was written, and is not in it; record into .mcap instead.')
+        return remarks
 
 
 class _TopicSession(_Session):
-    """Records messages from topics."""
+    """Records messages from topics into a recording, from which a log is written at the end."""
 
     remedy = ('check that a driver publishes, and that ROS_DOMAIN_ID and '
               'ROS_AUTOMATIC_DISCOVERY_RANGE agree')
@@ -343,7 +324,8 @@ class _TopicSession(_Session):
         if any(port_options) or given.increments != 'default':
             raise UsageError('options of a port were given without --port; '
                              'give --port or omit them')
-        if not given.out.endswith('.mcap') and (given.all or len(given.reference_topic) > 1):
+        self._is_mcap = given.out.endswith('.mcap')
+        if not self._is_mcap and (given.all or len(given.reference_topic) > 1):
             raise UsageError(f'{given.out}: a log has one gyro and one reference; '
                              'record several topics into .mcap')
         try:
@@ -353,9 +335,8 @@ class _TopicSession(_Session):
                              'source it, or record from --port') from None
         self._take_messages = take_messages
         roles = {'gyro': given.topic or _DEFAULT_TOPICS['gyro'],
-                 'temperature': given.temperature_topic or _DEFAULT_TOPICS['temperature']}
-        if given.reference_topic:
-            roles['reference'] = given.reference_topic[0]
+                 'temperature': given.temperature_topic or _DEFAULT_TOPICS['temperature'],
+                 **dict(zip(('reference',), given.reference_topic))}
         roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
         self._roles = {topic: role for role, topic in roles.items()}
         if len(self._roles) < len(roles):
@@ -370,29 +351,17 @@ class _TopicSession(_Session):
         # s; a message may be late, and a recording be played faster
         self._clock_steps = ClockStepDetector(max_ahead=10.0, max_behind=math.inf,
                                               max_backward=1.0)
-        super().__init__(given, stop)
 
-    @property
-    def samples(self) -> int:
-        return self._samples or (self._messages if self._is_mcap else 0)
-
-    @property
-    def lost(self) -> int:
-        return self._intervals.lost_samples
-
-    def _open_recorder(self) -> _Recorder:
-        """Open a recording, from which a log is written at the end."""
         def notes() -> dict[str, str]:
-            return recording_notes(
-                topics='everything' if self._given.all else ', '.join(self._topics))
-        if not self._is_mcap:
-            # fails now where the log cannot be written
-            self._create_recorder(self._given.out, notes)
-        return self._create_recorder(self._path, notes)
+            return recording_notes(topics='everything' if given.all else ', '.join(self._topics))
 
-    @property
-    def _path(self) -> str:
-        return self._given.out if self._is_mcap else f'{self._given.out}.mcap'
+        if not self._is_mcap:
+            _create_recorder(given.out, notes)  # fails now where the log cannot be written
+        super().__init__(given, stop, given.out if self._is_mcap else f'{given.out}.mcap', notes)
+
+    def counts(self) -> tuple[int, int]:
+        samples = self._samples or (self._messages if self._is_mcap else 0)
+        return samples, self._intervals.lost_samples
 
     def run(self) -> None:
         """Record, and write the log; the recording is kept where that fails."""
@@ -450,7 +419,7 @@ class _TopicSession(_Session):
                                    f'there are {", ".join(node.known_topics()) or "none"}')
 
     def _answer_data(self) -> dict[str, Any]:
-        return {**super()._answer_data(), 'messages': self._messages}
+        return {'messages': self._messages}
 
     def _remarks(self) -> list[str]:
         remarks = [f'{topic}: {reason}; it was not recorded.'

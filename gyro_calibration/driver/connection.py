@@ -26,6 +26,7 @@ import math
 from operator import sub
 import os
 import select
+from statistics import fmean
 import termios
 import threading
 from typing import NamedTuple, TypeVar
@@ -61,11 +62,7 @@ class SerialPort:
     Each method raises `PortError` where the device cannot do it or was disconnected; the port is
     then closed.
 
-    Parameters
-    ----------
-    path : str
-    baud : bits per second
-    timeout : how long `read` waits for the first byte, in seconds
+    `timeout` is how long `read` waits for the first byte, s.
 
     """
 
@@ -136,15 +133,14 @@ def _describe_error(error: BaseException) -> str:
     return f'{error}: set another port or baud'
 
 
+#: Name of the protocol that stands for recognition by listening.
 AUTO = 'auto'
-"""Name of the protocol that stands for recognition by listening."""
 
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
 _SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
 _REOPEN_DELAYS = (0.1, 5.0)  # s; first and longest delay before a lost port is opened again
 _RESTART_DURATION = 5.0  # s; longest silence of a board that restarts when its port is opened
-# s; interval of requests to send: a gyro that starts does not receive them
-_REQUEST_INTERVAL = 0.8
+_REQUEST_INTERVAL = 0.8  # s; of requests to send: a gyro that starts does not receive them
 _LISTENING_DURATION = 1.0  # s; listening time, in which a gyro of 10 Hz sends enough
 _RECOGNITION_INTERVAL = 0.1  # s; interval of attempts to recognize the protocol
 _MAX_RECOGNITION_BYTES = 16384  # last bytes that are used to recognize the protocol
@@ -199,47 +195,6 @@ def resolve_port(port: str) -> str:
     return matches[0]
 
 
-class _SilenceTimer:
-    """
-    Timer of the silence since the port was opened or since the last sample.
-
-    At `deadline`, after `timeout`, s, the port is opened again. Until the second sample, which
-    shows the period, the timer allows 5 s more: opening the port again would restart a board that
-    is still starting.
-
-    """
-
-    def __init__(self, period: float, now: float):
-        self._samples, self._last_request = 0, now
-        self.restart(period, now)
-
-    def restart(self, period: float, now: float, samples: int = 0) -> None:
-        """Start the timer again, after some samples."""
-        self._samples += samples
-        self.timeout = max(_SILENCE_TIMEOUT, _SILENCE_PERIODS * period)
-        self.deadline = now + self.timeout + (_RESTART_DURATION if self._samples < 2 else 0.0)
-        self._start, self._polls = now, 0
-
-    def is_request_due(self, now: float) -> bool:
-        """Tell whether another request to send is due; then count it as sent."""
-        if self._samples or now - self._last_request < _REQUEST_INTERVAL:
-            return False
-        self._last_request = now
-        return True
-
-    def poll(self, now: float) -> bool:
-        """Tell whether another half of the timeout, or all time, has passed."""
-        if now < min(self._start + 0.5 * self.timeout * (self._polls + 1), self.deadline):
-            return False
-        self._polls += 1
-        return True
-
-    @property
-    def has_timed_out(self) -> bool:
-        """Whether the silence has lasted for the timeout."""
-        return self._polls > 1
-
-
 class Connection:
     """
     Gives the samples of a gyro, with stamps, until it is stopped.
@@ -256,21 +211,18 @@ class Connection:
     port : path, or a pattern that finds it under any name
     protocol : name of a protocol, or ``'auto'``
     baud : bits per second; 0 for that of the protocol
-    settings : Settings or None
     on_change : is called with each new `ConnectionState`, in the thread that reads
     clock : returns seconds of a steady clock
     make_port : makes a `SerialPort` of a path and a baud
 
     Attributes
     ----------
-    state : State
     protocol, clock, baud : None and 0 until the protocol is known
     path : the device of the port when it was last opened, links resolved
     detected : result of the recognition by listening, in a sentence
     open_count : number of times that the port was opened
     waited_duration : total waiting time for the port, s
     longest_gap : longest time between two samples, s; 0 while none exceeds 1.5 periods
-    last_error : str
 
     Raises
     ------
@@ -416,35 +368,38 @@ class Connection:
         decoder, clock = self._decoder, self.clock
         if decoder is None or clock is None:  # stopped while listening
             return
-        silence = _SilenceTimer(clock.period, self._read_clock())
-        counts = self._unusable_counts(decoder)
+        received, begin = 0, self._read_clock()
+        last_request, counts = begin, list[tuple[int, int, int]]()
         while not stop.is_set():
             data = port.read()
-            arrival = self._read_clock()
+            now = self._read_clock()
             samples = decoder.feed(data)
             self._read_bytes += len(data)
             if samples:
-                yield self._make_chunk(samples, arrival)
-                silence.restart(clock.period, arrival, len(samples))
+                yield self._make_chunk(samples, now)
+                received, begin, counts = received + len(samples), now, []
                 continue
-            if silence.is_request_due(arrival):
+            if not received and now - last_request >= _REQUEST_INTERVAL:
                 assert self.protocol is not None
                 port.write(self.protocol.startup)
-            if silence.poll(arrival):
-                before, counts = counts, self._unusable_counts(decoder)
-                if silence.has_timed_out:
-                    problem = self._explain_silence(decoder, before, silence.timeout)
-                    self._report_or_raise(problem, silence.deadline)
+                last_request = now
+            timeout = max(_SILENCE_TIMEOUT, _SILENCE_PERIODS * clock.period)
+            # To open the port again would restart a board that still starts. The second sample
+            # shows the period.
+            deadline = begin + timeout + (_RESTART_DURATION if received < 2 else 0.0)
+            if now >= min(begin + 0.5 * timeout * (len(counts) + 1), deadline):
+                counts.append(
+                    (self._read_bytes, decoder.device_faults, decoder.refused_samples))
+                if len(counts) > 1:
+                    problem = self._explain_silence(counts[-2], counts[-1], timeout)
+                    self._report_or_raise(problem, deadline)
 
-    def _unusable_counts(self, decoder: Decoder) -> tuple[int, int, int]:
-        """Return the counts of bytes, values marked as invalid, and refused values."""
-        return self._read_bytes, decoder.device_faults, decoder.refused_samples
-
-    def _explain_silence(self, decoder: Decoder, previous_counts: tuple[int, int, int],
+    def _explain_silence(self, before: tuple[int, int, int], after: tuple[int, int, int],
                          limit: float) -> str:
-        counts, port = self._unusable_counts(decoder), self._pattern
+        """Return why no samples come, by the counts of bytes, faults and refused samples."""
         has_bytes, has_faults, is_beyond = (
-            now > then for now, then in zip(counts, previous_counts, strict=True))
+            now > then for now, then in zip(after, before, strict=True))
+        port = self._pattern
         if has_faults:
             return (f'the gyro on {port} marks all samples as invalid for {limit:g} s: turn it '
                     'off and on, then have it checked')
@@ -527,20 +482,14 @@ class Decimator:
         if len(group) == 1:
             yield SampleMean(*group[0], 1)
             return
-        begin = group[0][0]  # sums of seconds since 1970 would lose digits
-        samples = [sample for _, sample in group]
-        yield SampleMean(
-            begin + _mean([stamp - begin for stamp, _ in group]),
-            Sample(_mean([sample.output for sample in samples]),
-                   _known_mean([sample.temperature for sample in samples]),
-                   specific_force=_known_mean([sample.specific_force for sample in samples])),
-            len(group))
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
+        stamps, samples = zip(*group, strict=True)
+        begin = stamps[0]  # sums of seconds since 1970 would lose digits
+        output, *others = (_known_mean([getattr(sample, name) for sample in samples])
+                           for name in ('output', 'temperature', 'specific_force'))
+        yield SampleMean(begin + fmean(stamp - begin for stamp in stamps),
+                         Sample(output or 0.0, others[0], specific_force=others[1]), len(group))
 
 
 def _known_mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
-    return _mean(known) if known else None
+    return fmean(known) if known else None

@@ -41,18 +41,13 @@ class Emulator:
     An emulated gyro that programs can open as a port.
 
     Use it as a context manager, which sends from a thread of its own, or call `emulate`, which
-    sends until the samples end.
-
-    Each sample is taken from the source after the one before it was sent, so a source may be
-    endless and may depend on commands. The first sample is sent at once; a source that is slower
-    than its times delays the output. Above 2 kHz a few samples are sent together. Samples without
-    a sequence are numbered from 0 on.
+    sends until the samples end. Each sample is taken from the source after the one before it was
+    sent, so a source may be endless and may depend on commands. The first sample is sent at once.
+    Above 2 kHz a few samples are sent together. Samples without a sequence are numbered from 0 on.
 
     Parameters
     ----------
-    protocol : Protocol
     samples : each with its time, in seconds
-    settings : Settings or None
     speed : factor of real time; inf is the speed of the reader. Up to 1, bytes that are not read
         are lost, as on a real line; above 1 the emulator waits for the reader.
     link : path of a symbolic link to the pseudo-terminal, whose name differs from run to run; it
@@ -130,10 +125,6 @@ class Emulator:
             os.close(self._master)
             self._master = -1
 
-    def join(self) -> None:
-        """Wait until all samples were sent."""
-        self._thread.join()
-
     def __enter__(self) -> Emulator:
         self.open()
         self._thread.start()
@@ -174,9 +165,8 @@ class Emulator:
             if pending and start + due > time.monotonic():
                 self._send(pending)
                 pending, sent = b'', time.monotonic()
-            now = time.monotonic()
-            if (self._stop.wait(max(start + due, sent + self._BATCH_DURATION) - now) if start
-                    + due > now else self._stop.is_set()):
+            wait = max(start + due, sent + self._BATCH_DURATION) - time.monotonic()
+            if self._stop.wait(wait if start + due > time.monotonic() else 0.0):
                 return
             pending += data
             if time.monotonic() >= sent + self._BATCH_DURATION:

@@ -111,30 +111,19 @@ def recording_notes(**details: object) -> dict[str, str]:
     return {'recorded by': f'gyro_calibration {__version__}', 'date': date, **known}
 
 
-class _Recorder:
-    """A new file with notes; raises as `AtomicAppender` does."""
-
-    def __init__(self, path: str, notes: NotesCallback):
-        self._file, self._notes = AtomicAppender(path), notes
-
-    @property
-    def size(self) -> int:
-        """Bytes in the file."""
-        return self._file.size
-
-
-class McapRecorder(_Recorder):
+class McapRecorder:
     """
     Writes serialized messages into an MCAP file; each piece is a chunk.
 
     Attributes
     ----------
+    file : the `AtomicAppender`
     variance : variance of the rate of a sample, (rad/s)²
 
     """
 
     def __init__(self, path: str, notes: NotesCallback):
-        super().__init__(path, notes)
+        self.file, self._notes = AtomicAppender(path), notes
         self._writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
@@ -161,25 +150,25 @@ class McapRecorder(_Recorder):
     def flush(self) -> None:
         """Write the messages so far as a piece."""
         if self._writer.pending_bytes:
-            head = b'' if self.size else self._writer.pack_header(
+            head = b'' if self.file.size else self._writer.pack_header(
                 f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
-            self._file.append(head + self._writer.pack_chunk())
+            self.file.append(head + self._writer.pack_chunk())
 
     def close(self) -> None:
         """Write the last piece and the closing part; on a full disk without the index."""
         try:
-            if not self._file.is_full:
+            if not self.file.is_full:
                 self.flush()
-                if self.size:
-                    self._file.append(self._writer.pack_summary())
-            elif self.size:
+                if self.file.size:
+                    self.file.append(self._writer.pack_summary())
+            elif self.file.size:
                 with suppress(DiskFull):  # a reader then takes the file for truncated
-                    self._file.append(MCAP_END)
+                    self.file.append(MCAP_END)
         finally:
-            self._file.close()
+            self.file.close()
 
 
-class CsvRecorder(_Recorder):
+class CsvRecorder:
     """
     Writes samples as rows of the log format.
 
@@ -189,12 +178,13 @@ class CsvRecorder(_Recorder):
 
     Attributes
     ----------
+    file : the `AtomicAppender`
     late_columns : columns that came after the first piece and are not in the file
 
     """
 
     def __init__(self, path: str, notes: NotesCallback):
-        super().__init__(path, notes)
+        self.file, self._notes = AtomicAppender(path), notes
         self._is_compressed = path.endswith('.gz')
         self._rows: list[tuple[int, dict[str, float]]] = []
         self._held_values: dict[str, float] = {}
@@ -228,16 +218,16 @@ class CsvRecorder(_Recorder):
             writer.writerow([repr((time - self._start_stamp) / NSEC_PER_SEC),
                              *(repr(values[name]) for name in self._columns)])
         data = text.getvalue().encode()
-        self._file.append(gzip.compress(data, 6, mtime=0) if self._is_compressed else data)
+        self.file.append(gzip.compress(data, 6, mtime=0) if self._is_compressed else data)
         self._rows.clear()
 
     def close(self) -> None:
         """Write the last piece, unless one failed before: it may have had the header."""
         try:
-            if not self._file.is_full:
+            if not self.file.is_full:
                 self.flush(is_final=True)
         finally:
-            self._file.close()
+            self.file.close()
 
     def _write_header(self, text: io.StringIO, writer: Any) -> None:
         """Write notes and header; the first value of each column applies from the beginning."""

@@ -13,31 +13,27 @@ Clocks: the time of sending of each sample, and continuous time where a clock is
 
 `SampleClock` stamps samples. They arrive late, because a USB adapter holds bytes for 16 ms or the
 host is busy, but never early. So the time of a sample is a straight line over its number: the line
-under all arrivals of the last 20 s with the least sum of distances [1]_. The number is the
-sequence of the device, or its time, or a count. Lost samples without other evidence are detected
-too: all later samples are late by whole periods. Samples counted twice are detected at the next
-arrival, which is early.
+under all arrivals of the last 20 s with the least sum of distances (Moon, Skelly, Towsley:
+Estimation and removal of clock skew from network delay measurements, INFOCOM 1999). The number is
+the sequence of the device, or its time, or a count. Lost samples without other evidence show as
+well: all later samples are late by whole periods; and samples counted twice arrive early.
 
-`ClockStepDetector` detects that a clock was set. A computer without a battery starts with a wrong
-date and is set by months when it finds a time server; then the stamps jump. `NodeTimeConverter`
-converts a steady clock to stamps of such a clock, `HostTimeConverter` converts its stamps to a
-continuous time.
+`ClockStepDetector` detects that a clock was set: a computer without a battery starts with a wrong
+date and is set by months when it finds a time server. `NodeTimeConverter` converts a steady clock
+to stamps of such a clock, `HostTimeConverter` converts its stamps to a continuous time.
 
 No clock is read here, except by `read_steady_clock`: the caller gives the time of arrival.
-
-References
-----------
-.. [1] Moon, Skelly, Towsley: Estimation and removal of clock skew from network delay
-   measurements, INFOCOM 1999.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 import math
+from statistics import median
 import time
 
 from gyro_calibration.driver.protocols import Sample
@@ -45,51 +41,39 @@ from gyro_calibration.driver.protocols import Sample
 _Point = tuple[float, float]
 
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
-# s; window of the line: 200 arrivals at 10 Hz, little drift of a warming clock
-_LINE_WINDOW = 20.0
-_MIN_BLOCKS = 32  # least number of blocks in a full window; the largest is twice this
+_LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
+_WINDOW_BLOCKS = 64  # number of blocks in the window
 _SETTLING_DURATION = 2.0  # s; least span of a line before its period shows lost samples
-# s; time constant of stamps to the line, before and after it has settled
-_SLEW_TIME_CONSTANTS = (0.2, 1.0)
-# s; least duration of lateness that proves a loss: a stalled host catches up
-_MIN_LATE_DURATION = 0.3
-# s; duration after which the lateness itself is tested, not only its change
-_LONG_LATE_DURATION = 1.5
-_FALSE_LOSS_PROBABILITY = 1e-6  # probability that as many arrivals are late without a loss
-# windows of `_MIN_LATE_DURATION` each, over which a slow sweep of the lateness is averaged
-_SWEEP_WINDOWS = 64
-_MIN_SWEEP_SHARE = 0.2  # share of those windows that shows a sweep; by chance it is a few
-_LATE_SHARE_MEMORY = 256  # arrivals, over which the share of late ones without a loss is averaged
+_SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line
+_MIN_LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
+_LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
+_MIN_LATE_ARRIVALS = 3  # least number of late arrivals that prove a loss
 _JITTER_DURATION = 10.0  # s; averaging time of the jitter
 _MAX_CLOCK_DRIFT = 2e-5  # largest increase of the device clock rate while counts are uncertain, 1
-# s; least lateness that proves a loss: the host may wake up later than before
-_MIN_LATENESS = 0.5e-3
+_MIN_LATENESS = 0.5e-3  # s; that proves a loss: the host may wake up later than before
 _OUTLIER_LATENESS = 0.02  # s; largest lateness with a correct sequence, above the 16 ms of a burst
-_MAX_ODD_ADVANCES = 8  # successive advances that do not fit the mean one show that it is wrong
+_MAX_ODD_ADVANCES = 8  # in a row, which show that the mean advance is wrong
 _MAX_TIME_JUMP = 3.0  # s; largest continuous step of the time of a device
-# s; largest difference of a clock that is slewed; beyond it the clock was set
-_CLOCK_STEP_THRESHOLD = 0.1
-# s; after a clock was set, older stamps may still arrive for this time
-_MIXED_STAMPS_DURATION = 10.0
+_CLOCK_STEP_THRESHOLD = 0.1  # s; largest difference of a clock that is slewed, not set
+_MIXED_STAMPS_DURATION = 10.0  # s; for which older stamps may arrive after a clock was set
 _MAX_READING_DURATION = 0.05  # s; longest duration of a simultaneous reading of two clocks
 _DIFFERENCE_TIME_CONSTANT = 2.0  # s; time constant of the difference of two clocks
 
 
 class LowerLine:
     """
-    The line below all points with the least sum of distances.
+    The line below all points of the last 20 s with the least sum of distances.
 
     Only the lowest point of each block of time is kept. The line is the edge of their lower hull
-    over their mean. Blocks grow with the time span of the points, up to 20 s in total; older
-    points are dropped. With less than two points, the slope is the given one.
+    over their mean. With less than two points, the slope is the given one.
 
     """
 
     def __init__(self, slope: float):
         self.slope = slope
-        self._points: list[_Point] = []
+        self._points: deque[_Point] = deque(maxlen=_WINDOW_BLOCKS)
         self._anchor = (0.0, 0.0)
-        self._begin, self._block_begin, self._block_length = 0.0, -math.inf, 0.0
+        self._begin, self._block_begin = 0.0, -math.inf
 
     @property
     def is_known(self) -> bool:
@@ -108,10 +92,9 @@ class LowerLine:
         """Add a point that is not lower than the one before; x is larger than before."""
         if not self._points:
             self._begin, self._anchor = y, (x, y)
-        if y - self._block_begin >= self._block_length:
+        if y - self._block_begin >= _LINE_WINDOW / _WINDOW_BLOCKS:
             self._points.append((x, y))
             self._block_begin = y
-            self._merge_blocks()
         elif y - self.slope * x <= self._points[-1][1] - self.slope * self._points[-1][0]:
             self._points[-1] = (x, y)
         else:
@@ -122,19 +105,8 @@ class LowerLine:
         """Shift the points from a height on along x, and drop points that they overtake."""
         moved = [(x + offset, y) for x, y in self._points if y >= start]
         first = moved[0][0] if moved else math.inf
-        self._points = [(x, y) for x, y in self._points if y < start and x < first] + moved
-
-    def _merge_blocks(self) -> None:
-        """Merge blocks in pairs while they are short, then drop the oldest."""
-        if len(self._points) <= 2 * _MIN_BLOCKS:
-            return
-        if self._block_length >= _LINE_WINDOW / 2 / _MIN_BLOCKS:
-            del self._points[0]
-            return
-        pairs = zip(self._points[0::2], [*self._points[1::2], self._points[-1]], strict=False)
-        self._points = [min(pair, key=lambda point: point[1] - self.slope * point[0])
-                        for pair in pairs]
-        self._block_length = max(2.0 * self._block_length, self.time_span() / _MIN_BLOCKS)
+        kept = [(x, y) for x, y in self._points if y < start and x < first]
+        self._points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
     def _fit(self) -> None:
         hull = _lower_hull(self._points)
@@ -146,7 +118,7 @@ class LowerLine:
             self.slope = (right[1] - left[1]) / (right[0] - left[0])
 
 
-def _lower_hull(points: Sequence[_Point]) -> list[_Point]:
+def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
     """Return the corners of the lower convex hull of points in the order of x."""
     hull: list[_Point] = []
     for x, y in points:
@@ -171,16 +143,15 @@ class _SampleCounter:
 
     def __init__(self, rate: float, modulus: int):
         self._rate, self.modulus = rate, modulus
-        self._time: float | None = None
-        self._outlier_time: float | None = None
         self.reset()
 
     def reset(self) -> None:
         self.mean_advance, self.ambiguity, self._unevenness, self._is_sequence_frozen = (
             1.0, 1, 0.0, False)
-        self._odd_advances, self._odd_lost = list[float](), 0
+        self._odd_advances = list[tuple[float, int]]()
         self._sequence: int | None = None
-        self._time = self._outlier_time = None
+        self._time: float | None = None
+        self._outlier_time: float | None = None
 
     def advance(self, sample: Sample, max_advance: float = math.inf,
                 may_wrap: bool = False) -> tuple[float, int]:
@@ -236,24 +207,20 @@ class _SampleCounter:
             return 0
         steps = advance / self.mean_advance
         # Times with a resolution near the period do not show single samples.
-        lost = round(steps) - 1 if steps > 2.5 or steps > 1.5 and self._unevenness < 0.15 else 0
-        if not 0.3 <= steps <= 2.5:
-            return self._correct_mean_advance(advance, max(lost, 0))
-        self._odd_advances, self._odd_lost = [], 0
-        self.mean_advance += 0.05 * (advance - self.mean_advance)
-        self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
-        return lost
-
-    def _correct_mean_advance(self, advance: float, lost: int) -> int:
-        """Set the mean advance from odd ones in a row; cancel the losses that they showed."""
-        self._odd_advances.append(advance)
-        self._odd_lost += lost
+        lost = round(steps) - 1 if steps > (1.5 if self._unevenness < 0.15 else 2.5) else 0
+        if 0.3 <= steps <= 2.5:
+            self._odd_advances.clear()
+            self.mean_advance += 0.05 * (advance - self.mean_advance)
+            self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
+            return lost
+        self._odd_advances.append((advance, lost))
         if len(self._odd_advances) < _MAX_ODD_ADVANCES:
             return lost
-        self.mean_advance = sorted(self._odd_advances)[_MAX_ODD_ADVANCES // 2]
-        before = self._odd_lost - lost
-        self._odd_advances, self._odd_lost = [], 0
-        return -before
+        # the mean advance is wrong, and so are the losses that it showed
+        advances, losses = zip(*self._odd_advances, strict=True)
+        self._odd_advances.clear()
+        self.mean_advance = median(advances)
+        return lost - sum(losses)
 
 
 class _LatenessTest:
@@ -261,24 +228,21 @@ class _LatenessTest:
     Test whether samples have been late for so long that some must be lost.
 
     Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly to a
-    period and falls to zero (a sweep). So the step of the least lateness is tested; the lateness
-    itself is tested only after a longer time. During a sweep, a step by one period is a sample
-    that moved into the next burst, and no loss.
+    period and falls to zero. So the step of the least lateness is tested; the lateness itself is
+    tested only after a longer time.
 
     """
 
     def __init__(self) -> None:
-        self.late_since: float | None = None
-        self._on_time_share = 0.5  # share of the arrivals in time
-        self._last_on_time = math.inf  # the last arrival in time
-        self._min_on_time_lateness, self._min_previous_lateness, self._window_start = (
-            math.inf, math.inf, -math.inf)
-        self._sweep_share = 0.0  # share of windows whose least lateness exceeds half of the bound
+        self._last_on_time = math.inf  # time of the last arrival that was not late
+        # least lateness of arrivals that were not late, since the start of a window
+        self._least_on_time, self._window_start = math.inf, -math.inf
         self.reset()
 
     def reset(self) -> None:
-        self.late_since, self.late_step, self._min_lateness = None, 0.0, math.inf
-        self._late_count, self._first_number, self._last_arrival = 0, 0.0, 0.0
+        self.late_since: float | None = None
+        self.late_step, self._least = 0.0, math.inf
+        self._count, self._first_number, self._last_arrival = 0, 0.0, 0.0
 
     def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
                        period: float) -> bool:
@@ -289,44 +253,30 @@ class _LatenessTest:
 
         """
         if lateness <= bound:
-            self._learn_on_time(lateness, bound, arrival)
+            self.reset()
+            self._last_on_time = arrival
+            if arrival - self._window_start > _LONG_LATE_DURATION:
+                self._window_start, self._least_on_time = arrival, math.inf
+            self._least_on_time = min(self._least_on_time, lateness)
             return False
         # Lateness before a silence does not show losses in the silence.
         if (self.late_since is None
                 or arrival - self._last_arrival > max(0.5 * _MIN_LATE_DURATION, 3.0 * period)):
-            self.late_since, self._first_number, self._late_count, self._min_lateness = (
+            self.late_since, self._first_number, self._count, self._least = (
                 arrival, number, 0, math.inf)
-        self._min_lateness, self._last_arrival = min(self._min_lateness, lateness), arrival
-        self._late_count += 1
-        needed = (math.log(_FALSE_LOSS_PROBABILITY)
-                  / math.log1p(-min(max(self._on_time_share, 0.02), 0.99)))
+        self._least, self._last_arrival = min(self._least, lateness), arrival
+        self._count += 1
         lasts = arrival - self.late_since
-        before = (0.0 if lasts > _LONG_LATE_DURATION
-                  else max(0.0, min(self._min_on_time_lateness, self._min_previous_lateness)))
-        self.late_step = self._min_lateness - before
-        is_slip = self._sweep_share > _MIN_SWEEP_SHARE and self._min_lateness < 1.5 * bound
-        return (lasts >= _MIN_LATE_DURATION and self._late_count >= needed
-                and self.late_step > bound and not is_slip)
+        before = 0.0 if lasts > _LONG_LATE_DURATION else max(0.0, self._least_on_time)
+        self.late_step = self._least - before
+        return (lasts >= _MIN_LATE_DURATION and self._count >= _MIN_LATE_ARRIVALS
+                and self.late_step > bound)
 
     def is_loss_excluded(self, number: float, arrival: float, slope: float) -> bool:
         """Tell whether the sample rate fell, or the lateness exceeds the time that it lasts."""
         assert self.late_since is not None
-        grows = (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
-        return (grows
-                or self._min_lateness > self.late_since - self._last_on_time + _MIN_LATE_DURATION)
-
-    def _learn_on_time(self, lateness: float, bound: float, arrival: float) -> None:
-        # Average over one arrival in time, and the late ones before it without a loss.
-        self._on_time_share *= (1.0 - 1.0 / _LATE_SHARE_MEMORY) ** self._late_count
-        self._on_time_share += (1.0 - self._on_time_share) / _LATE_SHARE_MEMORY
-        self.reset()
-        self._last_on_time = arrival
-        if arrival - self._window_start > _MIN_LATE_DURATION:
-            is_late = 0.5 * bound < self._min_on_time_lateness < math.inf
-            self._sweep_share += (is_late - self._sweep_share) / _SWEEP_WINDOWS
-            self._window_start, self._min_previous_lateness = arrival, self._min_on_time_lateness
-            self._min_on_time_lateness = math.inf
-        self._min_on_time_lateness = min(self._min_on_time_lateness, lateness)
+        fell = (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
+        return fell or self._least > self.late_since - self._last_on_time + _MIN_LATE_DURATION
 
 
 class SampleClock:
@@ -454,15 +404,13 @@ class SampleClock:
     def _add_unnoticed_losses(self, ambiguity: int, number: float, arrival: float) -> int:
         late = self._lateness
         lost = ambiguity * math.floor(late.late_step / (ambiguity * self.period) + 0.25)
-        assert late.late_since is not None
-        since = late.late_since
-        is_no_loss = late.is_loss_excluded(number, arrival, self._line.slope)
-        late.reset()
-        if is_no_loss:
+        if late.is_loss_excluded(number, arrival, self._line.slope):
             self._restart_line()
             return 0
-        self._uncertain_since = since
-        return self._renumber(since, lost)
+        assert late.late_since is not None
+        self._uncertain_since = late.late_since
+        late.reset()
+        return self._renumber(self._uncertain_since, lost)
 
     def _renumber(self, since: float, offset: int) -> int:
         self._line.shift(since, offset)
@@ -486,7 +434,7 @@ class SampleClock:
         line.add(number, max(arrival, lowest))
         elapsed, self._last_number = max(0.0, number - self._last_number) * line.slope, number
         slew = 0.0 if is_first else before - line.value_at(number)
-        slew *= math.exp(-elapsed / _SLEW_TIME_CONSTANTS[line.time_span() > _SETTLING_DURATION])
+        slew *= math.exp(-elapsed / _SLEW_TIME_CONSTANT)
         self._slew_offset = min(slew, arrival - line.value_at(number))
 
     def _make_increasing(self, stamps: list[float], arrival: float) -> list[float]:

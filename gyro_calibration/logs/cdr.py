@@ -36,14 +36,10 @@ ODOMETRY, POSE, TWIST = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped
 #: In element 0 of the covariance of a quantity that the message does not report (REP-145).
 NOT_REPORTED = -1.0
 
+#: Variance of quantities that a single-axis gyro does not measure, in (rad/s)², (m/s²)², rad² or
+#: m². All zeros would declare the whole covariance unknown, z included; 1000 rad/s give these axes
+#: no weight in a filter, and the matrix can still be inverted.
 UNMEASURED_VARIANCE = 1e6
-"""
-Variance of quantities that a single-axis gyro does not measure, in (rad/s)², (m/s²)², rad² or m².
-
-All zeros would declare the whole covariance unknown, z included. A standard deviation of
-1000 rad/s gives these axes no weight in a filter, and the matrix can still be inverted.
-
-"""
 
 
 def z_axis_covariance(variance: float) -> tuple[float, ...]:

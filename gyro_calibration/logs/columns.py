@@ -64,7 +64,7 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'moving': ('moving', {'1': 1.0}),
 }
 #: Name of a quantity in options -> pattern of column names in other programs, in lower case,
-#: letters only, without the unit.
+#: letters only, before the unit.
 _COLUMN_ALIASES = {
     'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
     'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|gyroscope|gyroscopez|omega|omegaz|.*angularvelocityz|'
@@ -74,9 +74,6 @@ _COLUMN_ALIASES = {
     'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
     'supply': r'vdd|vcc|supply|voltage|volts',
 }
-#: Suffixes of names -> unit.
-_UNIT_SUFFIXES = {'dps': 'deg/s', 'degs': 'deg/s', 'deg': 'deg', 'rads': 'rad/s', 'rad': 'rad',
-                  'ms': 'ms', 'us': 'us', 'ns': 'ns'}
 
 
 class Column(NamedTuple):
@@ -107,7 +104,7 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
     InputError : an unknown quantity, column or unit, a quantity in two columns, or no output
 
     """
-    found = {}
+    found: dict[str, Column] = {}
     for name, text in user_columns.items():
         if name not in _OPTION_QUANTITIES:
             raise InputError(
@@ -115,19 +112,16 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
                 f'{", ".join(_OPTION_QUANTITIES)}{_suggest_nearest(name, _OPTION_QUANTITIES)}')
         quantity, units = _OPTION_QUANTITIES[name]
         found[quantity] = _find_column(header, name, text, units)
+    by_user = set(found)
     asked = {column.position for column in found.values()}
-    names: dict[str, str] = {}
     for index, name in enumerate(header):
-        plain_name = _strip_axis(name, axis)
-        if index in asked or plain_name not in COLUMNS:
+        quantity, factor = COLUMNS.get(_strip_axis(name, axis), ('', 0.0))
+        if not quantity or index in asked or quantity in by_user:
             continue
-        quantity, factor = COLUMNS[plain_name]
-        if quantity in found and quantity not in names:
-            continue  # the user named another
         if quantity in found:
-            raise InputError(f'columns {names[quantity]} and {name} both give the {quantity}; '
-                             'keep one of them')
-        found[quantity], names[quantity] = Column(index, factor), name
+            raise InputError(f'columns {header[found[quantity].position]} and {name} both give '
+                             f'the {quantity}; keep one of them')
+        found[quantity] = Column(index, factor)
     if not {'output', 'counts'} & set(found):
         raise InputError(f'no gyro column among {_shorten(",".join(header))}; '
                          f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggest_columns(header)}')
@@ -164,35 +158,35 @@ def is_header(header: Sequence[str], user_columns: Mapping[str, str], axis: str)
 
 def suggest_columns(header: Sequence[str]) -> str:
     """Suggest the option --columns for a header, or another name; '' without a suggestion."""
-    wanted = []
-    names = [name for name in header if name == _shorten(name) and not set(name) & set(',=:')]
-    for quantity, pattern in _COLUMN_ALIASES.items():
+    names = [name for name in header if name not in COLUMNS and name == _shorten(name)
+             and not set(name) & set(',=:')]
+    wanted = {}
+    for quantity in _COLUMN_ALIASES:
         for name in names:
-            letters, unit = _split_unit(name, _OPTION_QUANTITIES[quantity][1])
-            if re.fullmatch(pattern, letters):
-                wanted.append(f'{quantity}={name}:{unit}')
-                break
-    if any(each.startswith('gyro=') for each in wanted):
+            if quantity not in wanted and (unit := _guess_unit(name, quantity)):
+                wanted[quantity] = f'{quantity}={name}:{unit}'
+    if 'gyro' in wanted:
+        text = ','.join(wanted.values())
         units = (', with a unit in place of each UNIT, such as s, ms, deg/s, rad/s, deg, rad'
-                 if any(each.endswith(':UNIT') for each in wanted) else '')
-        return f'; perhaps --columns {shlex.quote(",".join(wanted))} is meant{units}'
+                 if 'UNIT' in text else '')
+        return f'; perhaps --columns {shlex.quote(text)} is meant{units}'
     for name in header:
         if name not in COLUMNS and (close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
             return f'; perhaps {close[0]} is meant by {_shorten(name)}'
     return ''
 
 
-def _split_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
-    """Return the letters of a name without its unit, and the unit; UNIT if there is none."""
-    base, _, rest = name.replace('[', '(').partition('(')
-    unit = rest.rstrip(')] ').replace('°', 'deg').replace('sec', 's')
-    letters = re.sub(r'[^a-z]', '', (base if unit in units else name).lower())
-    if unit in units:
-        return letters, unit
-    for end, unit in _UNIT_SUFFIXES.items():
-        if unit in units and letters.endswith(end) and len(letters) > len(end):
-            return letters.removesuffix(end), unit
-    return letters, 'UNIT'
+def _guess_unit(name: str, quantity: str) -> str:
+    """Return the unit in a name of a quantity, UNIT without one; '' for another quantity."""
+    letters = re.sub('[^a-z]', '', name.lower().replace('°', 'deg'))
+    units = _OPTION_QUANTITIES[quantity][1]
+    endings = {re.sub('[^a-z]', '', unit.lower()): unit for unit in units}
+    endings |= {f'{end}ec': unit for end, unit in endings.items() if unit.endswith('/s')}
+    for end, unit in {**endings, '': 'UNIT'}.items():
+        if letters.endswith(end) and re.fullmatch(_COLUMN_ALIASES[quantity],
+                                                  letters.removesuffix(end)):
+            return unit
+    return ''
 
 
 def _shorten(text: str) -> str:

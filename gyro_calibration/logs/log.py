@@ -29,7 +29,7 @@ import itertools
 import math
 from pathlib import Path
 import reprlib
-from typing import Any
+from typing import Any, NamedTuple
 import zlib
 
 from gyro_calibration.files import (
@@ -75,6 +75,8 @@ _MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 20, 1 <<
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
 
+#: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
+_MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading')
 #: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
 #: as text.
@@ -161,19 +163,17 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     blocks, numbers = [], 0
     for block in read_log_blocks(path, sensitivity, rate, on_progress=on_progress,
                                  columns=columns, axis=axis):
-        numbers += len(block) * (sum(getattr(block, quantity) is not None
-                                     for quantity in QUANTITIES) + 10 * len(block.others))
+        present = [quantity for quantity in QUANTITIES if getattr(block, quantity) is not None]
+        numbers += len(block) * (len(present) + 10 * len(block.others))
         if numbers > _MAX_LOG_VALUES:
             raise LogError(f'{path}: has more than {_MAX_LOG_VALUES} numbers, which is above the '
                            'limit of memory; split it')
         blocks.append(block)
-    first = blocks[0]
-    present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
     arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks])
               for quantity in present}
     others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks))
-              for name in first.others}
-    return Log(**arrays, notes=first.notes, others=others)
+              for name in block.others}
+    return Log(**arrays, notes=block.notes, others=others)
 
 
 def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
@@ -280,21 +280,14 @@ def _limit_length(lines: Iterator[str], max_length: int) -> Iterator[str]:
         yield line
 
 
-@dataclass(frozen=True)
-class _FileHeader:
-    """Notes and header of a file: notes, names, quantity -> column, delimiter."""
+class _FileHeader(NamedTuple):
+    """Notes and names of a file, columns of quantities and of all others, and the delimiter."""
 
     notes: tuple[str, ...]
     header: list[str]
     columns: dict[str, Column]
+    other_columns: dict[str, int]
     delimiter: str
-
-    @property
-    def other_columns(self) -> dict[str, int]:
-        """Return the names of columns without a quantity, made unique, with their indices."""
-        taken = {column.position for column in self.columns.values()}
-        return {name: index for index, name in enumerate(_make_unique(self.header))
-                if index not in taken and self.header[index] not in COLUMNS}
 
 
 def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
@@ -317,7 +310,11 @@ def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, s
         found = find_columns(header, columns, axis)
     except InputError as error:
         raise LogError(f'{path}: {error}') from None
-    return _FileHeader(tuple(notes), header, found, delimiter), len(notes) + rows.line_num + 1
+    taken = {column.position for column in found.values()}
+    others = {name: index for index, name in enumerate(_make_unique(header))
+              if index not in taken and header[index] not in COLUMNS}
+    return (_FileHeader(tuple(notes), header, found, others, delimiter),
+            len(notes) + rows.line_num + 1)
 
 
 def _make_unique(header: list[str]) -> list[str]:
@@ -349,11 +346,9 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
         return None
     arrays: dict[str, Array] = {}
     for quantity, (index, factor, offset) in table.columns.items():
-        arrays[quantity] = values[:, index] * factor
-        if offset:
-            arrays[quantity] += offset
         if _mask_invalid(values[:, index], quantity).any():
             return None
+        arrays[quantity] = values[:, index] * factor + offset
     return range(first_line, first_line + len(lines) + 1), arrays, {}
 
 
@@ -405,21 +400,16 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
     wrong = _mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        fault = (f'beyond the limit of {_max_magnitude(quantity):g}' if np.isfinite(values[row])
-                 else 'not a finite number')
+        fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
+                 if np.isfinite(values[row]) else 'not a finite number')
         raise LogError(f'{path}: line {line_numbers[row]}, column {column}: {excerpt(texts[row])} '
                        f'is {fault}; remove the row')
     return values
 
 
 def _mask_invalid(values: Array, quantity: str) -> Mask:
-    size = np.abs(values)
-    return (size > MAX_MAGNITUDE
-            if quantity in _NULLABLE_QUANTITIES else ~(size <= _max_magnitude(quantity)))
-
-
-def _max_magnitude(quantity: str) -> float:
-    return 1e5 if quantity == 'temperature' else MAX_MAGNITUDE  # degC, or the unit of the quantity
+    valid = np.abs(values) <= _MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE)
+    return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
 
 
 def excerpt(text: str) -> str:
@@ -464,15 +454,14 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
     except (TypeError, ValueError) as error:
         raise LogError(f'the table is no log: {describe_error(error)}') from None
     shapes = {values.shape for values in arrays.values()}
-    if len(shapes) > 1 or any(len(shape) != 1 or shape[0] < 2 for shape in shapes):
+    if len(shapes) > 1 or min(shapes) < (2,) or len(min(shapes)) != 1:
         raise LogError(f'the columns have shapes {sorted(shapes)}; wanted one shape (n,), with at '
                        'least two rows')
     for quantity, values in arrays.items():
         if (wrong := _mask_invalid(values, quantity)).any():
             raise LogError(f'row {int(np.argmax(wrong))} of {header[found[quantity].position]} is '
                            f'{values[np.argmax(wrong)]:g}; remove the row')
-    _refuse_unordered_time('the table', range(len(next(iter(arrays.values())))),
-                           arrays.get('time'), -math.inf)
+    _refuse_unordered_time('the table', range(*min(shapes)), arrays.get('time'), -math.inf)
     return Log(**arrays)
 
 

@@ -95,11 +95,10 @@ def _refine_step(codes: QuantizationCodes, step: float) -> tuple[float, float, f
             return step, aligned, deviation
         number = np.rint((place[within] - offset) / step)
         if np.ptp(number) > 0.0:
-            step, off, spread = _fit_line(number, place[within])
-            good = np.abs(off) <= 0.3 * abs(step)
-            if np.ptp(number[good]) > 0.0:
-                step, off, spread = _fit_line(number[good], place[within][good])
-            deviation = float(np.std(off) / spread)
+            fitted = np.polyfit(number, place[within], 1)
+            step = float(fitted[0])
+            deviation = float(np.std(place[within] - np.polyval(fitted, number))
+                              / (np.std(number) * math.sqrt(len(number))))
         if within.all():
             return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
         reach *= 4.0
@@ -116,14 +115,6 @@ def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
               if len(counts) > 1 else counts)
     mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
     return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
-
-
-def _fit_line(number: Array, place: Array) -> tuple[float, Array, float]:
-    """Return slope and residuals of positions, and the root of the sum of squares of numbers."""
-    centred, apart = number - number.mean(), place - place.mean()
-    squares = float(centred @ centred)
-    slope = float(centred @ apart) / squares
-    return slope, apart - slope * centred, float(np.sqrt(squares))
 
 
 def quantization_step(values: Array) -> float:

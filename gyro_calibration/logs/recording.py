@@ -88,8 +88,6 @@ class _TopicBuffer:
     def __init__(self, topic: str, kind: str, definition: str, axis: str):
         self.topic, self.kind, self.damaged_count = topic, kind, 0
         self._layout = cdr.parse_layout(definition, axis)
-        self.quantities = tuple(self._layout.quantities)
-        self._kept_indices = tuple(self._layout.quantities.values())
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
 
     def __len__(self) -> int:
@@ -104,17 +102,17 @@ class _TopicBuffer:
             self.damaged_count += 1
             return
         self._stamps.append(stamp)
-        self._numbers.extend([numbers[place] for place in self._kept_indices])
+        self._numbers.extend([numbers[place] for place in self._layout.quantities.values()])
 
     def sort_by_arrival(self) -> _TopicSeries:
         """Return the messages in the order of receipt."""
         received = np.frombuffer(self._received, np.int64)
         numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
-        course = _TopicSeries(self.topic, self.kind, np.frombuffer(self._stamps, np.int64),
-                              received, numbers, self.quantities)
+        series = _TopicSeries(self.topic, self.kind, np.frombuffer(self._stamps, np.int64),
+                              received, numbers, tuple(self._layout.quantities))
         # no copy where they are in order already
-        return (course if (received[1:] >= received[:-1]).all()
-                else course.select(np.argsort(received, kind='stable')))
+        return (series if (received[1:] >= received[:-1]).all()
+                else series.select(np.argsort(received, kind='stable')))
 
 
 @dataclass(frozen=True)
@@ -214,7 +212,7 @@ class _LogBuilder:
         if not gyro.is_reported('rate'):
             raise LogError(f'{self._path}: {gyro.topic} declares that it reports no angular '
                            'velocity; name another by --topic')
-        reference, temperature = self._find_reference(), self._find_temperature()
+        reference, temperature = self._find_reference(), self._find_temperature(gyro.topic)
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:
             self._notes.append('headers have no stamps: times are those at which messages were '
@@ -244,7 +242,7 @@ class _LogBuilder:
     # Which topics
 
     def _find_only_imu(self) -> str:
-        found = [topic for topic in self._topics_of_type((cdr.IMU,))
+        found = [topic for topic in self._topics_of_type({cdr.IMU})
                  if not _is_same_topic(topic, self._topics.reference)]
         if len(found) == 1:
             return found[0]
@@ -256,30 +254,24 @@ class _LogBuilder:
                        f'{self._list_topics()}; record the topic of the gyro')
 
     def _find_reference(self) -> _TopicSeries | None:
-        wanted = self._topics.reference
-        if wanted is None:
-            found = [topic for topic in self._topics_of_type(REFERENCE_TYPES)
-                     if self._series[topic].kind != cdr.IMU]
-            if found:
-                self._notes.append('no reference was asked for; --reference-topic may be '
-                                   f'{_join_names(found)}')
-            return None
-        return self._topic_series(self._find_topic(wanted, 'reference'))
+        if self._topics.reference is not None:
+            return self._topic_series(self._find_topic(self._topics.reference, 'reference'))
+        found = self._topics_of_type(set(REFERENCE_TYPES) - {cdr.IMU})
+        if found:
+            self._notes.append('no reference was asked for; --reference-topic may be '
+                               f'{_join_names(found)}')
+        return None
 
-    def _find_temperature(self) -> _TopicSeries | None:
-        wanted = self._topics.temperature
-        if wanted is not None:
-            return self._topic_series(self._find_topic(wanted, 'temperature'))
-        found = self._topics_of_type((cdr.TEMPERATURE,))
-        if not found:
-            return None
-        gyro = self._topics.gyro or self._find_only_imu()
-        near = max(found, key=lambda topic: len(
-            os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
+    def _find_temperature(self, gyro: str) -> _TopicSeries | None:
+        if self._topics.temperature is not None:
+            return self._topic_series(self._find_topic(self._topics.temperature, 'temperature'))
+        found = self._topics_of_type({cdr.TEMPERATURE})
         if len(found) > 1:
             self._notes.append(f'of the temperatures {_join_names(found)}, the one whose name is '
                                'nearest to the topic of the gyro is used')
-        return self._topic_series(near)
+        near = max(found, default=None, key=lambda topic: len(
+            os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
+        return self._topic_series(near) if near else None
 
     def _find_topic(self, wanted: str, role: str) -> str:
         topic = next((topic for topic in self._contents.topics if _is_same_topic(topic, wanted)),
@@ -297,7 +289,7 @@ class _LogBuilder:
             raise LogError(f'{self._path}: {topic} has no message that can be read; record again')
         return topic
 
-    def _topics_of_type(self, kinds: Sequence[str]) -> list[str]:
+    def _topics_of_type(self, kinds: set[str]) -> list[str]:
         return sorted(topic for topic, series in self._series.items()
                       if series.kind in kinds and len(series))
 
@@ -316,34 +308,33 @@ class _LogBuilder:
 
     def _order_samples(self, gyro: _TopicSeries, rate: float | None) -> _TopicSeries:
         """Sort samples by their stamps, leave out duplicates, and refuse unusable times."""
-        gyro = (self._drop_duplicates(self._sort_by_stamp(gyro)) if rate is None
-                else replace(gyro, stamps=np.maximum.accumulate(gyro.stamps)))
+        latest = np.maximum.accumulate(gyro.stamps)
+        back = latest - gyro.stamps
+        if rate is not None:
+            gyro = replace(gyro, stamps=latest)
+        elif back.any():
+            if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
+                place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
+                raise LogError(f'{self._path}: the stamps of {gyro.topic} step back by '
+                               f'{_format_seconds(back[place])} s at sample {place + 1}, as after '
+                               'setting a clock; split the recording there, or give the sample '
+                               'rate with --rate')
+            self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were '
+                               'sorted')
+            gyro = gyro.select(np.argsort(gyro.stamps, kind='stable'))
+        if rate is None:
+            gyro = self._drop_duplicates(gyro)
         if len(gyro) < 2:
             raise LogError(f'{self._path}: {gyro.topic} has {len(gyro)} samples with a time; '
                            'a log has at least two: record more')
         return gyro
 
-    def _sort_by_stamp(self, gyro: _TopicSeries) -> _TopicSeries:
-        back = np.maximum.accumulate(gyro.stamps) - gyro.stamps
-        if not back.any():
-            return gyro
-        if back.max() > _MAX_STEP_BACK * NSEC_PER_SEC:
-            place = int(np.argmax(back > _MAX_STEP_BACK * NSEC_PER_SEC))
-            raise LogError(f'{self._path}: the stamps of {gyro.topic} step back by '
-                           f'{_format_seconds(back[place])} s at sample {place + 1}, as after '
-                           'setting a clock; split the recording there, or give the sample rate '
-                           'with --rate')
-        self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were sorted')
-        return gyro.select(np.argsort(gyro.stamps, kind='stable'))
-
     def _drop_duplicates(self, gyro: _TopicSeries) -> _TopicSeries:
         doubled = np.diff(gyro.stamps, prepend=gyro.stamps[:1] - 1) == 0
         if not doubled.any():
             return gyro
-        same = doubled.copy()
-        rate = gyro.values('rate')
-        same[1:] &= rate[1:] == rate[:-1]
-        other = int(np.count_nonzero(doubled & ~same))
+        differs = np.diff(gyro.values('rate'), prepend=np.nan) != 0.0
+        other = int(np.count_nonzero(doubled & differs))
         if other > 1 + 0.01 * len(gyro):
             raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
                            'the stamp of another sample, so their times are unknown; '

@@ -14,12 +14,8 @@ ROS 2 recordings: messages read from a folder, an .mcap or a .db3 file, and writ
 The recording of a killed program lacks its closing part and index, so neither is used: records
 are read from the beginning up to the end, or to the point of truncation. No record may take more
 memory than `MAX_RECORD_BYTES`, and no file may expand to more than `MAX_EXPANSION_RATIO` times its
-size.
-
-Existing libraries have no such limits: rosbags 0.11.9 takes 2.6 GB for a database of 12 kB with
-computed columns and 3.7 GB for an MCAP file of 131 kB, and refuses a truncated file. ROS 2 has no
-writer of MCAP files that are complete after each chunk. The records follow the specification,
-https://mcap.dev/spec.
+size. Existing libraries have no such limits and refuse truncated files: rosbags 0.11.9 takes
+3.7 GB for an MCAP file of 131 kB. The records follow the specification, https://mcap.dev/spec.
 
 """
 
@@ -65,17 +61,6 @@ _ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
 #: Name of the metadata record of this program.
 METADATA_NAME = 'gyro_calibration'
 
-_KNOWN_TABLES = {'topics', 'messages', 'message_definitions'}
-#: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
-_MESSAGES_QUERY = """
-    SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
-           CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
-           CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
-    FROM messages"""
-#: Errors of SQLite in a damaged file: its own, with texts that may not be UTF-8, and lengths
-#: beyond the memory.
-_DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
-
 #: Is called with the number of bytes read of all files.
 OnProgress = Callable[[int], object]
 
@@ -88,6 +73,10 @@ class Message:
     kind: str
     received: int
     data: bytes
+
+
+#: Messages or None, each with the number of bytes read where progress is to be shown, else 0.
+_Messages = Iterator[tuple[Message | None, int]]
 
 
 @dataclass
@@ -103,14 +92,17 @@ class Contents:
     #: Number of parts that are damaged or too large.
     skipped_parts: int = 0
 
-    def keep_definition(self, kind: str, definition: str) -> bool:
-        """Tell whether a message type has known quantities, and store its definition."""
-        if kind not in self.definitions:
+    def add_topic(self, topic: str, kind: str, encoding: str,
+                  definition: str) -> tuple[str, str] | None:
+        """Store a topic; return it with its type, or None where it has no known quantities."""
+        topic, kind = excerpt(topic), excerpt(kind)
+        self.topics[topic] = kind
+        if kind not in self.definitions and encoding == 'cdr':
             with suppress(MessageError):
                 definition = DEFINITIONS.get(kind, definition)
                 if parse_layout(definition).quantities:
                     self.definitions[kind] = definition
-        return kind in self.definitions
+        return (topic, kind) if encoding == 'cdr' and kind in self.definitions else None
 
 
 def _to_short_line(text: object) -> str:
@@ -162,15 +154,15 @@ def read_messages(path: str | Path, contents: Contents,
 
     """
     done = 0
-
-    def report_progress(place: int) -> None:
-        on_progress(done + place)
-
     for file in list_recording_files(path):
+        read = _read_mcap if _recording_suffix(file) == '.mcap' else _read_database
         try:
             with _open_uncompressed(file) as source:
-                read = _read_mcap if _recording_suffix(file) == '.mcap' else _read_database
-                yield from read(source, file, contents, report_progress)
+                for message, place in read(source, file, contents):
+                    if place:
+                        on_progress(done + place)
+                    if message:
+                        yield message
             done += file.stat().st_size
         except OSError as error:
             raise LogError(f'{file}: cannot be read ({describe_error(error)}); '
@@ -194,11 +186,9 @@ def _open_uncompressed(path: Path) -> Iterator[Path]:
             yield path
             return
         with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
-            source, budget = Path(folder) / path.stem, _ExpansionBudget(path)
+            source = Path(folder) / path.stem
             with open(source, 'wb') as file:
-                for piece in _decompress_zstd(packed):
-                    budget.spend(len(piece))
-                    file.write(piece)
+                file.writelines(_decompress('zstd', packed, _ExpansionBudget(path)))
             yield source
 
 
@@ -218,16 +208,22 @@ class _ExpansionBudget:
                            'this is intended')
 
 
-def _decompress_zstd(packed: BinaryIO) -> Iterator[bytes]:
-    """Give the decompressed data of a Zstandard stream, up to a truncation or damage."""
-    zstandard = _import_library('zstandard')
-    reader = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).stream_reader(
-        packed, read_across_frames=True)
-    try:
+def _decompress(compression: str, packed: BinaryIO, budget: _ExpansionBudget) -> Iterator[bytes]:
+    """Give the data of a compressed stream, up to a truncation or damage."""
+    reader: Any
+    errors: tuple[type[Exception], ...]
+    if compression == 'zstd':
+        zstandard = _import_library('zstandard')
+        reader = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).stream_reader(
+            packed, read_across_frames=True)
+        errors = (zstandard.ZstdError,)
+    else:
+        reader = _import_library('lz4.frame').open(packed)
+        errors = (RuntimeError, EOFError)
+    with suppress(*errors):
         while piece := reader.read(_READ_BYTES):
+            budget.spend(len(piece))
             yield piece
-    except zstandard.ZstdError:
-        return
 
 
 def _import_library(name: str) -> Any:
@@ -238,6 +234,22 @@ def _import_library(name: str) -> Any:
         package = name.partition('.')[0]
         raise LogError(f'the recording is compressed, which needs the Python package {package}: '
                        f'pip install {package}') from None
+
+
+def _decompress_up_to(size: int, compression: str, data: bytes, budget: _ExpansionBudget) -> bytes:
+    """Return the first bytes of compressed data, at most a number."""
+    expanded = bytearray()
+    for piece in _decompress(compression, io.BytesIO(data), budget):
+        expanded += piece
+        if len(expanded) > size:
+            break
+    return bytes(expanded[:size])
+
+
+def _decompress_message(data: bytes, budget: _ExpansionBudget) -> bytes:
+    """Return the bytes of a message, decompressed if the message itself is compressed."""
+    return (_decompress_up_to(1 << 16, 'zstd', data, budget)
+            if data.startswith(_ZSTANDARD_MAGIC) else data)
 
 
 # MCAP
@@ -252,8 +264,7 @@ MCAP_END = (struct.pack('<BQ4x', _RecordCode.DATA_END, 4)
             + struct.pack('<BQ20x', _RecordCode.FOOTER, 20) + _MAGIC)
 
 
-def _read_mcap(source: Path, path: Path, contents: Contents,
-               on_progress: OnProgress) -> Iterator[Message]:
+def _read_mcap(source: Path, path: Path, contents: Contents) -> _Messages:
     with open(source, 'rb') as file:
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
@@ -262,10 +273,11 @@ def _read_mcap(source: Path, path: Path, contents: Contents,
         for code, body in _iter_records(file, end, contents):
             if code == _RecordCode.DATA_END:
                 return
-            yield from reader.read(code, body, torn=file.tell() == end)
+            for message in reader.read(code, body, torn=file.tell() == end):
+                yield message, 0
             if file.tell() - reported > _READ_BYTES:
                 reported = file.tell()
-                on_progress(reported)
+                yield None, reported
         contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, '
                               'and was read up to there')
 
@@ -298,7 +310,7 @@ class _McapReader:
     def __init__(self, contents: Contents, budget: _ExpansionBudget):
         self._contents, self._budget = contents, budget
         self._schemas: dict[int, tuple[str, str]] = {}
-        self._channels: dict[int, tuple[str, str]] = {}
+        self._channels: dict[int, tuple[str, str] | None] = {}
 
     def read(self, code: int, body: bytes, torn: bool = False) -> Iterator[Message]:
         """Give the messages in a record; a truncated chunk is read up to its end."""
@@ -309,8 +321,8 @@ class _McapReader:
                     yield from self.read(inner, content) if inner != _RecordCode.CHUNK else ()
             elif code == _RecordCode.MESSAGE:
                 number, _, received, _ = struct.unpack_from('<HIQQ', body)
-                if number in self._channels:
-                    yield Message(*self._channels[number], received,
+                if channel := self._channels.get(number):
+                    yield Message(*channel, received,
                                   _decompress_message(body[22:], self._budget))
             elif code == _RecordCode.SCHEMA:
                 kind, place = _read_text(body, 2)
@@ -319,12 +331,9 @@ class _McapReader:
             elif code == _RecordCode.CHANNEL:
                 number, schema = struct.unpack_from('<HH', body)
                 topic, place = _read_text(body, 4)
-                encoding, _ = _read_text(body, place)
                 kind, definition = self._schemas.get(schema, ('unknown', ''))
-                topic, kind = excerpt(topic), excerpt(kind)
-                self._contents.topics[topic] = kind
-                if encoding == 'cdr' and self._contents.keep_definition(kind, definition):
-                    self._channels[number] = topic, kind
+                self._channels[number] = self._contents.add_topic(
+                    topic, kind, _read_text(body, place)[0], definition)
             elif code == _RecordCode.METADATA:
                 name, pairs = _parse_metadata(body)
                 if name == METADATA_NAME:  # written by this program
@@ -371,50 +380,13 @@ def _read_chunk(body: bytes, torn: bool, budget: _ExpansionBudget) -> bytes:
     """Return the records of a chunk as bytes; of a truncated one those before its end."""
     _, _, size, check = struct.unpack_from('<QQQI', body)
     compression, place = _read_text(body, 28)
-    if size > MAX_RECORD_BYTES:
+    if size > MAX_RECORD_BYTES or compression not in ('', 'zstd', 'lz4'):
         raise _DamagedPart
-    data = _decompress(compression, body[place + 8:], size, budget)
+    data = body[place + 8:]
+    data = _decompress_up_to(size, compression, data, budget) if compression else data[:size]
     if not torn and (len(data) != size or check and zlib.crc32(data) != check):
         raise _DamagedPart
     return data
-
-
-def _decompress(compression: str, data: bytes, size: int, budget: _ExpansionBudget) -> bytes:
-    """Return decompressed data, up to the stated size."""
-    if compression == '':
-        return data[:size]
-    if compression not in _DECOMPRESSORS:
-        raise _DamagedPart
-    expanded = bytearray()
-    for piece in _DECOMPRESSORS[compression](data):
-        budget.spend(len(piece))
-        expanded += piece
-        if len(expanded) > size:
-            break
-    del expanded[size:]
-    return bytes(expanded)
-
-
-def _decompress_lz4(data: bytes) -> Iterator[bytes]:
-    decompressor = _import_library('lz4.frame').LZ4FrameDecompressor()
-    try:
-        piece = decompressor.decompress(data, max_length=_READ_BYTES)
-        while piece:
-            yield piece
-            piece = (b'' if decompressor.eof
-                     else decompressor.decompress(b'', max_length=_READ_BYTES))
-    except (RuntimeError, EOFError) as error:
-        raise _DamagedPart from error
-
-
-_DECOMPRESSORS: dict[str, Callable[[bytes], Iterator[bytes]]] = {
-    'zstd': lambda data: _decompress_zstd(io.BytesIO(data)), 'lz4': _decompress_lz4}
-
-
-def _decompress_message(data: bytes, budget: _ExpansionBudget) -> bytes:
-    """Return the bytes of a message, decompressed if the message itself is compressed."""
-    return (_decompress('zstd', data, 1 << 16, budget)
-            if data.startswith(_ZSTANDARD_MAGIC) else data)
 
 
 def _pack_record(code: _RecordCode, *content: bytes) -> bytes:
@@ -506,34 +478,36 @@ class McapWriter:
     def pack_summary(self) -> bytes:
         """Return the end of a file: the summary with the index of all chunks."""
         data_end = _pack_record(_RecordCode.DATA_END, struct.pack('<I', 0))
-        begin = self._offset + len(data_end)
         sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
         span = (min((span[0] for span in self._spans), default=0),
                 max((span[1] for span in self._spans), default=0))
         counts = b''.join(struct.pack('<HQ', *pair) for pair in self._counts.items())
-        groups = {_RecordCode.SCHEMA: [record for _, record in self._schemas.values()],
-                  _RecordCode.CHANNEL: [record for _, record in self._channels.values()],
-                  _RecordCode.STATISTICS: [_pack_record(
-                      _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
-                      struct.pack('<QQ', *span), _pack_sized(counts))],
-                  _RecordCode.CHUNK_INDEX: self._chunk_indexes,
-                  _RecordCode.METADATA_INDEX: [self._metadata_index]}
-        summary, offsets = b'', b''
-        for code, records in groups.items():
-            group = b''.join(records)
-            place = struct.pack('<BQQ', code, begin + len(summary), len(group))
-            offsets += _pack_record(_RecordCode.SUMMARY_OFFSET, place)
-            summary += group
-        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, begin, begin + len(summary))
-        checked = zlib.crc32(summary + offsets + footer)
-        return data_end + summary + offsets + footer + struct.pack('<I', checked) + _MAGIC
+        statistics = _pack_record(
+            _RecordCode.STATISTICS, struct.pack('<QHIIII', self._counts.total(), *sizes),
+            struct.pack('<QQ', *span), _pack_sized(counts))
+        summary = b''.join([*(record for _, record in self._schemas.values()),
+                            *(record for _, record in self._channels.values()),
+                            statistics, *self._chunk_indexes, self._metadata_index])
+        footer = struct.pack('<BQQQ', _RecordCode.FOOTER, 20, self._offset + len(data_end), 0)
+        checked = struct.pack('<I', zlib.crc32(summary + footer))
+        return data_end + summary + footer + checked + _MAGIC
 
 
 # SQLite
 
+_TABLES = ('topics', 'messages', 'message_definitions')
+#: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
+_MESSAGES_QUERY = """
+    SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
+           CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
+           CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
+    FROM messages"""
+#: Errors of SQLite in a damaged file: its own, with texts that may not be UTF-8, and lengths
+#: beyond the memory.
+_DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
-def _read_database(source: Path, path: Path, contents: Contents,
-                   on_progress: OnProgress) -> Iterator[Message]:
+
+def _read_database(source: Path, path: Path, contents: Contents) -> _Messages:
     with _open_database(source, path) as (database, tables):
         channels, budget = _read_topics(database, tables, path, contents), _ExpansionBudget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
@@ -542,14 +516,13 @@ def _read_database(source: Path, path: Path, contents: Contents,
         try:
             for row, topic, received, data in database.execute(_MESSAGES_QUERY):
                 count += 1
-                if count % 4096 == 0:
-                    on_progress(int(size * row / last))
-                if topic not in channels:
-                    continue
-                if not (isinstance(received, int) and isinstance(data, bytes)):
-                    contents.skipped_parts += 1
-                    continue
-                yield Message(*channels[topic], received, _decompress_message(data, budget))
+                message = None
+                if channel := channels.get(topic):
+                    if isinstance(received, int) and isinstance(data, bytes):
+                        message = Message(*channel, received, _decompress_message(data, budget))
+                    else:
+                        contents.skipped_parts += 1
+                yield message, int(size * row / last) if count % 4096 == 0 else 0
         except _DATABASE_ERRORS as error:
             contents.notes.append(f'{path.name} is damaged after {count} messages '
                                   f'({_describe_database_error(error)}), and was read up to there')
@@ -558,20 +531,19 @@ def _read_database(source: Path, path: Path, contents: Contents,
 @contextmanager
 def _open_database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
     """
-    Open a database read-only, and give it with the names of its tables.
+    Open a database read-only, and give it with the names of its tables of stored columns.
 
     Tried in turn: with the journal of a killed writer, without it, and as a copy with its page
-    count corrected. Only stored columns are read: the cost of computed ones is not limited by the
-    size of the file.
+    count corrected. Computed columns are not read: their cost is not limited by the size of the
+    file.
 
     """
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
-        ways = (('mode=ro', lambda: source), ('mode=ro&immutable=1', lambda: source),
-                ('mode=ro', lambda: _correct_page_count(source, Path(folder))))
-        for how, file in ways:
+        for mode in ('mode=ro', 'mode=ro&immutable=1', 'copy'):
             try:
-                database, tables = _connect(file(), how)
+                file = source if mode != 'copy' else _correct_page_count(source, Path(folder))
+                database, tables = _connect(file, mode.replace('copy', 'mode=ro'))
             except _DATABASE_ERRORS as error:
                 reason = error
                 continue
@@ -590,7 +562,6 @@ def _describe_database_error(error: Exception | None) -> str:
 
 
 def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
-    """Return a database and the names of its tables without computed columns."""
     database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{mode}', uri=True)
     try:
         database.text_factory = partial(str, encoding='utf-8', errors='replace')
@@ -601,25 +572,14 @@ def _connect(file: Path, mode: str) -> tuple[sqlite3.Connection, set[str]]:
         if sys.version_info >= (3, 11):
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _READ_BYTES)
         database.execute('PRAGMA trusted_schema = OFF')
-        tables = {name for name, in database.execute(
-            "SELECT name FROM sqlite_master WHERE type = 'table'")}
-        stored = {
-            name for name in sorted(tables & _KNOWN_TABLES)
-            if not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
-        database.set_authorizer(_authorize)
-        return database, stored
+        tables = {name for name, text in database.execute(
+            "SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+            if name in _TABLES and str(text).upper().startswith('CREATE TABLE')
+            and not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
+        return database, tables
     except BaseException:
         database.close()
         raise
-
-
-def _authorize(action: int, table: str | None, function: str | None, _: str | None,
-               view: str | None) -> int:
-    """Allow SQLite to read the tables with the functions used here, but no views."""
-    reads = action == sqlite3.SQLITE_READ and table in _KNOWN_TABLES
-    computes = action == sqlite3.SQLITE_FUNCTION and function in ('length', 'max', 'typeof')
-    allowed = view is None and (action == sqlite3.SQLITE_SELECT or reads or computes)
-    return sqlite3.SQLITE_OK if allowed else sqlite3.SQLITE_DENY
 
 
 def _correct_page_count(source: Path, folder: Path) -> Path:
@@ -636,20 +596,15 @@ def _correct_page_count(source: Path, folder: Path) -> Path:
 
 
 def _read_topics(database: sqlite3.Connection, tables: set[str], path: Path,
-                 contents: Contents) -> dict[int, tuple[str, str]]:
-    channels = {}
+                 contents: Contents) -> dict[int, tuple[str, str] | None]:
     try:
         definitions = dict(database.execute(
             'SELECT topic_type, encoded_message_definition FROM message_definitions')
             if 'message_definitions' in tables else ())
-        for number, topic, kind, encoding in database.execute(
-                'SELECT id, name, type, serialization_format FROM topics'):
-            topic, kind = excerpt(str(topic)), excerpt(str(kind))
-            contents.topics[topic] = kind
-            if (encoding == 'cdr'
-                    and contents.keep_definition(kind, str(definitions.get(kind, '')))):
-                channels[number] = topic, kind
+        return {number: contents.add_topic(str(topic), str(kind), encoding,
+                                           str(definitions.get(kind, '')))
+                for number, topic, kind, encoding in database.execute(
+                    'SELECT id, name, type, serialization_format FROM topics')}
     except _DATABASE_ERRORS as error:
         raise LogError(f'{path}: its list of topics cannot be read '
                        f'({_describe_database_error(error)}); record again') from error
-    return channels

@@ -27,6 +27,7 @@ from gyro_calibration.model.channels import clip
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
+from scipy.linalg import block_diag
 
 #: Rates beyond this, rad/s, are treated as overflow: the model's values are too large.
 _MAX_COMPUTABLE_RATE = 1e300
@@ -183,12 +184,10 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
             rows += [sizes[name] / steepness for name in model.active_tolerances]
     if calibration is not None:
         rows += [rate, 1.0]
-    if not isinstance(rate, np.ndarray):
-        return np.array(rows, dtype=float) * (-1.0 if calibration is None else -calibration.scale)
-    sensitivity = np.empty((len(rows), *rate.shape))
-    for index, row in enumerate(rows):
-        sensitivity[index] = row
-    return sensitivity * (-1.0 if calibration is None else -calibration.scale)
+    factor = -1.0 if calibration is None else -calibration.scale
+    shape = np.shape(rate)
+    return factor * np.array([np.broadcast_to(row, shape) for row in rows],
+                             dtype=float).reshape(len(rows), *shape)
 
 
 def uncertainty_covariance(model: GyroModel) -> np.ndarray:
@@ -199,18 +198,12 @@ def uncertainty_covariance(model: GyroModel) -> np.ndarray:
 
     """
     blocks = [] if model.covariance is None else [model.covariance]
-    if model.active_tolerances:
-        blocks.append(
-            np.diag([getattr(model.tolerance, name) ** 2 for name in model.active_tolerances]))
+    blocks += [np.diag([getattr(model.tolerance, name) ** 2])
+               for name in model.active_tolerances]
     if model.self_calibration is not None:
         known = model.self_calibration.covariance
         blocks.append(np.full((2, 2), np.nan) if known is None else np.array(known))
-    size = sum(map(len, blocks))
-    whole, start = np.zeros((size, size)), 0
-    for block in blocks:
-        whole[start:start + len(block), start:start + len(block)] = block
-        start += len(block)
-    return whole
+    return block_diag(*blocks) if blocks else np.zeros((0, 0))
 
 
 def quadratic_form(matrix: np.ndarray, vectors: np.ndarray) -> Number:

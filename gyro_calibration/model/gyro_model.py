@@ -19,7 +19,7 @@ from functools import cached_property
 import math
 from typing import Any
 
-from gyro_calibration.logs.log import Array, DEGREE, Mask, Number
+from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.channels import ChannelHistory, clip
 from gyro_calibration.model.effects import Channels, Effect, Parameter
 from gyro_calibration.model.noise import Noise
@@ -232,11 +232,9 @@ class GyroModel:
 
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
-        """Return the plausible temperatures, degC: at least -100 to 200, and 3 times the range."""
-        low, high = self.valid_temperatures
-        reach = high - low if math.isfinite(sum(map(abs, self.temperature_range))) else 0.0
-        return (min(low - reach, _PLAUSIBLE_TEMPERATURES[0]),
-                max(high + reach, _PLAUSIBLE_TEMPERATURES[1]))
+        """Return the plausible temperatures, degC: at least -100 to 200."""
+        (low, high), (coldest, hottest) = self.valid_temperatures, _PLAUSIBLE_TEMPERATURES
+        return min(low, coldest), max(high, hottest)
 
     @cached_property
     def valid_temperatures(self) -> tuple[float, float]:
@@ -303,30 +301,22 @@ class GyroModel:
 
     def _monotone_distance(self, centre: float, side: float) -> float:
         """Return how far from a rate to one side the output grows with the rate, rad/s."""
-        _, dependent = self._split_by_rate
-        low, high = self.extrapolation_range
-        distances = self.rate_limit / _MIN_OUTPUT_SLOPE * np.geomspace(1e-6, 1.0, 160)
+        dependent = self._split_by_rate[1]
+        distances = np.concatenate(
+            [[0.0], self.rate_limit / _MIN_OUTPUT_SLOPE * np.geomspace(1e-6, 1.0, 4000)])
 
-        def grows(begin: Array, end: Array) -> Mask:
-            ends = [[rate + _sum_errors(dependent, Channels(rate, rate, temperature))
-                     for rate in (centre + side * begin, centre + side * end)]
-                    for temperature in (low, high)]
-            return np.all([side * (after - before) >= _MIN_OUTPUT_SLOPE * (end - begin)
-                           for before, after in ends], axis=0)
+        def output(distance: Array, temperature: float) -> Array:
+            rate = centre + side * distance
+            return side * (rate + _sum_errors(dependent, Channels(rate, rate, temperature)))
 
         with np.errstate(all='ignore'):
-            steps = np.concatenate([[0.0], distances])
-            good = grows(steps[:-1], steps[1:]) & grows((1.0 - 1e-6) * distances, distances)
-            if good.all():
-                return float(distances[-1])
-            first = int(np.argmin(good))
-            # bisect between the last good step and the first bad one
-            near, far = (np.array([steps[first + place]]) for place in (0, 1))
-            for _ in range(50):
-                middle = 0.5 * (near + far)
-                near, far = ((middle, far) if grows((1.0 - 1e-6) * middle, middle).all()
-                             else (near, middle))
-        return float(near[0])
+            # between the distances, and closely before each: a step down may be narrow
+            good = np.all([
+                output(distances[1:], temperature) - output(begin, temperature)
+                >= _MIN_OUTPUT_SLOPE * (distances[1:] - begin)
+                for begin in (distances[:-1], (1.0 - 1e-6) * distances[1:])
+                for temperature in self.extrapolation_range], axis=0)
+        return float(distances[-1] if good.all() else distances[np.argmin(good)])
 
     def uses_channel(self, channel: str) -> bool:
         """Tell whether an effect uses the channel."""

@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 import csv
 from dataclasses import dataclass
 import io
@@ -155,9 +154,9 @@ def motion_by_name(motion: str | Path) -> Motion:
     return NAMED_MOTIONS.get(str(motion)) or read_motion(motion)
 
 
-_COLUMN_UNITS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE,
-                 'reference_heading_rad': 1.0, 'rate_dps': DEGREE, 'rate_rad_s': 1.0,
-                 'reference_rate_dps': DEGREE, 'reference_rate_rad_s': 1.0}
+_COLUMN_UNITS = {
+    f'{prefix}{name}': factor for prefix in ('', 'reference_') for name, factor in (
+        ('heading_deg', DEGREE), ('heading_rad', 1.0), ('rate_dps', DEGREE), ('rate_rad_s', 1.0))}
 
 
 def read_motion(path: str | Path) -> Motion:
@@ -178,9 +177,9 @@ def read_motion(path: str | Path) -> Motion:
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
         name = _find_motion_column(path, header)
-        columns = {each: header.index(each) for each in ('time_s', name)}
-        time, values = (
-            np.fromiter(_read_numbers(path, rows, columns), dtype=float).reshape(-1, 2).T)
+        places = header.index('time_s'), header.index(name)
+        time, values = np.fromiter((_parse_number(path, row, place, header)
+                                    for row in rows for place in places), float).reshape(-1, 2).T
     except MotionError:
         raise
     except (OSError, ValueError, csv.Error) as error:
@@ -190,36 +189,30 @@ def read_motion(path: str | Path) -> Motion:
     time, values = time[known], values[known] * _COLUMN_UNITS[name]
     if len(time) < 2 or not (np.diff(time) >= MIN_SAMPLE_INTERVAL).all():
         raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
-    return (motion_from_rates(time, values) if 'rate' in name
-            else motion_from_headings(time, values))
+    return (motion_from_rates if 'rate' in name else motion_from_headings)(time, values)
 
 
 def _find_motion_column(path: str | Path, header: list[str]) -> str:
     """Return the name of the column that holds the motion."""
     found = [name for name in _COLUMN_UNITS if name in header]
-    both = (len(found) == 2 and found[0].startswith('reference_heading')
-            and found[1].startswith('reference_rate'))
-    if 'time_s' not in header or not (len(found) == 1 or both):
+    both = [each[:14] for each in found] == ['reference_head', 'reference_rate']
+    if 'time_s' not in header or len(found) != 1 + both:
         given = excerpt(','.join(header)) or 'nothing'
         raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
                           'heading_deg, heading_rad, rate_dps, rate_rad_s')
     return found[0]
 
 
-def _read_numbers(path: str | Path, rows: Iterable[list[str]],
-                  columns: dict[str, int]) -> Iterator[float]:
-    """Give time and value of one row after the other, nan where a reference was lost."""
-    for row in rows:
-        for name, place in columns.items():
-            try:
-                value = float(row[place])
-            except (IndexError, ValueError):
-                value = math.inf
-            if not (abs(value) <= MAX_MAGNITUDE
-                    or math.isnan(value) and name.startswith('reference_')):
-                raise MotionError(f'{path}: column {name} holds something that is not a finite '
-                                  'number; correct or remove the row')
-            yield value
+def _parse_number(path: str | Path, row: list[str], place: int, header: list[str]) -> float:
+    """Return a number; nan is one where a reference may be lost."""
+    try:
+        value = float(row[place])
+    except (IndexError, ValueError):
+        value = math.inf
+    if abs(value) <= MAX_MAGNITUDE or value != value and header[place].startswith('reference_'):
+        return value
+    raise MotionError(f'{path}: column {header[place]} holds something that is not a finite '
+                      'number; correct or remove the row')
 
 
 def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,

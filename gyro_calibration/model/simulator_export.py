@@ -134,20 +134,20 @@ def _format_sdf(parameters: SimulatorParameters) -> tuple[str, set[str]]:
     Gauss-Markov process.
 
     """
-    quantized = parameters.quantization >= 1e-6  # rad/s; Gazebo makes no smaller steps
     values = {'mean': parameters.bias, 'stddev': parameters.white_noise, 'bias_mean': 0.0,
               'bias_stddev': parameters.bias_deviation}
+    names = {'bias', 'bias_instability', 'rate_random_walk', 'angle_random_walk'}
     if parameters.wander.density:
         values |= {'dynamic_bias_stddev': parameters.wander.density,
                    'dynamic_bias_correlation_time': parameters.wander.correlation_time}
-    if quantized:
-        values['precision'] = parameters.quantization
-    kind = 'gaussian_quantized' if quantized else 'gaussian'
+    kind = 'gaussian'
+    if parameters.quantization >= 1e-6:  # rad/s; Gazebo makes no smaller steps
+        kind, values['precision'] = 'gaussian_quantized', parameters.quantization
+        names.add('quantization')
     lines = [f'        <{name}>{value:.9g}</{name}>' for name, value in values.items()]
-    text = '\n'.join(['<imu>', '  <angular_velocity>', '    <z>', f'      <noise type="{kind}">',
-                      *lines, '      </noise>', '    </z>', '  </angular_velocity>', '</imu>'])
-    return text, {'bias', 'bias_instability', 'rate_random_walk', 'angle_random_walk',
-                  *(['quantization'] if quantized else [])}
+    return '\n'.join(['<imu>', '  <angular_velocity>', '    <z>', f'      <noise type="{kind}">',
+                      *lines, '      </noise>', '    </z>', '  </angular_velocity>',
+                      '</imu>']), names
 
 
 def _format_isaac(parameters: SimulatorParameters) -> tuple[str, set[str]]:

@@ -173,7 +173,7 @@ def test_samples_are_numbered():
         find_protocol('csv'),
         writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
     with Emulator(protocol, samples(100, 1e4)) as gyro:
-        gyro.join()
+        gyro._thread.join()
     assert sent == list(range(100))
 
 

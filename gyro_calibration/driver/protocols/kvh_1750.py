@@ -86,18 +86,11 @@ def _write(reading: WrittenReading, settings: Settings) -> bytes:
 
 
 KVH_1750 = Protocol(
-    name='kvh_1750',
-    description='KVH 1725, 1750, 1760, 1775 fibre-optic gyros, binary',
-    baud=921600,
-    rate=1000.0,
-    sensitivity=1.0,
+    name='kvh_1750', description='KVH 1725, 1750, 1760, 1775 fibre-optic gyros, binary',
+    baud=921600, rate=1000.0, sensitivity=1.0,
     splitter=partial(FrameSplitter, rb'\xfe\x81\xff\x55.{32}', 36,
                      lambda frame: _checksum(frame[:32]) == frame[32:]),
-    parser=stateless(_parse),
-    writer=stateless(_write),
+    parser=stateless(_parse), writer=stateless(_write),
     full_scale=math.radians(500.0),  # the input range is 490 deg/s
     noise_density=math.radians(1.0 / 3600.0),  # 1 deg/h/√Hz for the 1725, others less
-    increments=True,
-    modulus=_MODULUS,
-    check_settings=lambda settings: None,
-)
+    increments=True, modulus=_MODULUS, check_settings=lambda settings: None)

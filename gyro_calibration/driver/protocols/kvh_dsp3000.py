@@ -45,16 +45,9 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
 
 
 KVH_DSP3000 = Protocol(
-    name='kvh_dsp3000',
-    description='KVH DSP-3000 fibre-optic gyro, text with deg/s',
-    baud=38400,
-    rate=100.0,
-    sensitivity=math.radians(1.0),
-    splitter=partial(LineSplitter, 64, (b' ',)),
-    parser=stateless(_parse),
+    name='kvh_dsp3000', description='KVH DSP-3000 fibre-optic gyro, text with deg/s',
+    baud=38400, rate=100.0, sensitivity=math.radians(1.0),
+    splitter=partial(LineSplitter, 64, (b' ',)), parser=stateless(_parse),
     writer=lambda settings: lambda reading: b'%15.6f   %d\r\n' % (reading.value, reading.valid),
-    invert=True,
-    full_scale=math.radians(500.0),
-    noise_density=math.radians(4.0 / 3600.0),  # data sheet: 4 deg/h/√Hz, 0.067 deg/√h
-    startup=b'RRR',
-)
+    invert=True, full_scale=math.radians(500.0), startup=b'RRR',
+    noise_density=math.radians(4.0 / 3600.0))  # data sheet: 4 deg/h/√Hz, 0.067 deg/√h

@@ -48,14 +48,8 @@ def _write(reading: WrittenReading, settings: Settings) -> bytes:
 
 
 MINIMU9 = Protocol(
-    name='minimu9',
-    description='Pololu MinIMU-9 with AHRS firmware, text with raw counts',
-    baud=115200,
-    rate=50.0,
-    sensitivity=_RATE_PER_COUNT,
-    splitter=partial(LineSplitter, 256, (b'!',)),
-    parser=stateless(_parse),
-    writer=stateless(_write),
-    largest_count=0x8000,
-    noise_density=math.radians(0.03),  # data sheet of the L3G4200D
-)
+    name='minimu9', description='Pololu MinIMU-9 with AHRS firmware, text with raw counts',
+    baud=115200, rate=50.0, sensitivity=_RATE_PER_COUNT,
+    splitter=partial(LineSplitter, 256, (b'!',)), parser=stateless(_parse),
+    writer=stateless(_write), largest_count=0x8000,
+    noise_density=math.radians(0.03))  # data sheet of the L3G4200D

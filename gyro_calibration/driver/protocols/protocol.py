@@ -26,27 +26,19 @@ import math
 import re
 from typing import NamedTuple, TypeVar
 
-STANDARD_GRAVITY = 9.80665
-"""m/s²; what devices call one g."""
-
-ROOM_TEMPERATURE = 25.0
-"""degC; default of an emulated device."""
-
+STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
+ROOM_TEMPERATURE = 25.0  # degC; default of an emulated device
+#: Columns of the log format that hold the output, with their unit in rad/s, or in counts.
 GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts': 1.0}
-"""Columns of the log format that hold the output, with their unit in rad/s, or in counts."""
-
+#: Further columns of the log format.
 OPTIONAL_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
-"""Further columns of the log format."""
-
+#: Standard deviation of a sample of a gyro whose data sheet is not known, rad/s.
 ASSUMED_NOISE = math.radians(0.5)
-"""rad/s, standard deviation of one sample of a gyro whose data sheet is not known."""
-
+#: Standard deviation of a specific force, m/s²: 0.01 g, beyond the noise of any such unit.
 ASSUMED_FORCE_NOISE = 0.1
-"""m/s², standard deviation of a specific force: 0.01 g, beyond the noise of any such unit."""
 
 _PLAUSIBLE_TEMPERATURES = -100.0, 300.0  # degC; range of temperature sensors in gyros
 _MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros are 2 to 3 % off
-_LENGTH_SMOOTHING = 0.05  # weight of a frame in the average length
 
 
 @dataclass(frozen=True)
@@ -116,13 +108,12 @@ class Settings:
                                  'rotation set invert')
         if self.axis not in ('x', 'y', 'z'):
             raise ValueError(f'axis is {self.axis!r}, but must be x, y or z')
-        columns = tuple(self.columns)
-        object.__setattr__(self, 'columns', columns)
-        named = f'columns are {", ".join(columns)}, but'
-        if sum(columns.count(name) for name in GYRO_COLUMNS) != 1:
+        object.__setattr__(self, 'columns', tuple(self.columns))
+        named = f'columns are {", ".join(self.columns)}, but'
+        if sum(self.columns.count(name) for name in GYRO_COLUMNS) != 1:
             raise ValueError(f'{named} exactly one must be {", ".join(GYRO_COLUMNS)}')
         for name in OPTIONAL_COLUMNS:
-            if columns.count(name) > 1:
+            if self.columns.count(name) > 1:
                 raise ValueError(f'{named} {name} may occur only once')
 
 
@@ -159,11 +150,10 @@ def to_signed_count(value: float, bits: int = 16) -> int:
     return min(max(round(value), -1 << bits - 1), (1 << bits - 1) - 1)
 
 
+#: Parses a frame to a reading, or None if it is not valid; may use earlier frames.
 ParseFrame = Callable[[bytes], 'Reading | None']
-"""Parses a frame to a reading, or None if it is not valid; may use earlier frames."""
-
+#: Makes the bytes of a reading; may use earlier readings.
 WriteFrame = Callable[[WrittenReading], bytes]
-"""Makes the bytes of a reading; may use earlier readings."""
 
 InputT = TypeVar('InputT')
 OutputT = TypeVar('OutputT')
@@ -365,7 +355,7 @@ class Decoder:
         self._factor = protocol.unit_scale(settings)
         self._limit = protocol.effective_full_scale(settings)
         self._refused_bytes, self._has_sample = 0, False
-        self._skipped_bytes, self._refused_frames, self._mean_frame_length = 0, 0, 0.0
+        self._skipped_bytes, self._refused_frames = 0, 0
         self.device_faults = self.refused_samples = self.refused_temperatures = 0
 
     @property
@@ -396,29 +386,24 @@ class Decoder:
         if reading.value is None:
             return None
         output = reading.value * self._factor
-        if not (reading.valid and math.isfinite(output) and abs(output) <= self._limit):
+        if not (reading.valid and abs(output) <= self._limit):
             self.device_faults += not reading.valid
             self.refused_samples += reading.valid
             self._refused_frames += 1
             return None
-        # number of frames that were discarded or skipped before this one; 0 for the first
-        length = len(frame.data)
-        self._mean_frame_length += (_LENGTH_SMOOTHING if self._mean_frame_length else 1.0) * (
-            length - self._mean_frame_length)
-        missing = (self._refused_frames + round(self._skipped_bytes / self._mean_frame_length)
+        missing = (self._refused_frames + round(self._skipped_bytes / len(frame.data))
                    if self._has_sample else 0)
         self._skipped_bytes, self._refused_frames, self._has_sample = 0, 0, True
-        temperature = reading.temperature
-        if (temperature is not None
-                and not _PLAUSIBLE_TEMPERATURES[0] <= temperature <= _PLAUSIBLE_TEMPERATURES[1]):
+        temperature, (coldest, hottest) = reading.temperature, _PLAUSIBLE_TEMPERATURES
+        if temperature is not None and not coldest <= temperature <= hottest:
             self.refused_temperatures += 1
             temperature = None
         return Sample(output, temperature, reading.time, reading.sequence, missing,
                       reading.specific_force, reading.health)
 
 
+#: A finite number in text: `float` also takes nan, inf and 1_0.
 NUMBER = rb'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?'
-"""A finite number in text: `float` also takes nan, inf and 1_0."""
 
 _LINE_END = re.compile(rb'[\r\n]')
 

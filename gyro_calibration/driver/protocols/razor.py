@@ -68,15 +68,8 @@ def _write(reading: WrittenReading, settings: Settings) -> bytes:
 
 
 RAZOR = Protocol(
-    name='razor',
-    description='Razor AHRS firmware, text with rad/s',
-    baud=57600,
-    rate=50.0,
-    sensitivity=1.0,
-    splitter=partial(LineSplitter, 256, (b'#',)),
-    parser=stateless(_parse),
-    writer=stateless(_write),
+    name='razor', description='Razor AHRS firmware, text with rad/s',
+    baud=57600, rate=50.0, sensitivity=1.0, splitter=partial(LineSplitter, 256, (b'#',)),
+    parser=stateless(_parse), writer=stateless(_write), startup=b'#ox#o1',
     # just above the 16 bits of an ITG-3200, 0.06957 deg/s each, the widest range of these gyros
-    full_scale=40.0,
-    startup=b'#ox#o1',
-)
+    full_scale=40.0)

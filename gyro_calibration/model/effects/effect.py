@@ -16,9 +16,7 @@ each only adds columns. Effects on the signal (a delay, a lag, rounding) are no 
 instant and add no column; they are simulated at their stage, and `not_compensated` states what
 compensation leaves of them.
 
-A parameter with a default is a convention (a reference temperature, a centre, a scale) and is not
-fitted. One without a default is a property of the gyro, is fitted, and is part of the covariance.
-`nested` computes the sum of the columns faster than the columns; a test compares both.
+`sum_columns` computes the sum of the columns faster than the columns; a test compares both.
 
 """
 
@@ -154,9 +152,9 @@ class Effect:
         """Return a function of channels: what the effect adds to the output, rad/s."""
         shapes = values[:len(self.nonlinear_parameters)]
         coefficients = values[len(self.nonlinear_parameters):]
-        nested, columns = self.sum_columns, self.columns
-        if nested is not None:
-            return lambda channels: nested(channels, shapes, coefficients)
+        sum_columns, columns = self.sum_columns, self.columns
+        if sum_columns is not None:
+            return lambda channels: sum_columns(channels, shapes, coefficients)
         if len(coefficients) == 1:
             value, = coefficients
             return lambda channels: value * columns(channels, *shapes)[0]

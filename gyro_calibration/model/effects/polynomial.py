@@ -31,11 +31,8 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     """
     Return the error polynomial of Ojeda, Chung and Borenstein (2000), eq. 9 to 13.
 
-    The paper's error is a function of the output, so that one subtraction compensates (eq. 13).
-    The powers are those of the centred and scaled output and temperature: raw powers have a
-    condition number of 1e11. The coefficient ``t{j}w{i}`` belongs to power j of temperature and i
-    of output. The index of eq. 10 as printed collides; here every product of powers has its own
-    column.
+    The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of output. The index of
+    eq. 10 as printed collides; here every product of powers has its own column.
 
     Parameters
     ----------
