@@ -21,7 +21,7 @@ its variance by ``(3 sin / (2 + cos))²``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 import math
 
@@ -39,13 +39,6 @@ from scipy.fft import dct, idct, next_fast_len
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 
-#: Largest number of parts of the frequency range in which filtered noise has separate levels;
-#: least number of coefficients in each; and lowest level, which limits the weight of a part that
-#: is nearly free of noise.
-_MAX_LEVEL_PARTS, _MIN_PART_COEFFICIENTS, _MIN_NOISE_LEVEL = 32, 100, 0.003
-#: Standard deviations by which the level of filtered noise falls; the standard deviation of the
-#: logarithm of a median of n is 2.33 over root n.
-_FALL_SIGMAS, _LOG_MEDIAN_SCATTER = 4.5, 2.33
 #: Numbers of random walks, of strengths and times of Gauss-Markov processes, and of corner
 #: frequencies of flicker in `noise_grid`.
 _WALK_COUNT, _STRENGTH_COUNT, _CORRELATION_TIME_COUNT, _FLICKER_CORNER_COUNT = 14, 7, 7, 14
@@ -118,35 +111,6 @@ def coefficient_angles(count: int) -> Array:
     return np.arange(1, count) * math.pi / count
 
 
-def relative_part_powers(whitened: Array) -> Array:
-    """
-    Return the power in equal parts of the angle relative to the second part: shape (parts,).
-
-    The first part is set to 1, because slow noise is described by `NoiseShape`. With too few
-    coefficients there is one part.
-
-    """
-    parts = np.array_split(whitened ** 2,
-                           max(min(_MAX_LEVEL_PARTS, len(whitened) // _MIN_PART_COEFFICIENTS), 1))
-    found = np.array([part.mean() for part in parts])
-    return (np.maximum(np.concatenate([found[1:2], found[1:]]) / found[1], _MIN_NOISE_LEVEL)
-            if len(found) > 1 else np.ones(1))
-
-
-def high_frequency_power_ratio(whitened: Array) -> float:
-    """Return the power in the last quarter of the angle over the second; 1 if insignificant."""
-    _, second, _, last = (float(np.median(part ** 2)) for part in np.array_split(whitened, 4))
-    by_chance = math.exp(-_FALL_SIGMAS * _LOG_MEDIAN_SCATTER * math.sqrt(8.0 / len(whitened)))
-    return last / second if last < by_chance * second else 1.0
-
-
-def interpolate_noise_level(angle: Array, part_levels: Array) -> Array:
-    """Return the level at each angle, by lines in the logarithm between middles of parts."""
-    return np.exp(
-        np.interp(angle, (np.arange(len(part_levels)) + 0.5) * math.pi / len(part_levels),
-                  np.log(part_levels)))
-
-
 def band_starts(angle: Array, interval: float, single_bands: int = 24,
                 ratio: float = 1.12) -> Array:
     """Return the first index of each band of coefficients: the lowest alone, then by ratio."""
@@ -182,9 +146,6 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
-#: Ratio of the power in the last to that in the second quarter of the frequencies, below which a
-#: record was smoothed (jumps have 0.18, noise not less). Longest averaging interval for it, s.
-SMOOTHED_POWER_RATIO, _MAX_AVERAGING_TIME = 0.05, 0.03
 #: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
 _SMOOTHING_BINS, _ROUNDING_POWER_FACTOR = 101, 1.5
 #: Update intervals of a held reference, and steps of its change, from which on a constant value is
@@ -222,8 +183,6 @@ class Replay:
     simulated_error : error of the simulated output, rad/s, shape (n,), which is subtracted from
         `channels.output`
     rounding_variance : variance of a sample by quantization of the output, (rad/s)²
-    noise_levels : of filtered white noise: see `noise_levels`
-
     """
 
     channels: Channels
@@ -237,7 +196,6 @@ class Replay:
     available_channels: frozenset[str]
     simulated_error: Array
     rounding_variance: float = 0.0
-    noise_levels: Array = field(default_factory=lambda: np.ones(1))
 
     @property
     def point_interval(self) -> float:
@@ -308,18 +266,6 @@ class Replay:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
         return cosine_transform(self.resample(values))
 
-    def noise_level(self) -> Array:
-        """Return the level of the white noise at each coefficient, shape (points - 1,)."""
-        return interpolate_noise_level(coefficient_angles(self.point_count), self.noise_levels)
-
-    def with_scaled_noise_levels(self, factors: Array) -> Replay:
-        """Return the log with its levels multiplied by factors, as its noise for gaps."""
-        fill_transform = cosine_transform(self.fill_noise) * np.sqrt(interpolate_noise_level(
-            coefficient_angles(len(self.fill_noise)) * self.decimation, factors))
-        filling = inverse_cosine_transform(fill_transform)
-        return replace(self, noise_levels=self.noise_levels * factors,
-                       fill_noise=filling / white_noise_deviation(filling))
-
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
         return replace(self, channels=replace(self.channels, rate=rate))
@@ -376,7 +322,6 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     coarse = max(output_step ** 2 / 12.0 - float(np.var(expected_rounding[kept])), 0.0)
     plain = Replay(replace(channels, output=log.output - expected_rounding), reference, kept,
                    place, interval, every, filling, rounded, has, np.zeros(len(time)), coarse)
-    plain = replace(plain, decimation=every * _smoothing_decimation(plain))
     if model is None:
         return plain
     # the error by the model is subtracted from the output, and effects use its distorted rate
@@ -408,26 +353,6 @@ def _even_time(time: Array) -> Array:
     if not stamps.has_bursts:
         return time - time[0]
     return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
-
-
-def _smoothing_decimation(base_replay: Replay) -> int:
-    """
-    Return the factor of the number of points to average, so that smoothing does not show.
-
-    A gyro with averaged samples, or a smoothed reference, has hardly any noise at the highest
-    frequencies. The noises of the grid do not describe that, so that small errors of motion and
-    reference would have too much weight there.
-
-    """
-    residual, factor, decimation = base_replay.channels.output - base_replay.reference, 1, 1
-    while 2 * factor * base_replay.point_interval <= _MAX_AVERAGING_TIME:
-        averaged = replace(base_replay, decimation=base_replay.decimation * factor)
-        power = averaged.transform_samples(residual) ** 2
-        _, second, _, last = (float(np.median(part)) for part in np.array_split(power, 4))
-        factor *= 2
-        if last < SMOOTHED_POWER_RATIO * second:
-            decimation = factor
-    return decimation
 
 
 def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> Array:
