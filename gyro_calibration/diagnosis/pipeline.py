@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 
+from gyro_calibration.calibration.dwells.samples import require_output
 from gyro_calibration.diagnosis.candidates import (
     common_channels,
     constant_channels,
@@ -85,6 +86,7 @@ from gyro_calibration.diagnosis.residuals import (
     residual_curves,
 )
 from gyro_calibration.diagnosis.search import (
+    Causes,
     choose_simplest,
     complexity_penalty,
     confirm,
@@ -115,11 +117,10 @@ _DETECTION_POWER = 0.95
 #: Names of the shape parameters of causes that are not effects of the catalogue.
 _SHAPE_NAMES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MAX_SLIPS)))}
 _SINGLE_EVENT_REMEDY = 'find its cause; it occurs in this log alone, and is not added to the model'
-#: Why a constant channel shows no cause, and the variable that is derived from the channel.
+#: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
                      'specific_force': 'the specific force does not change'}
-_DERIVED_VARIABLES = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
 #: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
 _STEP_SHARES = {
@@ -132,7 +133,6 @@ _STEP_SHARES = {
     'cross-validation': 3,
     'findings': 4}
 
-Causes = tuple[SelectedCause, ...]
 #: A cause and its alternatives, each with its deficit in log-likelihood.
 Alternatives = Sequence[tuple[SelectedCause, float]]
 
@@ -208,8 +208,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     steps.begin('data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
     steps.begin('replay of the model')
-    replays = [replay(_in_true_unit(log, clean.unit_factor), clean.usable, generator,
-                      clean.update_interval, clean.heading_step, clean.output_step, model)
+    replays = [replay(replace(log, output=clean.unit_factor * require_output(log)), clean.usable,
+                      generator, clean.update_interval, clean.heading_step, clean.output_step,
+                      model)
                for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
     search = start_search(replays, generator, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
@@ -247,9 +248,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     steps.begin('findings')
     more = find_suspected(search, (*named, *unnamed))
     taken = {each.candidate.cause for each in named}
-    doubtful = [each for each in unconfirmed
-                if is_lasting(each.candidate) and each.candidate.cause not in taken]
-    doubtful = doubtful or ([more.causes[-1]] if more else [])
+    doubtful = tuple(each for each in unconfirmed if is_lasting(each.candidate)
+                     and each.candidate.cause not in taken) or (more.causes[-1:] if more else ())
     findings = [*_cause_findings(search, found, sets, unnamed, doubtful),
                 *_record_findings(quality, changed)]
     if model is not None:
@@ -279,28 +279,21 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      rate, heading_shares=of_heading)
 
 
-def _in_true_unit(log: Log, factor: float) -> Log:
-    """Return a log with its output multiplied by a factor."""
-    return log if factor == 1.0 or log.output is None else replace(log, output=log.output * factor)
-
-
 def _cause_findings(search: Search, fit: RegressionFit, alternatives_of: Sequence[Alternatives],
-                    unnamed: Sequence[SelectedCause],
-                    suspected_causes: Sequence[SelectedCause]) -> Iterator[Finding]:
+                    unnamed: Causes, suspected: Causes) -> Iterator[Finding]:
     """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
     for place, (known, members) in enumerate(zip(fit.causes, alternatives_of)):
         others = [(each.candidate.cause, lack)
                   for each, lack in members if each.candidate.cause != known.candidate.cause]
         yield cause_finding(
-            search, fit, place, _cause_p_value(search, (*fit.causes, *unnamed), place), members,
-            next_experiment(known.candidate.cause, others, observed_range(fit.problem.replays)))
-    for known in suspected_causes:
+            search, fit, place, evidence_for(search, (*fit.causes, *unnamed), place), members,
+            next_experiment(known.candidate.cause, others, observed_range(search.problem.replays)))
+    for known in suspected:
         everything = refine_jointly(search, (*fit.causes, *unnamed, known))
-        with_it = fit_causes(search.problem, everything)
         place = len(everything) - 1
-        yield mark_suspected(
-            cause_finding(search, with_it, place, _cause_p_value(search, everything, place),
-                          [(everything[-1], 0.0)], ''))
+        yield mark_suspected(cause_finding(
+            search, fit_causes(search.problem, everything), place,
+            evidence_for(search, everything, place), [(everything[-1], 0.0)], ''))
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
@@ -311,12 +304,6 @@ def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding])
             best[each.effect] = each
     covered = {name for each in best.values() for name in each.ambiguous_with}
     return [*best.values(), *(each for each in changed if each.effect not in covered)]
-
-
-def _cause_p_value(search: Search, causes: Sequence[SelectedCause], cause_index: int) -> float:
-    """Return the p-value of a named cause, given the others."""
-    return search.null_distribution.p_value(causes[cause_index].candidate.cause,
-                                            evidence_for(search, causes, cause_index))
 
 
 def _mean_bias_deviation(fit: RegressionFit, noise: Noise) -> float:
@@ -381,27 +368,22 @@ def _noise_findings(noise_parameters: NoiseParameters, model: GyroModel, false_a
 
 def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     """Return the reason for each cause that these logs cannot show."""
-    replays = search.problem.replays
+    replays, of_motion = search.problem.replays, {'reference', *REFERENCES}
     has = common_channels(replays) | {'time', 'output'}
-    of_motion = frozenset({'reference', *REFERENCES})
-    has |= (of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES)
-            else frozenset())
+    if any(getattr(log, name) is not None for log in logs for name in REFERENCES):
+        has |= of_motion
     moves = any(np.any(each.reference[each.valid] != 0.0) for each in replays)
     reasons = {}
     for name, cause in CAUSES.items():
-        missing = sorted(cause.required_channels - has)
-        if missing:
+        if missing := sorted(cause.required_channels - has):
             reasons[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
         elif not moves and cause.required_channels & of_motion:
             reasons[name] = 'the reference shows no motion'
-    quiet = {name: _CONSTANT_REASONS[name] for name in constant_channels(replays)}
-    quiet |= {other: quiet[name] for name, other in _DERIVED_VARIABLES.items() if name in quiet}
-    for name, reason in quiet.items():
-        reasons.update({cause.name: reason for cause in CAUSES.values()
-                        if cause.along == name and cause.name not in reasons})
-    alike = 'in these logs it cannot be distinguished from a bias or a scale factor error'
-    hidden = sorted(search.unidentifiable & (CAUSES.keys() - reasons.keys()))
-    reasons.update(dict.fromkeys(hidden, alike))
+        elif constant := sorted(cause.required_channels & constant_channels(replays)):
+            reasons[name] = _CONSTANT_REASONS[constant[0]]
+        elif name in search.unidentifiable:
+            reasons[name] = ('in these logs it cannot be distinguished from a bias or a scale '
+                             'factor error')
     return reasons
 
 
@@ -442,9 +424,9 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
 
 # findings
 
-def cause_finding(search: Search, fit: RegressionFit, cause_index: int, p_value: float,
+def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
                   alternatives: Alternatives, separate_by: str) -> Finding:
-    """Return the finding of a named cause with its alternatives."""
+    """Return the finding of a named cause with its evidence and alternatives."""
     known = fit.causes[cause_index]
     candidate, name = known.candidate, known.candidate.cause
     parameters = _cause_parameters(fit, cause_index)
@@ -471,7 +453,8 @@ def cause_finding(search: Search, fit: RegressionFit, cause_index: int, p_value:
     elif name == 'reference_slip':
         where = min(candidate.shapes[1:]), max(candidate.shapes[1:])
     return make_finding(
-        name, parameters, p_value, tuple(dict.fromkeys(confounders)),
+        name, parameters, search.null_distribution.p_value(name, evidence),
+        tuple(dict.fromkeys(confounders)),
         minimum_detectable=detectable_sigmas * deviation if deviation > 0.0 else None,
         separate_by=separate_by or (CAUSES[name].separate_by if confounders else ''),
         evidence=(f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0

@@ -56,7 +56,7 @@ Indices = NDArray[np.intp]
 MIN_INDEPENDENT_SHARE = 1e-7
 #: Longest averaging interval of filtered noise, s, and largest ratio of its power in the last to
 #: that in the second quarter of the frequencies.
-_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO = 0.1, 0.5
+_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO = 0.25, 0.7
 #: Drop of the log-likelihood at the ends of a 95 % interval.
 _LIKELIHOOD_DROP_95 = 1.92
 

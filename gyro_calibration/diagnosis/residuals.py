@@ -25,6 +25,7 @@ from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.regression import RegressionFit
 from gyro_calibration.diagnosis.replay import (
+    coefficient_angles,
     cosine_transform,
     Replay,
     spline_derivative_gain,
@@ -170,13 +171,18 @@ def _band_energies(fit: RegressionFit) -> BandEnergies:
     coarse = np.concatenate(
         [np.full(each.point_count - 1, each.rounding_variance / each.decimation)
          for each in problem.replays])
+    # The noise parameters before a filter are those of low frequencies.
+    used = np.concatenate(
+        [coefficient_angles(each.point_count) < (np.pi if each.decimation == 1 else 0.25 * np.pi)
+         for each in problem.replays])
     parts = [1.0 / step, 1.0 / angle, step / (2.0 - 2.0 * np.cos(angle))]
     if problem.noise_shapes[0].rounding_ratio:
         parts.append(spline_derivative_gain(angle) / step)
-    energy, count, *totals = (np.add.reduceat(part, problem.band_starts)
+    energy, count, *totals = (np.add.reduceat(part * used, problem.band_starts)
                               for part in (left ** 2, np.ones(len(left)), coarse, *parts))
-    known, *means = (total / count for total in totals)
-    return BandEnergies(energy, count, np.column_stack(means), known)
+    kept = count > 0.0
+    known, *means = (total[kept] / count[kept] for total in totals)
+    return BandEnergies(energy[kept], count[kept], np.column_stack(means), known)
 
 
 def drop_tone_bands(bands: BandEnergies) -> BandEnergies:

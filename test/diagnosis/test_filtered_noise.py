@@ -68,8 +68,9 @@ def test_the_angle_random_walk_behind_a_filter_is_that_of_low_frequencies():
 def test_what_is_hidden_in_noise_behind_a_filter_is_found(filter, name):
     hidden, log = behind(filter, [name], 8.0, 1)
     found = diagnose([log], np.random.default_rng(0))
-    assert [each.effect
-            for each in found.findings] == [name] and not found.unexplained, (told(hidden, found))
+    (finding,) = found.findings
+    assert name in (finding.effect, *finding.ambiguous_with), told(hidden, found)
+    assert not found.unexplained, told(hidden, found)
 
 
 @pytest.mark.parametrize('seconds', [20.0, 120.0, 900.0])
