@@ -37,7 +37,6 @@ from gyro_calibration.diagnosis.expected_output import (
     fit_line,
     identify_unit_factor,
     is_implausible_factor,
-    LineFit,
     model_scale_factor,
     OutputComparison,
     reference_rate,
@@ -213,45 +212,32 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
 
     """
     chances = {}
+    deviation, noise = sample_deviation(comparison), comparison.noise_deviation
+    fine = codes.step < _FINE_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
         values, counts = ((codes.values, codes.counts) if sign > 0.0
                           else (-codes.values[::-1], codes.counts[::-1]))
-        chance = _extreme_code_chance(values, counts,
-                                      float(local_code_steps(codes, sign * values[-1:])[0]),
-                                      comparison.noise_deviation)
-        if (chance < level and values[-1] > _rest_rate_limit(comparison.output)
-                and _is_clipped(comparison, sign, values[-1], codes.step)):
-            chances[sign] = (sign * values[-1], chance)
+        extreme, step = values[-1], float(local_code_steps(codes, sign * values[-1:])[0])
+        # the chance of as many samples at the last code, if the density falls towards it
+        reach = max(4.0 * step, 0.05 * noise)
+        near = int(counts[:-1][values[:-1] > extreme - reach - 0.5 * step].sum())
+        chance = float(stats.binom.sf(counts[-1] - 2, counts[-1] - 1 + near,
+                                      1.0 / (min(reach / step, 1e6) + 1.0)))
+        if chance >= level or extreme <= _rest_rate_limit(comparison.output):
+            continue
+        at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
+        expected = (np.array([]) if comparison.expected is None
+                    else sign * comparison.expected[at_extreme])
+        beyond = (float(np.nanmedian(expected)) - extreme if np.isfinite(expected).any()
+                  else -math.inf)
+        # The expected output errs by bias wander and nonlinearity, which these samples share.
+        if (beyond > (-3.0 * deviation if fine else 0.5 * codes.step + 2.0 * deviation)
+                or fine and len(find_runs(at_extreme)) >= _MIN_LIMIT_RUNS):
+            chances[sign] = (sign * extreme, chance)
     if not chances:
         return None
     return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
                  min(chance for _, chance in chances.values()))
-
-
-def _extreme_code_chance(values: Array, counts: Array, step: float,
-                         noise_deviation: float) -> float:
-    """Return the chance of as many samples at the last code, if the density falls towards it."""
-    reach = max(4.0 * step, 0.05 * noise_deviation)
-    neighbours = min(reach / step, 1e6)
-    neighbour_count = int(counts[:-1][values[:-1] > values[-1] - reach - 0.5 * step].sum())
-    return float(
-        stats.binom.sf(counts[-1] - 2, counts[-1] - 1 + neighbour_count, 1.0 / (neighbours + 1.0)))
-
-
-def _is_clipped(comparison: OutputComparison, sign: float, extreme: float, step: float) -> bool:
-    """Tell whether samples at the largest value in one sense would have gone beyond it."""
-    at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
-    runs = int(np.count_nonzero(np.diff(at_extreme.astype(np.int8), prepend=0) > 0))
-    fine = step < _FINE_STEP_NOISE_RATIO * comparison.noise_deviation
-    expected = np.array([]) if comparison.expected is None else comparison.expected[at_extreme]
-    beyond = sign * expected[np.isfinite(expected)] - extreme
-    if not beyond.size:
-        return fine and runs >= _MIN_LIMIT_RUNS
-    middle = float(np.median(beyond))
-    # The expected output errs by bias wander and nonlinearity, which these samples share.
-    deviation = sample_deviation(comparison)
-    return (middle > 0.5 * step + 2.0 * deviation
-            or (fine and (runs >= _MIN_LIMIT_RUNS or middle > -3.0 * deviation)))
 
 
 # repeated samples
@@ -512,9 +498,9 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
         return found
     found = _check_stamps(found, log, has_output)
     found = _check_reference(found, log)
-    line = None if line is None else LineFit(line.factor * factor, line.offset * factor,
-                                             line.deviation * abs(factor))
-    return _check_samples(found, output * factor, rate, line, model, has_output, log)
+    expected = (None if rate is None or line is None
+                else factor * (line.factor * rate + line.offset))
+    return _check_samples(found, compare_output(output * factor, expected), has_output, model, log)
 
 
 def resolve_unit(quality: DataQuality) -> DataQuality:
@@ -592,14 +578,14 @@ def update_interval(time: Array, values: Array, step: float) -> float | None:
     return float(gaps[regular].mean() * np.median(np.diff(time))) if regular.mean() > 0.8 else None
 
 
-def _check_samples(found: DataQuality, output: Array, rate: Array | None, line: LineFit | None,
-                   model: GyroModel | None, has_output: Mask, log: Log) -> DataQuality:
+def _check_samples(found: DataQuality, comparison: OutputComparison, has_output: Mask,
+                   model: GyroModel | None, log: Log) -> DataQuality:
     """Check the samples of the gyro for quantization, limits, repeats and outliers."""
-    codes, comparison = find_codes(output[has_output]), compare_output(output, rate, line)
+    codes, output = find_codes(comparison.output[has_output]), comparison.output
     limit = find_limit(codes, comparison, FALSE_ALARM_CHANCE)
     at_limit = (np.zeros(len(output), dtype=bool) if limit is None
-                else limit.is_reached(comparison.output))
-    valid, band = has_output & ~at_limit, find_dead_band(codes, comparison.output)
+                else limit.is_reached(output))
+    valid, band = has_output & ~at_limit, find_dead_band(codes, output)
     repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     limit_runs = find_runs(at_limit)
     if repeated is not None and len(limit_runs) == 1 and np.count_nonzero(at_limit) - 1 <= 2 * max(
@@ -610,7 +596,7 @@ def _check_samples(found: DataQuality, output: Array, rate: Array | None, line: 
     valid = valid if repeated is None else valid & ~repeated.is_faulty
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(
-        band.contains(comparison.output), iterations=NEIGHBOURS_PER_SIDE)
+        band.contains(output), iterations=NEIGHBOURS_PER_SIDE)
     outlying = find_outliers(comparison, tested, 0.5 * codes.step, FALSE_ALARM_CHANCE)
     valid = valid if outlying is None else valid & ~outlying.is_faulty
     away_from_limit = np.ones(len(output), dtype=bool)

@@ -35,9 +35,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
+_FACTORS = {'pi/180': DEGREE, '180/pi': 1.0 / DEGREE, '2': 2.0, '1/2': 0.5}
 _COMMON_FACTORS: Mapping[str, float] = {
-    'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi, '-pi/180': -math.pi / 180.0,
-    '-180/pi': -180.0 / math.pi, '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
+    **_FACTORS, '-1': -1.0, **{f'-{name}': -value for name, value in _FACTORS.items()}}
 #: Powers of two instead of powers of ten, and vice versa.
 _BINARY_FACTORS: Mapping[str, float] = {
     **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)},
@@ -154,12 +154,11 @@ class OutputComparison:
     scatter: float = math.inf
 
 
-def compare_output(output: Array, rate: Array | None, line: LineFit | None) -> OutputComparison:
-    """Compare an output with the line over the reference rate."""
+def compare_output(output: Array, expected: Array | None) -> OutputComparison:
+    """Compare an output with the expected one."""
     whole = bridge_gaps(output)
-    if rate is None or line is None:
+    if expected is None:
         return OutputComparison(whole, None, white_noise_deviation(output))
-    expected = line.factor * rate + line.offset
     difference = output - expected
     scatter = (1.4826 * float(np.nanmedian(np.abs(difference))) if np.isfinite(difference).any()
                else math.inf)

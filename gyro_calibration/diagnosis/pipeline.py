@@ -98,6 +98,7 @@ from gyro_calibration.diagnosis.search import (
     Search,
     search_causes,
     start_search,
+    UNPREDICTIVE,
     withdraw_names,
 )
 from gyro_calibration.diagnosis.steps import CHECKS_STEP, OnProgress, ProgressSteps
@@ -220,11 +221,11 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         search = start_search(averaged, generator, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
         everything = search_causes(search)
     named, unnamed = withdraw_names(search, everything)
-    named, unconfirmed, contradicted = confirm(search, named)
-    refuted = {**{each.candidate.cause: 'it does not predict held-out stretches'
-                  for each in unconfirmed if not is_lasting(each.candidate)},
-               **{each.candidate.cause: 'the interval of its size includes 0'
-                  for each in contradicted}}
+    named, removed = confirm(search, named)
+    unconfirmed = [each for each, why in removed.items()
+                   if why == UNPREDICTIVE and is_lasting(each.candidate)]
+    refuted = {each.candidate.cause: why for each, why in removed.items()
+               if each not in unconfirmed}
     steps.begin('alternatives')
     named, sets = choose_simplest(search, named, unnamed)
     found = fit_causes(search.problem, named)
@@ -246,10 +247,9 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
     steps.begin('findings')
-    more = find_suspected(search, (*named, *unnamed))
     taken = {each.candidate.cause for each in named}
-    doubtful = tuple(each for each in unconfirmed if is_lasting(each.candidate)
-                     and each.candidate.cause not in taken) or (more.causes[-1:] if more else ())
+    doubtful = (tuple(each for each in unconfirmed if each.candidate.cause not in taken)
+                or find_suspected(search, (*named, *unnamed)))
     findings = [*_cause_findings(search, found, sets, unnamed, doubtful),
                 *_record_findings(quality, changed)]
     if model is not None:

@@ -199,8 +199,8 @@ class RegressionFit:
     residual : whitened, less the columns of causes of fixed amplitude, shape (m,)
     columns : whitened and independent: scale factor error, those of the causes, and derivatives
         with respect to their shapes, shape (q, m)
-    column_owners : of each column: (index of the cause, or -1 for the scale factor error, or -2;
-        index of its value, or -1 less index of its shape)
+    column_owners : of each column: (index of the cause, or -1 for the scale factor error; index of
+        its value, or -1 less index of its shape)
     column_counts : number of columns with free values of each cause
     information, scores : of the columns under each noise, shapes (g, q, q) and (g, q)
     residual_squares : sum of whitened squares that are left under each noise, shape (g,)
@@ -422,18 +422,8 @@ def with_distorted_rate(replay: Replay, causes: Sequence[SelectedCause]) -> Repl
 
 # fits
 
-def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause],
-               nuisance_candidates: Sequence[Candidate] = ()) -> RegressionFit:
-    """
-    Fit causes to logs.
-
-    Parameters
-    ----------
-    problem : the logs with the reference rate
-    causes : causes with their shapes and values
-    nuisance_candidates : candidates whose columns are nuisances too
-
-    """
+def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause]) -> RegressionFit:
+    """Fit causes to logs, and the shapes of those that have values to first order."""
     distorted = tuple(with_distorted_rate(each, causes) for each in problem.replays)
     widths = []
     residual = np.concatenate([
@@ -455,10 +445,6 @@ def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause],
         for shape in smooth_shapes(known.candidate) if known.values else ():
             columns.append(_shape_derivative(known, shape, replays, own)[None])
             owners.append((place, -1 - shape))
-    for candidate in nuisance_candidates:
-        own = candidate_transforms(candidate, distorted)
-        columns.append(own)
-        owners += [(-2, 0)] * len(own)
     return _fit_columns(problem, distorted, tuple(causes), residual / problem.deviation,
                         np.concatenate(columns) / problem.deviation, tuple(owners), tuple(widths))
 
@@ -496,11 +482,8 @@ def add_cause(fit: RegressionFit, candidate: Candidate) -> RegressionFit:
 
 def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
     """Return the amplitude that fits best for a cause whose amplitude is fixed."""
-    own = candidate_transforms(candidate, fit.distorted) / fit.problem.deviation
-    free = _fit_columns(fit.problem, fit.distorted, fit.causes, fit.residual,
-                        np.concatenate([fit.columns, own]), (*fit.column_owners, (-2, 0)),
-                        fit.column_counts)
-    return float(free.estimates[0][-1])
+    free = add_cause(fit, replace(candidate, cause='', amplitude=None))
+    return free.coefficients(len(fit.causes))[0].value
 
 
 def _fit_columns(problem: RegressionProblem, distorted: tuple[Replay, ...],

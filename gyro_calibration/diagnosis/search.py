@@ -89,6 +89,9 @@ MIN_PREDICTION_SIGMAS, MAX_STRETCH_GAIN, STRETCH_COUNT = 1.65, 3.0, 64
 #: whose causes are named only if they have the same size in all logs.
 _MIN_REPEAT_CHANCE, _REPEATING_VARIABLES = 1e-3, ('temperature', 'temperature_rate')
 
+#: Why a cause is not named.
+UNPREDICTIVE = 'it does not predict held-out stretches'
+
 Causes = tuple[SelectedCause, ...]
 
 
@@ -380,18 +383,18 @@ def is_lasting(candidate: Candidate) -> bool:
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
 
-def find_suspected(search: Search, selected: Sequence[SelectedCause]) -> SearchStep | None:
-    """Return the named causes and one more, at `SUSPECTED_RATE_FACTOR` times the rate."""
+def find_suspected(search: Search, selected: Causes) -> Causes:
+    """Return one more cause at `SUSPECTED_RATE_FACTOR` times the rate, if there is one."""
     _, steps = find_strongest(search, selected)
     score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
     cause_names = {each.candidate.cause for each in selected}
     for step in steps:
-        candidate = step.causes[-1].candidate
-        if (is_lasting(candidate) and candidate.cause not in cause_names
-                and search.excess_evidence(candidate.cause, step.score - score,
+        found = step.causes[-1]
+        if (is_lasting(found.candidate) and found.candidate.cause not in cause_names
+                and search.excess_evidence(found.candidate.cause, step.score - score,
                                            SUSPECTED_RATE_FACTOR) > 0.0):
-            return step
-    return None
+            return (found,)
+    return ()
 
 
 # scans over all frequencies and times
@@ -581,37 +584,17 @@ def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: i
 
 def eliminate_backward(search: Search, causes: Causes) -> Causes:
     """Remove causes that are not significant given the others, the weakest first."""
-    return _remove_weakest(search, causes, lambda some: [
-        search.excess_evidence(each.candidate.cause, evidence_for(search, some, place))
-        for place, each in enumerate(some)])[0]
-
-
-def _remove_weakest(search: Search, causes: Causes,
-                    margins_of: Callable[[Causes], Sequence[float]]) -> tuple[Causes, Causes]:
-    """Remove the weakest cause and refine the others until all have a positive margin."""
-    removed: Causes = ()
     while causes:
-        margins = margins_of(causes)
-        weakest = int(np.argmin(margins))
-        if margins[weakest] > 0.0:
+        excess = [search.excess_evidence(each.candidate.cause, evidence_for(search, causes, place))
+                  for place, each in enumerate(causes)]
+        weakest = int(np.argmin(excess))
+        if excess[weakest] > 0.0:
             break
-        removed += causes[weakest:weakest + 1]
         causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
-    return causes, removed
+    return causes
 
 
 # names
-
-def find_alternatives(search: Search, causes: Causes,
-                      cause_index: int) -> list[tuple[SelectedCause, float]]:
-    """Return a named cause and its alternatives, with their deficits in log-likelihood."""
-    cause = causes[cause_index].candidate.cause
-    _, steps = find_strongest(search, causes[:cause_index] + causes[cause_index + 1:])
-    mine = max((step.score for step in steps if step.causes[-1].candidate.cause == cause),
-               default=np.inf)
-    return [(step.causes[-1], mine - step.score) for step in steps
-            if mine - step.score < RULED_OUT_DEFICIT and is_named(step.causes[-1].candidate)]
-
 
 def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     """
@@ -648,30 +631,34 @@ def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool
     if (runs == 1 or CAUSES[candidate.cause].along not in _REPEATING_VARIABLES
             or candidate.amplitude is not None):
         return True
-    alone = [replace(candidate, log_index=run) for run in range(runs - 1)]
-    more = 2.0 * (fit_causes(search.problem, causes, alone).log_likelihood
+    alone = [SelectedCause(replace(candidate, log_index=run)) for run in range(runs - 1)]
+    more = 2.0 * (fit_causes(search.problem, [*causes, *alone]).log_likelihood
                   - fit_causes(search.problem, causes).log_likelihood)
     return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
 
 
 # confirmation
 
-def confirm(search: Search, named: Causes) -> tuple[Causes, Causes, Causes]:
+def confirm(search: Search, causes: Causes) -> tuple[Causes, dict[SelectedCause, str]]:
     """
     Remove causes that do not predict held-out stretches, or whose intervals include 0.
 
     Returns
     -------
-    the confirmed causes, those that do not predict, and those whose intervals include 0
+    the confirmed causes, and the removed ones with the reason
 
     """
-    named, unconfirmed = _remove_weakest(search, named, lambda some: [
-        each - MIN_PREDICTION_SIGMAS for each in held_out_sigmas(search, some)])
-    named, contradicted = _remove_weakest(search, named, lambda some: [
-        each - NORMAL_QUANTILE_975 for each in _size_sigmas(search, some)])
-    return named, unconfirmed, contradicted
-
-
+    removed = {}
+    while causes:
+        predicted = np.array(held_out_sigmas(search, causes)) / MIN_PREDICTION_SIGMAS
+        sizes = np.array(_size_sigmas(search, causes)) / NORMAL_QUANTILE_975
+        weakest = int(np.argmin(np.minimum(predicted, sizes)))
+        if min(predicted[weakest], sizes[weakest]) > 1.0:
+            break
+        removed[causes[weakest]] = (UNPREDICTIVE if predicted[weakest] <= 1.0
+                                    else 'the interval of its size includes 0')
+        causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
+    return causes, removed
 def prediction_sigmas(log_likelihood_gains: Array) -> float:
     """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
     clipped_gains = np.clip(log_likelihood_gains, -MAX_STRETCH_GAIN, MAX_STRETCH_GAIN)
@@ -722,20 +709,32 @@ def _size_sigmas(search: Search, causes: Causes) -> list[float]:
 
 def choose_simplest(search: Search, named: Causes, unnamed: Causes,
                     ) -> tuple[Causes, list[list[tuple[SelectedCause, float]]]]:
-    """Replace each cause by its simplest alternative, and return the alternatives of each."""
+    """
+    Replace each cause by its simplest alternative.
+
+    Returns
+    -------
+    the causes, and for each itself and its alternatives, with their deficits in log-likelihood
+
+    """
     def size(known: SelectedCause) -> int:
         """Return the number of fitted values of a cause."""
         candidate = known.candidate
-        count = len(fitted_shape_indices(candidate))
-        return (count if candidate.amplitude is not None
-                else count + len(candidate.columns(search.problem.replays[0])))
+        return len(fitted_shape_indices(candidate)) + (
+            0 if candidate.amplitude is not None
+            else len(candidate.columns(search.problem.replays[0])))
 
     sets = []
     for place in range(len(named)):
-        members = find_alternatives(search, (*named, *unnamed), place) or [(named[place], 0.0)]
-        sizes = [size(each) for each, _ in members]
-        if min(sizes) < size(named[place]):
-            chosen = members[int(np.argmin(sizes))][0]
+        cause = named[place].candidate.cause
+        _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
+        mine = max((step.score for step in steps if step.causes[-1].candidate.cause == cause),
+                   default=np.inf)
+        members = [(step.causes[-1], mine - step.score) for step in steps
+                   if mine - step.score < RULED_OUT_DEFICIT
+                   and is_named(step.causes[-1].candidate)] or [(named[place], 0.0)]
+        chosen = min((each for each, _ in members), key=size)
+        if size(chosen) < size(named[place]):
             named = refine_jointly(search, (*named[:place], chosen, *named[place + 1:]))
         sets.append(members)
     return named, sets

@@ -238,7 +238,7 @@ def test_samples_that_a_coarse_gyro_repeats_in_a_turn_are_found(generator):
 
 def test_steps_as_wide_as_the_noise_repeat_as_seldom_as_stated(any_generator):
     """200 logs at rest in the middle of a step at 2 % each; 26 alarms if each repeat counted."""
-    logs = [compare_output(np.round(any_generator.standard_normal(2000) / 1.05) * 1.05, None, None)
+    logs = [compare_output(np.round(any_generator.standard_normal(2000) / 1.05) * 1.05, None)
             for _ in range(200)]
     assert sum(find_repeated_samples(log, find_codes(log.output), None, np.ones(2000, dtype=bool),
                                      0.02) is not None for log in logs) <= most(200, 0.02)
