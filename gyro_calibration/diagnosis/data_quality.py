@@ -141,7 +141,7 @@ class DeadBand:
         rest = (np.full(len(comparison.output), np.median(comparison.output))
                 if comparison.expected is None else comparison.expected)
         off = np.nan_to_num(rest - self.value)
-        deviation = max(sample_deviation(comparison), 1e-9 * self.half_width)
+        deviation = max(comparison.deviation, 1e-9 * self.half_width)
         reach = self.half_width + 2.0 * deviation
         return ndtr((reach - off) / deviation) - ndtr((-reach - off) / deviation)
 
@@ -160,12 +160,6 @@ def find_dead_band(codes: QuantizationCodes, output: Array) -> DeadBand | None:
 def _rest_rate_limit(output: Array) -> float:
     """Return the largest absolute output of a rest, by a quantile that excludes outliers."""
     return _REST_RATE_SHARE * float(np.quantile(np.abs(output), 0.99))
-
-
-def sample_deviation(comparison: OutputComparison) -> float:
-    """Return the standard deviation of samples from the expected output, rad/s."""
-    return (comparison.noise_deviation if comparison.expected is None
-            else max(comparison.noise_deviation, comparison.scatter))
 
 
 @dataclass(frozen=True)
@@ -212,7 +206,7 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
 
     """
     chances = {}
-    deviation, noise = sample_deviation(comparison), comparison.noise_deviation
+    deviation, noise = comparison.deviation, comparison.noise_deviation
     fine = codes.step < _FINE_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
         values, counts = ((codes.values, codes.counts) if sign > 0.0
@@ -305,7 +299,7 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
             # Repeats of a coarse code depend on each other: a fault only if it should have left.
             left = abs(travel[run.stop] - travel[run.start]) - width[run.start]
             unlikely = float(2.0 * stats.norm.sf(
-                left / (math.sqrt(2.0) * sample_deviation(comparison)))) if left > 0.0 else 1.0
+                left / (math.sqrt(2.0) * comparison.deviation))) if left > 0.0 else 1.0
         if unlikely * len(valid) < level:
             repeats[run.start + 1:run.stop + 1] = True
             p_value = min(p_value, unlikely * len(valid))
@@ -427,15 +421,6 @@ def _outlier_sigmas(values: Array, off: Array, expected_change: Array, valid: Ma
 
 
 # the record
-
-#: False-alarm probability of each check.
-FALSE_ALARM_CHANCE = 2e-4
-#: Least step of codes that matters, as a share of the white noise; the same for a step of the
-#: reference, as a share of the variance.
-MIN_STEP_NOISE_RATIO, MIN_STEP_VARIANCE_SHARE = 0.2, 0.02
-#: Samples whose expected output is within so many standard deviations of a limit are not used,
-#: because noise determines whether they are clipped.
-_LIMIT_MARGIN_SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class DataQuality:
@@ -602,7 +587,7 @@ def _check_samples(found: DataQuality, comparison: OutputComparison, has_output:
     away_from_limit = np.ones(len(output), dtype=bool)
     if limit is not None and comparison.expected is not None:
         # by the expected output: a selection by the measured output would be biased by its noise
-        near = _LIMIT_MARGIN_SIGMAS * max(comparison.noise_deviation, comparison.scatter)
+        near = _LIMIT_MARGIN_SIGMAS * comparison.deviation
         away_from_limit = ~(
             (comparison.expected > limit.high - near) | (comparison.expected < limit.low + near))
     findings = (*found.findings, *_code_findings(codes, comparison, limit, at_limit, model),

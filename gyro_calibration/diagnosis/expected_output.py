@@ -116,12 +116,6 @@ def identify_sample_offset(estimate: float, deviation: float, interval: float) -
 #: Length of the parabolas by which a heading is differentiated, s; shorter ones would show its
 #: quantization.
 _SMOOTHING_DURATION = 0.15
-#: Lengths of the blocks in which output and reference are compared, s; the shorter one is used if
-#: the motion averages out in the longer one.
-_BLOCK_DURATIONS = (0.5, 0.1)
-#: Share of the range of the output at each end that is left out of the first fit of a line, and
-#: number of robust fits.
-_END_SHARE, _FIT_ITERATIONS = 0.05, 4
 
 
 @dataclass(frozen=True)
@@ -143,28 +137,25 @@ class OutputComparison:
     output : without nan; gaps are interpolated
     expected : from the reference, nan in its gaps; None without a reference
     noise_deviation : standard deviation of the white noise of a sample
-    scatter : robust standard deviation of output less expected output; infinite without a
-        reference
+    deviation : standard deviation of a sample from the expected output, at least that
 
     """
 
     output: Array
     expected: Array | None
     noise_deviation: float
-    scatter: float = math.inf
+    deviation: float
 
 
 def compare_output(output: Array, expected: Array | None) -> OutputComparison:
     """Compare an output with the expected one."""
-    whole = bridge_gaps(output)
+    whole, noise = bridge_gaps(output), white_noise_deviation(output)
     if expected is None:
-        return OutputComparison(whole, None, white_noise_deviation(output))
-    difference = output - expected
-    scatter = (1.4826 * float(np.nanmedian(np.abs(difference))) if np.isfinite(difference).any()
-               else math.inf)
-    return OutputComparison(whole, expected,
-                            min(white_noise_deviation(output), white_noise_deviation(difference)),
-                            scatter)
+        return OutputComparison(whole, None, noise, noise)
+    difference = (output - expected)[np.isfinite(output) & np.isfinite(expected)]
+    noise = min(noise, white_noise_deviation(output - expected))
+    scatter = robust_deviation(difference) if len(difference) else math.inf
+    return OutputComparison(whole, expected, noise, max(noise, scatter))
 
 
 def bridge_gaps(values: Array) -> Array:
@@ -213,7 +204,7 @@ def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:
     rate, output = rate[known], output[known]
     if time is not None:
         whole, stamps = (rate, output), time[known]
-        for length in _BLOCK_DURATIONS:
+        for length in (0.5, 0.1):  # s, shorter if the motion averages out
             number = np.floor((stamps - stamps[0]) / length)
             block = np.cumsum(np.diff(number, prepend=number[0]) > 0.0)
             rate, output = (np.bincount(block, each) / np.bincount(block) for each in whole)
@@ -236,11 +227,11 @@ def model_scale_factor(model: GyroModel, rate: Array) -> float:
 def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
     low, high = output.min(), output.max()
     # without the ends, which may be clipped, unless most samples are there
-    ends = _END_SHARE * (high - low)
+    ends = 0.05 * (high - low)
     inliers = (output > low + ends) & (output < high - ends)
     if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.3 * np.ptp(rate):
         inliers = np.ones(len(rate), dtype=bool)
-    for _ in range(_FIT_ITERATIONS):
+    for _ in range(4):
         if np.count_nonzero(inliers) < 8 or not np.ptp(rate[inliers]) > 0.0:
             return None
         columns = np.column_stack([rate, np.ones(len(rate))])

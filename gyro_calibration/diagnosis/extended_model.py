@@ -58,15 +58,9 @@ _COMPENSATING_EFFECTS: Mapping[str, Effect] = {
 HEADING_WINDOW = 60.0
 #: Longest window as a share of a held-out part.
 MAX_WINDOW_SHARE = 0.75
-#: One of so many blocks is held out.
-HELD_OUT_STRIDE = 3
-#: Least number of samples of a log that remain for the fit.
-_MIN_SAMPLES = 20
 #: False-alarm rate of a cause, found in the whole logs, when it is selected without the held-out
 #: blocks.
 _REPEATED_ALARM_RATE = 0.01
-#: Least number of parts for an interval of the gain.
-_MIN_PARTS = 2
 
 
 def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[DataQuality],
@@ -363,7 +357,7 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     length = min(HEADING_WINDOW, max(each.duration for each in replays) / 6.0)
     held_out_masks = [held_out_mask(each, length) for each in replays]
     if (not any(out.any() for out in held_out_masks)
-            or any(np.count_nonzero(each.valid & ~out) < _MIN_SAMPLES
+            or any(np.count_nonzero(each.valid & ~out) < 20
                    for each, out in zip(replays, held_out_masks))):
         return None
     reduced_search = restrict_search(
@@ -419,7 +413,7 @@ def held_out_mask(replay: Replay, block_duration: float) -> Mask:
     """Mark the samples that are held out, shape (n,)."""
     number, time = _block_numbers(replay, block_duration), replay.channels.time
     count = int((time[-1] - time[0]) / block_duration + 1e-9)
-    return replay.valid & (number % HELD_OUT_STRIDE == 1) & (number < count)
+    return replay.valid & (number % 3 == 1) & (number < count)
 
 
 def _block_numbers(replay: Replay, block_duration: float) -> Array:
@@ -535,7 +529,7 @@ def jackknife_change(square_sums: Array, counts: Array) -> Change:
     """
     before, after = np.sqrt(square_sums.sum(axis=0) / counts.sum())
     parts = len(counts)
-    if parts < _MIN_PARTS:
+    if parts < 2:
         return Change(float(before), float(after), None)
     others = np.sqrt(
         np.maximum(square_sums.sum(axis=0) - square_sums, 0.0) / (counts.sum() - counts)[:, None])

@@ -123,16 +123,11 @@ _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K'
                      'supply': 'the supply voltage does not change',
                      'specific_force': 'the specific force does not change'}
 
-#: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
-_STEP_SHARES = {
-    CHECKS_STEP: 1,
-    'data quality': 1,
-    'replay of the model': 1,
-    'search for causes': 78,
-    'alternatives': 11,
-    'noise figures': 1,
-    'cross-validation': 3,
-    'findings': 4}
+#: Shares of the steps in the computing time, %.
+_STEP_SHARES = {**dict.fromkeys((CHECKS_STEP, 'data quality', 'replay of the model'), 1),
+                'search for causes': 80,
+                **dict.fromkeys(('alternatives', 'noise figures', 'cross-validation',
+                                 'findings'), 4)}
 
 #: A cause and its alternatives, each with its deficit in log-likelihood.
 Alternatives = Sequence[tuple[SelectedCause, float]]

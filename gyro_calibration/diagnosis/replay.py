@@ -39,10 +39,6 @@ from scipy.fft import dct, idct, next_fast_len
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 
-#: Numbers of random walks, of strengths and times of Gauss-Markov processes, and of corner
-#: frequencies of flicker in `noise_grid`.
-_WALK_COUNT, _STRENGTH_COUNT, _CORRELATION_TIME_COUNT, _FLICKER_CORNER_COUNT = 14, 7, 7, 14
-
 
 @dataclass(frozen=True)
 class NoiseShape:
@@ -131,15 +127,14 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     """
     lowest = 0.02 / duration ** 2
     highest = max(1e5 * lowest, 1e-3 / interval ** 2 * 1e-3)
-    walks = [0.0, *np.geomspace(lowest, highest, _WALK_COUNT)]
-    times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0,
-                         _CORRELATION_TIME_COUNT)
+    walks = [0.0, *np.geomspace(lowest, highest, 14)]
+    times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, 7)
     # By their spectral density at frequency 0 relative to white noise.
     strong = [(ratio / (2.0 * time), time) for time in times
-              for ratio in np.geomspace(0.3, 1000.0, _STRENGTH_COUNT)]
+              for ratio in np.geomspace(0.3, 1000.0, 7)]
     plain = [NoiseShape(walk, strength, time, rounding_ratio) for walk in walks
              for strength, time in [(0.0, 1.0), *strong]]
-    corners = np.geomspace(0.1 / duration, 0.3 / interval, _FLICKER_CORNER_COUNT)
+    corners = np.geomspace(0.1 / duration, 0.3 / interval, 14)
     return plain + [NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
                     for walk in walks[::4] for corner in corners]
 
@@ -183,6 +178,7 @@ class Replay:
     simulated_error : error of the simulated output, rad/s, shape (n,), which is subtracted from
         `channels.output`
     rounding_variance : variance of a sample by quantization of the output, (rad/s)²
+
     """
 
     channels: Channels

@@ -659,6 +659,8 @@ def confirm(search: Search, causes: Causes) -> tuple[Causes, dict[SelectedCause,
                                     else 'the interval of its size includes 0')
         causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
     return causes, removed
+
+
 def prediction_sigmas(log_likelihood_gains: Array) -> float:
     """Return the gain of held-out stretches in log-likelihood over its standard deviation."""
     clipped_gains = np.clip(log_likelihood_gains, -MAX_STRETCH_GAIN, MAX_STRETCH_GAIN)
