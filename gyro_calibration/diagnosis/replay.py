@@ -482,7 +482,7 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
     bend = np.abs(np.diff(np.pad(rate, 2, mode='edge'), 4)) / 24.0
     white = white_noise_deviation((output - rate)[valid])
     sharp = maximum_filter1d(bend > _CORNER_NOISE_SHARE * white + rounding, 5)
-    rounded = rounding ** 2 / 12.0 > 0.5 * white ** 2  # most of what looks white is of the steps
+    rounded = rounding > math.sqrt(6.0) * white  # most of what looks white is of the steps
     return np.zeros_like(sharp) if rounded or sharp[valid].mean() > _MAX_CORNER_SHARE else sharp
 
 

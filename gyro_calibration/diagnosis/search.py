@@ -55,7 +55,7 @@ from gyro_calibration.diagnosis.regression import (
     with_distorted_rate,
 )
 from gyro_calibration.diagnosis.replay import cosine_transform, inverse_cosine_transform, Replay
-from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
@@ -213,6 +213,9 @@ def start_search(replays: Sequence[Replay], generator: np.random.Generator, rate
     found = [*propose_candidates(replays), *generic_terms(replays)]
     problem = build_problem(replays)
     columns, fit = make_candidate_columns(problem, found), fit_causes(problem, [])
+    if not np.isfinite(fit.noise_log_likelihood).all():
+        raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
+                          'check columns and units')
     shown, places = columns.evidence(problem, fit.columns, [fit.residual[None]])[0], (
         indices_by_cause(found))
     on_part('significance, by simulated noise')
