@@ -141,6 +141,9 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
+#: Ratio of the power in the last to that in the second quarter of the frequencies, below which a
+#: record was smoothed (jumps have 0.18, noise not less). Longest averaging interval for it, s.
+_SMOOTHED_POWER_RATIO, _MAX_AVERAGING_TIME = 0.05, 0.03
 #: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
 _SMOOTHING_BINS, _ROUNDING_POWER_FACTOR = 101, 1.5
 #: Update intervals of a held reference, and steps of its change, from which on a constant value is
@@ -318,6 +321,7 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     coarse = max(output_step ** 2 / 12.0 - float(np.var(expected_rounding[kept])), 0.0)
     plain = Replay(replace(channels, output=log.output - expected_rounding), reference, kept,
                    place, interval, every, filling, rounded, has, np.zeros(len(time)), coarse)
+    plain = replace(plain, decimation=every * _smoothing_decimation(plain))
     if model is None:
         return plain
     # the error by the model is subtracted from the output, and effects use its distorted rate
@@ -349,6 +353,25 @@ def _even_time(time: Array) -> Array:
     if not stamps.has_bursts:
         return time - time[0]
     return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
+
+
+def _smoothing_decimation(base_replay: Replay) -> int:
+    """
+    Return the factor of the number of points to average, so that strong smoothing does not show.
+
+    Otherwise the small errors of motion and reference would have so much weight at the highest
+    frequencies that a first search would name many causes for them.
+
+    """
+    residual, factor, decimation = base_replay.channels.output - base_replay.reference, 1, 1
+    while 2 * factor * base_replay.point_interval <= _MAX_AVERAGING_TIME:
+        averaged = replace(base_replay, decimation=base_replay.decimation * factor)
+        power = averaged.transform_samples(residual) ** 2
+        _, second, _, last = (float(np.median(part)) for part in np.array_split(power, 4))
+        factor *= 2
+        if last < _SMOOTHED_POWER_RATIO * second:
+            decimation = factor
+    return decimation
 
 
 def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> Array:

@@ -12,15 +12,8 @@
 
 from dataclasses import replace
 
-from gyro_calibration.diagnosis.candidates import effect_candidate
 from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression import (
-    average_filtered_noise,
-    build_problem,
-    fit_causes,
-    SelectedCause,
-)
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
@@ -73,9 +66,13 @@ def test_effects_look_at_a_rate_without_gaps_and_lost_samples_are_not_compared(g
 
 
 def test_a_smoothed_record_is_averaged_until_no_smoothing_is_seen(smoothed):
-    late = SelectedCause(effect_candidate('time_offset', LATE), (1.0,))
-    fit = average_filtered_noise(fit_causes(build_problem([laid_out(smoothed)]), [late]))
-    assert fit.problem.replays[0].decimation > 1
+    assert laid_out(smoothed).decimation > 1
+
+
+def test_a_record_that_is_not_smoothed_is_left_as_it_is(smoothed):
+    rate = np.sin(smoothed.time)
+    noise = 1e-3 * np.random.default_rng(2).standard_normal(len(rate))
+    assert laid_out(replace(smoothed, output=rate + noise, reference_rate=rate)).decimation == 1
 
 
 def test_stamps_in_bursts_lose_no_sample():
