@@ -21,7 +21,7 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
-from gyro_calibration.diagnosis.data_quality import REFERENCE_KINDS
+from gyro_calibration.diagnosis.expected_output import REFERENCE_KINDS
 from gyro_calibration.diagnosis.extended_model import merge_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.pipeline import diagnose

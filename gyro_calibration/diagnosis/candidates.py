@@ -56,6 +56,8 @@ class Candidate:
     columns : of a log
     log_index : number of the log for a single event; None for a cause in all logs
     amplitude : fixed coefficient of its column if only shapes are fitted; None if it is free
+    half_width : of the range in which its shape, a time or a frequency, is searched; None for a
+        shape that is searched in logarithms
 
     """
 
@@ -64,6 +66,7 @@ class Candidate:
     columns: ColumnFunction
     log_index: int | None = None
     amplitude: float | None = None
+    half_width: float | None = None
 
 
 def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
@@ -77,10 +80,11 @@ def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Arr
     return np.concatenate(parts, axis=1)
 
 
-def effect_candidate(name: str, *shapes: float, log_index: int | None = None) -> Candidate:
+def effect_candidate(name: str, *shapes: float, log_index: int | None = None,
+                     half_width: float | None = None) -> Candidate:
     """Return the candidate of an effect of the gyro, or of the reference."""
     if name in _REFERENCE_EFFECTS:
-        columns = _REFERENCE_EFFECTS[name][0]
+        columns = _REFERENCE_EFFECTS[name]
         return Candidate(name, shapes, lambda each: columns(each, *shapes), log_index)
     known = CATALOGUE[name]
     if (distortion := known.distortion) is not None:
@@ -91,7 +95,7 @@ def effect_candidate(name: str, *shapes: float, log_index: int | None = None) ->
         return Candidate(name, shapes, rate_change, log_index, 1.0)
     amplitude = known.coefficients[0].default if known.coefficients else None
     return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), log_index,
-                     amplitude)
+                     amplitude, half_width)
 
 
 def gaussian_pulse(time: Array, middle: float, width: float) -> Array:
@@ -99,21 +103,29 @@ def gaussian_pulse(time: Array, middle: float, width: float) -> Array:
     return np.exp(-0.5 * ((time - middle) / width) ** 2) / (width * math.sqrt(2.0 * math.pi))
 
 
-#: Effects of the reference -> columns by log and shapes, and the shapes that a fit finds.
-_REFERENCE_EFFECTS: Mapping[str, tuple[Callable[..., Sequence[Array]], list[int]]] = {
-    'reference_once_per_rev': (lambda each: (
+#: Effects of the reference -> columns by log and shapes; the times and the width of slips are
+#: those of a scan, and only the width is fitted.
+_REFERENCE_EFFECTS: Mapping[str, Callable[..., Sequence[Array]]] = {
+    'reference_once_per_rev': lambda each: (
         -each.channels.rate * np.sin(each.channels.heading),
-        -each.channels.rate * np.cos(each.channels.heading)), []),
-    'reference_slip': (lambda each, width, *moments: tuple(
-        -gaussian_pulse(each.channels.time, moment, width) for moment in moments), [0])}
+        -each.channels.rate * np.cos(each.channels.heading)),
+    'reference_slip': lambda each, width, *moments: tuple(
+        -gaussian_pulse(each.channels.time, moment, width) for moment in moments)}
+#: Causes whose columns do not depend smoothly on their shapes.
+_DISCONTINUOUS = ('bias_step', 'dead_zone')
 
 
 def fitted_shape_indices(candidate: Candidate) -> list[int]:
     """Return the indices of the shapes that are fitted, not set by convention."""
     if candidate.cause not in CATALOGUE:
-        return _REFERENCE_EFFECTS[candidate.cause][1] if is_named(candidate) else []
+        return [0] if candidate.shapes and is_named(candidate) else []
     parameters = CATALOGUE[candidate.cause].parameters[:len(candidate.shapes)]
     return [place for place, parameter in enumerate(parameters) if parameter.default is None]
+
+
+def smooth_shapes(candidate: Candidate) -> list[int]:
+    """Return the indices of fitted shapes on which the columns depend smoothly."""
+    return [] if candidate.cause in _DISCONTINUOUS else fitted_shape_indices(candidate)
 
 
 def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidate:
@@ -121,7 +133,8 @@ def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidat
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
     return effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
-                            *candidate.shapes[shape_index + 1:], log_index=candidate.log_index)
+                            *candidate.shapes[shape_index + 1:], log_index=candidate.log_index,
+                            half_width=candidate.half_width)
 
 
 def common_channels(replays: Sequence[Replay]) -> frozenset[str]:
@@ -161,11 +174,12 @@ def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     yield effect_candidate('rate_ramp')
     for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
         yield effect_candidate('warm_up', time_constant)
+    per_log = max(MAX_STEP_TIMES // len(replays), 1)
     for run, each in enumerate(replays):
-        begin = float(each.channels.time[each.valid][0])
-        spacing = step_time_spacing(each, len(replays))
-        for number in range(1, _step_times_per_log(len(replays)) + 1):
-            yield effect_candidate('bias_step', begin + number * spacing, log_index=run)
+        begin, spacing = float(each.channels.time[each.valid][0]), each.duration / (per_log + 1)
+        for number in range(1, per_log + 1):
+            yield effect_candidate('bias_step', begin + number * spacing, log_index=run,
+                                   half_width=1.5 * spacing)
     if 'temperature' in has:
         yield effect_candidate('bias_temperature', middle)
         for reference in reference_temperatures(replays):
@@ -220,16 +234,6 @@ def user_effects(available_channels: Collection[str],
                                                 for shape in own.nonlinear_parameters)))
 
 
-def _step_times_per_log(log_count: int) -> int:
-    """Return how many times of a bias step are tried in each of so many logs."""
-    return max(MAX_STEP_TIMES // log_count, 1)
-
-
-def step_time_spacing(replay: Replay, log_count: int) -> float:
-    """Return the interval between the times of a bias step that are tried in a log, s."""
-    return replay.duration / (_step_times_per_log(log_count) + 1)
-
-
 def reference_temperatures(replays: Sequence[Replay]) -> list[float]:
     """Return the trial reference temperatures of a parabola: usual, mean and first."""
     known = np.concatenate([each.channels.temperature for each in replays])
@@ -246,16 +250,13 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 #: Prefix of the name of structure without a name; its variable follows.
 UNNAMED_PREFIX = '~'
-#: Numbers of knots of splines over a variable.
-SPLINE_KNOTS = {'rate': (8, 24), 'temperature': (8, 24)}
-_DEFAULT_KNOTS = (8,)
+#: Numbers of waves over the range of rate and temperature, and of knots of splines; other
+#: variables have a spline of the first number alone.
+WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), (8, 24)
+#: Harmonics of the heading.
+HEADING_HARMONICS = range(2, 11)
 #: Largest number of times of a bump in a log, and its widths as shares of the duration.
 MAX_BUMP_TIMES, BUMP_WIDTHS = 40, (0.007, 0.02, 0.05)
-#: Numbers of waves over the range of a variable.
-WAVE_COUNTS = {'rate': tuple(np.arange(1.0, 12.5, 0.5)),
-               'temperature': tuple(np.arange(1.0, 8.5, 0.5))}
-_DEFAULT_WAVE_COUNTS = (1.0, 1.5, 2.0, 3.0, 4.0)
-HEADING_HARMONICS = range(2, 11)
 
 Variable = Callable[[Replay], Array]
 
@@ -270,23 +271,33 @@ def unnamed_variable(candidate: Candidate) -> str:
     return candidate.cause[len(UNNAMED_PREFIX):]
 
 
-def generic_terms(replays: Sequence[Replay]) -> list[Candidate]:
-    """Return the generic terms that these logs may show."""
+def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
+    """Give the generic terms that these logs may show."""
     variables = dict(_scaled_variables(replays))
-    found = [each for name, of in variables.items() for each in _single_variable_terms(name, of)]
+    for name, of in variables.items():
+        is_fine = name in ('rate', 'temperature')
+        for count in WAVE_COUNTS if is_fine else ():
+            yield _unnamed_term(name, _wave_columns(of, np.pi * count))
+        for count in SPLINE_KNOTS if is_fine else SPLINE_KNOTS[:1]:
+            yield _unnamed_term(name, _spline_columns(of, count))
     if 'rate' in variables:
-        found += _rotation_terms(variables)
+        for number in HEADING_HARMONICS:
+            yield _unnamed_term('heading', _wave_columns(_heading, number))
+        for name, number in (('rate', 2), ('rate', 3), ('rate', 4), ('temperature', 1),
+                             ('supply', 1)):
+            if name in variables:
+                yield _unnamed_term(f'{name} and heading',
+                                    _wave_columns(_heading, number, variables[name]))
     for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
-            found.append(_unnamed_term(f'{first} and {second}', _product_columns(one, other)))
+            yield _unnamed_term(f'{first} and {second}', _product_columns(one, other))
     for run, each in enumerate(replays):
         begin = float(each.channels.time[each.valid][0])
         for width in BUMP_WIDTHS:
             count = min(MAX_BUMP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
-                found.append(_unnamed_term('time', _bump_columns(moment, width * each.duration),
-                                           run, moment))
-    return found
+                yield _unnamed_term('time', _bump_columns(moment, width * each.duration), run,
+                                    moment)
 
 
 def _unnamed_term(name: str, columns: ColumnFunction, log_index: int | None = None,
@@ -297,14 +308,13 @@ def _unnamed_term(name: str, columns: ColumnFunction, log_index: int | None = No
 def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable]]:
     """Give the variables that change in these logs, each scaled to -1 to 1."""
     has = common_channels(replays) - constant_channels(replays)
-    known: dict[str, Variable] = {'rate': lambda each: each.channels.rate}
-    if 'temperature' in has:
-        known['temperature'] = lambda each: each.channels.temperature
-    if 'supply' in has:
-        known['supply'] = lambda each: np.asarray(each.channels.supply)
-    if 'specific_force' in has:
-        known['specific_force'] = lambda each: each.lagged('specific_force', 0.3)
-    for name, of in known.items():
+    known: dict[str, Variable] = {
+        'rate': lambda each: each.channels.rate,
+        'temperature': lambda each: each.channels.temperature,
+        'supply': lambda each: np.asarray(each.channels.supply),
+        'specific_force': lambda each: each.lagged('specific_force', 0.3)}
+    for name in ('rate', *(each for each in list(known)[1:] if each in has)):
+        of = known[name]
         low = min(float(of(each).min()) for each in replays)
         high = max(float(of(each).max()) for each in replays)
         if high > low:
@@ -315,58 +325,27 @@ def _scale_to_unit_range(variable: Variable, low: float, high: float) -> Variabl
     return lambda each: np.clip((2.0 * variable(each) - low - high) / (high - low), -1.0, 1.0)
 
 
-def _function_columns(variable: Variable, function: Callable[..., Sequence[Array]],
-                      value: Array | float) -> ColumnFunction:
-    """Return the columns of a function of a variable and a value."""
-    return lambda each: function(variable(each), value)
+def _heading(replay: Replay) -> Array:
+    return replay.channels.heading
 
 
 def _product_columns(one: Variable, other: Variable) -> ColumnFunction:
     return lambda each: (one(each) * other(each),)
 
 
+def _wave_columns(phase: Variable, number: float,
+                  factor_variable: Variable | None = None) -> ColumnFunction:
+    def columns(each: Replay) -> Sequence[Array]:
+        factor = 1.0 if factor_variable is None else factor_variable(each)
+        return (factor * np.sin(number * phase(each)), factor * np.cos(number * phase(each)))
+    return columns
+
+
+def _spline_columns(variable: Variable, count: int) -> ColumnFunction:
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
+    # their sum is constant, as the bias is
+    return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
+
+
 def _bump_columns(middle: float, width: float) -> ColumnFunction:
     return lambda each: (np.exp(-0.5 * ((each.channels.time - middle) / width) ** 2),)
-
-
-def _single_variable_terms(name: str, variable: Variable) -> Iterator[Candidate]:
-    for waves in WAVE_COUNTS.get(name, _DEFAULT_WAVE_COUNTS):
-        yield _unnamed_term(name, _function_columns(variable, lambda x, waves: (
-            np.sin(np.pi * waves * x), np.cos(np.pi * waves * x)), waves))
-    for power in (2, 4, 5) if name == 'rate' else (3, 4) if name == 'temperature' else (2, 3):
-        if (name, power) != ('rate', 2):
-            yield _unnamed_term(
-                name, _function_columns(variable, lambda x, power: (x ** power,), power))
-    for steep in (-8.0, -4.0, 4.0, 8.0):
-        yield _unnamed_term(name, _function_columns(
-            variable, lambda x, steep: (np.exp(steep * x - abs(steep)),), steep))
-    for count in SPLINE_KNOTS.get(name, _DEFAULT_KNOTS):
-        knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
-        # their sum is constant, as the bias is
-        yield _unnamed_term(name, _function_columns(variable, lambda x, knots: tuple(
-            BSpline.design_matrix(x, knots, 3).toarray().T[1:]), knots))
-
-
-def _rotation_terms(variables: Mapping[str, Variable]) -> Iterator[Candidate]:
-    """Give powers of the rate, and harmonics of the heading, alone and times a variable."""
-    rate = variables['rate']
-    for power in (0.25, 0.5, 0.75, 1.5):
-        yield _unnamed_term('rate', _function_columns(
-            rate, lambda x, power: (np.abs(x) ** power,), power))
-        yield _unnamed_term('rate', _function_columns(
-            rate, lambda x, power: (np.abs(x) ** power * np.sign(x),), power))
-    for harmonic in HEADING_HARMONICS:
-        yield _unnamed_term('heading', _harmonic_columns(harmonic, None))
-    for harmonic in HEADING_HARMONICS[:3]:
-        yield _unnamed_term('rate and heading', _harmonic_columns(harmonic, rate))
-    for name in ('temperature', 'supply'):
-        if name in variables:
-            yield _unnamed_term(f'{name} and heading', _harmonic_columns(1, variables[name]))
-
-
-def _harmonic_columns(number: int, factor_variable: Variable | None) -> ColumnFunction:
-    def columns(each: Replay) -> Sequence[Array]:
-        phase = number * each.channels.heading
-        factor = 1.0 if factor_variable is None else factor_variable(each)
-        return factor * np.sin(phase), factor * np.cos(phase)
-    return columns

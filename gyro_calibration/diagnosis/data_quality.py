@@ -11,7 +11,10 @@
 """
 Checks of a record for faults that are not errors of the gyro.
 
-Faults are reported, and the samples concerned are not used; no fault is fitted.
+Codes are the values of a digital output, with their step, the dead band about zero, and the limit.
+Repeated samples have the value of the sample before, more often than coarse codes explain.
+Outliers are samples far from their neighbours that motion does not explain. Faults are reported,
+and the samples concerned are not used; no fault is fitted.
 
 The false-alarm rate for a log without faults is at most 1e-3: each of the five tests (lost
 samples, repeated samples, outliers, a limit on either side) has a level of 2e-4. Quantization and
@@ -25,59 +28,399 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.course_over_ground import MIN_LOST_SHARE
-from gyro_calibration.calibration.dwells.samples import find_lost_reference, require_output
+from gyro_calibration.calibration.dwells.samples import require_output
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.expected_output import (
     bridge_gaps,
     compare_output,
+    encoder_step,
     fit_line,
     identify_unit_factor,
-    integrate_with_curvature,
     is_implausible_factor,
-    LineFit,
     model_scale_factor,
     OutputComparison,
     reference_rate,
     UNIT_FACTORS,
 )
-from gyro_calibration.diagnosis.findings import Estimate, Finding, Reference
+from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import resample_reference, select_reference
-from gyro_calibration.diagnosis.samples import (
-    find_dead_band,
-    find_limit,
-    find_outliers,
-    find_repeated_samples,
-    Limit,
-    NEIGHBOURS_PER_SIDE,
-    Outliers,
-    RepeatedSamples,
-)
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     find_codes,
+    find_runs,
     QuantizationCodes,
     robust_deviation,
-    white_noise_deviation,
 )
-from gyro_calibration.logs.stamps import fit_stamp_grid, StampGrid
+from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from scipy import stats
-from scipy.ndimage import binary_dilation, uniform_filter1d
+from scipy.ndimage import binary_dilation, maximum_filter1d
+from scipy.special import ndtr
 
 #: False-alarm probability of each check.
 FALSE_ALARM_CHANCE = 2e-4
 #: Least step of codes that matters, as a share of the white noise; the same for a step of the
 #: reference, as a share of the variance.
 MIN_STEP_NOISE_RATIO, MIN_STEP_VARIANCE_SHARE = 0.2, 0.02
+#: Step of codes, as a share of the white noise, below which codes hardly repeat by chance; and
+#: least number of separate runs of an extreme code, which a repetition fault does not cause.
+_FINE_STEP_NOISE_RATIO, _MIN_LIMIT_RUNS = 0.1, 3
+#: Output of a rest, as a share of the largest; a limit is higher, and a dead band is lower.
+_REST_RATE_SHARE = 0.1
 #: Samples whose expected output is within so many standard deviations of a limit are not used,
 #: because noise determines whether they are clipped.
 _LIMIT_MARGIN_SIGMAS = 4.0
-#: Least share of the changes of an encoder heading that are not collinear with the two before; in
-#: a calculated motion, rates are constant or change evenly.
-_MIN_IRREGULAR_SHARE = 0.1
+#: Number of classes of motion, by the expected change near a sample.
+_MOTION_CLASSES = 8
+#: Probability of a repeat from which on single repeats of a coarse output are not tested, and up
+#: to which they are marked as a fault.
+_COARSE_REPEAT_CHANCE, _RARE_REPEAT_CHANCE = 0.3, 0.02
+#: Least deviation of an outlier in standard deviations (more for very long logs); and deviation
+#: from which on to that of outliers there are at most half as many samples as outliers: more are a
+#: tail of the noise.
+_MIN_OUTLIER_SIGMAS, _NEAR_OUTLIER_SIGMAS = 6.0, 4.5
+#: Numbers of neighbours on each side with which a sample is compared, of samples between a jolt in
+#: the output and in the reference, of samples in a block of constant scatter, and of consecutive
+#: outliers, at most.
+NEIGHBOURS_PER_SIDE, _JOLT_SAMPLES, _SCATTER_BLOCK_SAMPLES, _MAX_OUTLIER_RUN = 3, 10, 256, 2
 
+
+# codes
+
+def local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
+    """
+    Return an upper bound of the step of codes near each value, shape (n,).
+
+    Steps grow with the values of 32-bit floats and of decimals with a number of significant
+    digits; or they are too small to be determined. They are at most the smallest gap between
+    values of the same size or larger, and at most ten times the smallest relative step, as with a
+    number of digits.
+
+    """
+    steps = np.full(len(output), max(
+        codes.step, float(np.diff(codes.values).min()) if len(codes.values) > 1 else 1.0))
+    sides = {sign: np.sort(sign * codes.values[sign * codes.values >= 0.0])
+             for sign in (1.0, -1.0)}
+    finest = min(float((np.diff(sizes) / sizes[1:]).min(initial=np.inf))
+                 for sizes in sides.values())
+    for sign, sizes in sides.items():
+        if len(sizes) > 1:
+            side = sign * output >= 0.0
+            closest = np.minimum.accumulate(np.diff(sizes)[::-1])[::-1]
+            place = np.minimum(np.searchsorted(sizes, sign * output[side]), len(closest) - 1)
+            steps[side] = np.maximum(
+                steps[side],
+                np.minimum(closest[place], 10.0 * finest * np.abs(output[side])))
+    return steps
+
+
+@dataclass(frozen=True)
+class DeadBand:
+    """
+    A frequent value without other values near it.
+
+    Attributes
+    ----------
+    value : rad/s
+    half_width : distance of the nearest other value, rad/s
+
+    """
+
+    value: float
+    half_width: float
+
+    def contains(self, output: Array) -> Mask:
+        """Mark the samples in it."""
+        return np.abs(output - self.value) < 0.5 * self.half_width
+
+    def membership_chance(self, comparison: OutputComparison) -> Array:
+        """Return the chance of each sample to be in it, by its expected output, or by a rest."""
+        rest = (np.full(len(comparison.output), np.median(comparison.output))
+                if comparison.expected is None else comparison.expected)
+        off = np.nan_to_num(rest - self.value)
+        deviation = max(comparison.deviation, 1e-9 * self.half_width)
+        reach = self.half_width + 2.0 * deviation
+        return ndtr((reach - off) / deviation) - ndtr((-reach - off) / deviation)
+
+
+def find_dead_band(codes: QuantizationCodes, output: Array) -> DeadBand | None:
+    """Return the dead band of an output, or None where it shows none."""
+    counts = np.where(np.abs(codes.values) < _rest_rate_limit(output), codes.counts, 0)
+    place = int(np.argmax(counts))
+    away = np.abs(np.delete(codes.values, place) - codes.values[place])
+    band = DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
+    runs = np.count_nonzero(np.diff(band.contains(output), prepend=False, append=False)) // 2
+    return (band if counts[place] > 1 and runs > 1
+            and band.half_width > 1.5 * codes.step else None)
+
+
+def _rest_rate_limit(output: Array) -> float:
+    """Return the largest absolute output of a rest, by a quantile that excludes outliers."""
+    return _REST_RATE_SHARE * float(np.quantile(np.abs(output), 0.99))
+
+
+@dataclass(frozen=True)
+class Limit:
+    """
+    Largest and smallest code of a saturated output.
+
+    Attributes
+    ----------
+    low, high : the limit on each side, infinite where there is none
+    p_value : the chance that an output without one repeats its extreme codes as often
+
+    """
+
+    low: float
+    high: float
+    p_value: float
+
+    @property
+    def size(self) -> float:
+        """Return the limit as a rate without sign."""
+        return min(-self.low, self.high)
+
+    def is_reached(self, output: Array) -> Mask:
+        """Mark the samples at the limit."""
+        slack = 1e-9 * self.size
+        return (output >= self.high - slack) | (output <= self.low + slack)
+
+
+def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
+               level: float) -> Limit | None:
+    """
+    Return the limit of an output, or None where it shows none.
+
+    An extreme code is a limit if it is larger than the output at rest; if it is more frequent than
+    its neighbours, which are more frequent without a limit; and if the expected output is beyond
+    it, which is not so for a coarse code at a constant rate.
+
+    Parameters
+    ----------
+    codes : of the output
+    comparison : output and expectation
+    level : chance of a false alarm on one side
+
+    """
+    chances = {}
+    deviation, noise = comparison.deviation, comparison.noise_deviation
+    fine = codes.step < _FINE_STEP_NOISE_RATIO * noise
+    for sign in (1.0, -1.0):
+        values, counts = ((codes.values, codes.counts) if sign > 0.0
+                          else (-codes.values[::-1], codes.counts[::-1]))
+        extreme, step = values[-1], float(local_code_steps(codes, sign * values[-1:])[0])
+        # the chance of as many samples at the last code, if the density falls towards it
+        reach = max(4.0 * step, 0.05 * noise)
+        near = int(counts[:-1][values[:-1] > extreme - reach - 0.5 * step].sum())
+        chance = float(stats.binom.sf(counts[-1] - 2, counts[-1] - 1 + near,
+                                      1.0 / (min(reach / step, 1e6) + 1.0)))
+        if chance >= level or extreme <= _rest_rate_limit(comparison.output):
+            continue
+        at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
+        expected = (np.array([]) if comparison.expected is None
+                    else sign * comparison.expected[at_extreme])
+        beyond = (float(np.nanmedian(expected)) - extreme if np.isfinite(expected).any()
+                  else -math.inf)
+        # The expected output errs by bias wander and nonlinearity, which these samples share.
+        if (beyond > (-3.0 * deviation if fine else 0.5 * codes.step + 2.0 * deviation)
+                or fine and len(find_runs(at_extreme)) >= _MIN_LIMIT_RUNS):
+            chances[sign] = (sign * extreme, chance)
+    if not chances:
+        return None
+    return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
+                 min(chance for _, chance in chances.values()))
+
+
+# repeated samples
+
+@dataclass(frozen=True)
+class SampleFault:
+    """
+    Faulty samples.
+
+    Attributes
+    ----------
+    is_faulty : mask of the samples, shape (n,)
+    p_value : of their number, or of the length of a run
+    size : expected number of repeats by codes and noise, at most; or the largest deviation of
+        outliers in standard deviations
+
+    """
+
+    is_faulty: Mask
+    p_value: float
+    size: float
+
+
+def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
+                          band: DeadBand | None, valid: Mask, level: float) -> SampleFault | None:
+    """
+    Find repeated samples, or return None.
+
+    Parameters
+    ----------
+    comparison : output and expectation
+    codes : of the output
+    band : of rates that the output has one value for, if it has one
+    valid : samples to look at; the codes explain repeats at a limit
+    level : chance of a false alarm
+
+    """
+    known, change = valid[1:] & valid[:-1], np.diff(comparison.output)
+    same = (change == 0.0) & known
+    expected = (np.zeros(len(change)) if comparison.expected is None
+                else np.nan_to_num(np.diff(comparison.expected)))
+    if not same.any():
+        return None
+    width = local_code_steps(codes, comparison.output[:-1])
+    chance = _repeat_chances(change, expected, width, known)
+    if band is not None:  # a sample in it repeats while the next is due in it
+        within = band.contains(comparison.output[:-1])
+        chance = np.where(
+            within, np.maximum(chance, band.membership_chance(comparison)[1:]), chance)
+        width = np.where(within, 2.0 * band.half_width, width)
+    repeats, p_value = np.zeros(len(valid), dtype=bool), 1.0
+    rare = (chance < _COARSE_REPEAT_CHANCE) & known
+    excess, expected_count = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
+    by_number = float(stats.poisson.sf(excess - 1, expected_count))
+    if by_number < level and excess > 1.5 * expected_count:
+        repeats[1:], p_value = same & (chance < _RARE_REPEAT_CHANCE), by_number
+    product, travel = (np.concatenate([[0.0], np.cumsum(each)])
+                       for each in (np.log(np.maximum(chance, 1e-12)), expected))
+    for run in find_runs(same):
+        if run.stop - run.start < 2:
+            continue
+        if chance[run].max() < _COARSE_REPEAT_CHANCE:
+            unlikely = math.exp(max(product[run.stop] - product[run.start], -700.0))
+        else:
+            # Repeats of a coarse code depend on each other: a fault only if it should have left.
+            left = abs(travel[run.stop] - travel[run.start]) - width[run.start]
+            unlikely = float(2.0 * stats.norm.sf(
+                left / (math.sqrt(2.0) * comparison.deviation))) if left > 0.0 else 1.0
+        if unlikely * len(valid) < level:
+            repeats[run.start + 1:run.stop + 1] = True
+            p_value = min(p_value, unlikely * len(valid))
+    return SampleFault(repeats, p_value, float(chance[known].sum())) if repeats.any() else None
+
+
+def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) -> Array:
+    """
+    Return an upper bound of the probability of each repeat, shape (n - 1,).
+
+    That of a change by less than a step for the scatter of changes of similar expectation, and no
+    less than the share of changes by one code or two, each way.
+
+    """
+    chances, classes = np.ones(len(change)), motion_classes(np.abs(expected))
+    for each in np.unique(classes):
+        members = np.flatnonzero((classes == each) & known)
+        if len(members):
+            due, steps, size = expected[members], step[members], np.abs(change[members])
+            # zeros count: with many, the codes are coarse
+            scale = np.maximum(_robust_quantile(np.abs(change[members] - due)), 1e-9 * steps)
+            count = np.count_nonzero((size > 0.5 * steps) & (size < 2.5 * steps))
+            chances[members] = np.maximum(
+                ndtr((steps - due) / scale) - ndtr((-steps - due) / scale),
+                (count + 2.0 * np.sqrt(count)) / 4.0 / len(size))
+    return chances
+
+
+def motion_classes(motion: Array) -> NDArray[np.intp]:
+    """Return the class of each sample, with as many samples in each class, by its motion."""
+    edges = np.quantile(motion, np.linspace(0.0, 1.0, _MOTION_CLASSES + 1)[1:-1])
+    return np.searchsorted(np.unique(edges), motion, side='left')
+
+
+def _robust_quantile(off: Array) -> float:
+    """Return a robust standard deviation of magnitudes."""
+    return float(np.quantile(off, 0.6827)) if off.size else 0.0
+
+
+# outliers
+
+def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
+                  level: float) -> SampleFault | None:
+    """
+    Find outliers, or return None.
+
+    Parameters
+    ----------
+    comparison : output and expectation
+    valid : samples that count; next to three and more of six that do not, as after a run of
+        repeats, one is not tested
+    min_scatter : the scatter is at least this, rad/s: half a code
+    level : chance of a false alarm
+
+    """
+    output = bridge_gaps(np.where(valid, comparison.output, np.nan))
+    limit = max(_MIN_OUTLIER_SIGMAS, float(stats.norm.isf(0.25 * level / len(output))))
+    # how much the output is expected to change about each sample, and how far it jumps
+    expected_change = jumps = np.zeros(len(output))
+    if comparison.expected is not None and np.isfinite(comparison.expected).any():
+        expected = bridge_gaps(comparison.expected)
+        output = output - expected
+        padded = np.pad(expected, 2 * NEIGHBOURS_PER_SIDE, mode='edge')
+        expected_change = np.ptp(sliding_window_view(padded, 4 * NEIGHBOURS_PER_SIDE + 1), axis=1)
+        jumps = maximum_filter1d(_distance_to_median(expected), 2 * _JOLT_SAMPLES + 1)
+    off = _distance_to_median(output)
+    sigmas = _outlier_sigmas(output, off, expected_change, valid, min_scatter)
+    # near a jump of the reference of half the size: a jolt, or the reference is outlying
+    sigmas[jumps > 0.5 * off] = 0.0
+    missing = np.count_nonzero(_neighbour_samples(~valid), axis=1)
+    tested = valid & (missing < NEIGHBOURS_PER_SIDE)
+    outlying = (sigmas > limit) & tested
+    for run in find_runs(outlying):
+        outlying[run] = run.stop - run.start <= _MAX_OUTLIER_RUN
+    count = int(np.count_nonzero(outlying))
+    near = int(np.count_nonzero((sigmas > _NEAR_OUTLIER_SIGMAS) & (sigmas <= limit) & tested))
+    usual = stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_NEAR_OUTLIER_SIGMAS))
+    if not count or near > 0.5 * count + usual:
+        return None
+    p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
+    return (SampleFault(outlying, p_value, float(sigmas[outlying].max())) if p_value < level
+            else None)
+
+
+def _neighbour_samples(values: Array | Mask) -> Array:
+    """Return the samples before and after each one, the next six at the ends, shape (n, 6)."""
+    size, place = 2 * NEIGHBOURS_PER_SIDE + 1, np.arange(len(values))
+    first = np.clip(place - NEIGHBOURS_PER_SIDE, 0, len(values) - size)
+    window = sliding_window_view(values, size)[first]
+    return window[np.arange(size) != (place - first)[:, None]].reshape(-1, size - 1)
+
+
+def _distance_to_median(values: Array) -> Array:
+    """Return how far each sample is from the median of its neighbours."""
+    return np.abs(values - np.median(_neighbour_samples(values), axis=1))
+
+
+def _outlier_sigmas(values: Array, off: Array, expected_change: Array, valid: Mask,
+                    min_scatter: float) -> Array:
+    """Return distances from neighbours in standard deviations, local ones and those by motion."""
+    near = _neighbour_samples(values)
+    # A step, a corner or a steep slope is off the median, but within the range of its neighbours.
+    outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
+    blocks = max(1, len(off) // _SCATTER_BLOCK_SAMPLES)
+    parts, kept = np.array_split(off, blocks), np.array_split(valid, blocks)
+    of_blocks = [_robust_quantile(part[own]) for part, own in zip(parts, kept)]
+    local = np.repeat(maximum_filter1d(of_blocks, 3, mode='nearest'),
+                      [len(part) for part in parts])
+    by_motion, classes = np.zeros(len(off)), motion_classes(expected_change)
+    for each in np.unique(classes):
+        members = off[(classes == each) & valid]
+        # by far ones too if there are enough, for rough motion
+        by_motion[classes == each] = max(
+            [_robust_quantile(members),
+             *(np.quantile(members, 1.0 - share) / stats.norm.isf(0.5 * share)
+               for share in (0.05, 0.01) if share * members.size > 5)])
+    scale = np.maximum(np.maximum(local, by_motion), max(min_scatter, 1e-300))
+    return np.where(outside > 0.5 * off, off / scale, 0.0)
+
+
+# the record
 
 @dataclass(frozen=True)
 class DataQuality:
@@ -140,9 +483,9 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
         return found
     found = _check_stamps(found, log, has_output)
     found = _check_reference(found, log)
-    line = None if line is None else LineFit(line.factor * factor, line.offset * factor,
-                                             line.deviation * abs(factor))
-    return _check_samples(found, output * factor, rate, line, model, has_output, log)
+    expected = (None if rate is None or line is None
+                else factor * (line.factor * rate + line.offset))
+    return _check_samples(found, compare_output(output * factor, expected), has_output, model, log)
 
 
 def resolve_unit(quality: DataQuality) -> DataQuality:
@@ -178,8 +521,7 @@ def _check_stamps(found: DataQuality, log: Log, has_output: Mask) -> DataQuality
     except DataRefused as refused:
         return replace(found, remarks=(*found.remarks, *remarks,
                                        f'Lost samples cannot be counted: {refused}.'))
-    found = replace(found, remarks=(*found.remarks, *remarks, *stamps.burst_remarks,
-                                    *_interval_drift_remarks(stamps)))
+    found = replace(found, remarks=(*found.remarks, *remarks, *stamps.burst_remarks))
     lost, steps = stamps.lost_after, np.diff(stamps.time)
     if not lost.any():
         return found
@@ -190,24 +532,6 @@ def _check_stamps(found: DataQuality, log: Log, has_output: Mask) -> DataQuality
         found, findings=(*found.findings,
                          _sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
                                         stamps.loss_remarks[0].rstrip('.'))))
-
-
-def _interval_drift_remarks(stamps: StampGrid) -> Iterator[str]:
-    """Give a remark if the interval differs between the ends of the log by more than jitter."""
-    number = np.arange(len(stamps.time)) + np.concatenate([[0], np.cumsum(stamps.lost_after)])
-    third = len(number) // 3
-    if third < 30:
-        return
-    intervals, deviations = [], []
-    for part in (slice(0, third), slice(-third, None)):
-        line = np.polyfit(number[part], stamps.time[part] - stamps.time[part][0], 1)
-        off = np.std(stamps.time[part] - stamps.time[part][0] - np.polyval(line, number[part]))
-        intervals.append(line[0])
-        deviations.append(off / np.ptp(number[part]))
-    change = intervals[1] / intervals[0] - 1.0
-    if abs(change) > max(1e-5, 6.0 * np.hypot(*deviations) / stamps.interval):
-        yield (f'The interval of the samples changes by {1e6 * change:+.0f} ppm from the first to '
-               'the last third of the log.')
 
 
 def _check_reference(found: DataQuality, log: Log) -> DataQuality:
@@ -225,16 +549,6 @@ def _check_reference(found: DataQuality, log: Log) -> DataQuality:
                    remarks=(*found.remarks, *note))
 
 
-def encoder_step(heading: Array) -> float:
-    """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
-    known = heading[np.isfinite(heading)]
-    step = find_codes(known).step
-    change = np.diff(known)
-    changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
-                          for each in (change, np.diff(change, 2)))
-    return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
-
-
 def update_interval(time: Array, values: Array, step: float) -> float | None:
     """Return the interval between updates of a held reference, s; None if each sample is new."""
     change = np.diff(values)
@@ -249,28 +563,31 @@ def update_interval(time: Array, values: Array, step: float) -> float | None:
     return float(gaps[regular].mean() * np.median(np.diff(time))) if regular.mean() > 0.8 else None
 
 
-def _check_samples(found: DataQuality, output: Array, rate: Array | None, line: LineFit | None,
-                   model: GyroModel | None, has_output: Mask, log: Log) -> DataQuality:
+def _check_samples(found: DataQuality, comparison: OutputComparison, has_output: Mask,
+                   model: GyroModel | None, log: Log) -> DataQuality:
     """Check the samples of the gyro for quantization, limits, repeats and outliers."""
-    codes, comparison = find_codes(output[has_output]), compare_output(output, rate, line)
+    codes, output = find_codes(comparison.output[has_output]), comparison.output
     limit = find_limit(codes, comparison, FALSE_ALARM_CHANCE)
     at_limit = (np.zeros(len(output), dtype=bool) if limit is None
-                else limit.is_reached(comparison.output))
-    valid, band = has_output & ~at_limit, find_dead_band(codes, comparison.output)
+                else limit.is_reached(output))
+    valid, band = has_output & ~at_limit, find_dead_band(codes, output)
     repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
-    if repeated is not None and repeated.includes_limit_run(at_limit):
+    limit_runs = find_runs(at_limit)
+    if repeated is not None and len(limit_runs) == 1 and np.count_nonzero(at_limit) - 1 <= 2 * max(
+            run.stop - run.start for run in find_runs(repeated.is_faulty)):
+        # one run at a limit that is like the others is one of repeats
         limit, at_limit, valid = None, np.zeros_like(at_limit), has_output
         repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
-    valid = valid if repeated is None else valid & ~repeated.is_repeat
+    valid = valid if repeated is None else valid & ~repeated.is_faulty
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(
-        band.contains(comparison.output), iterations=NEIGHBOURS_PER_SIDE)
+        band.contains(output), iterations=NEIGHBOURS_PER_SIDE)
     outlying = find_outliers(comparison, tested, 0.5 * codes.step, FALSE_ALARM_CHANCE)
-    valid = valid if outlying is None else valid & ~outlying.is_outlier
+    valid = valid if outlying is None else valid & ~outlying.is_faulty
     away_from_limit = np.ones(len(output), dtype=bool)
     if limit is not None and comparison.expected is not None:
         # by the expected output: a selection by the measured output would be biased by its noise
-        near = _LIMIT_MARGIN_SIGMAS * max(comparison.noise_deviation, comparison.scatter)
+        near = _LIMIT_MARGIN_SIGMAS * comparison.deviation
         away_from_limit = ~(
             (comparison.expected > limit.high - near) | (comparison.expected < limit.low + near))
     findings = (*found.findings, *_code_findings(codes, comparison, limit, at_limit, model),
@@ -308,23 +625,23 @@ def _code_findings(codes: QuantizationCodes, comparison: OutputComparison, limit
                              f'{" or ".join(sides)}')
 
 
-def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None, log: Log,
+def _sample_findings(repeated: SampleFault | None, outlying: SampleFault | None, log: Log,
                      reference_step: float, noise_deviation: float) -> Iterator[Finding]:
     """Give repeated samples, outliers, and the step of the reference if it adds much variance."""
     assert log.time is not None
     if repeated is not None:
-        count = int(np.count_nonzero(repeated.is_repeat))
-        first = log.time[int(np.argmax(repeated.is_repeat))]
+        count, runs = int(np.count_nonzero(repeated.is_faulty)), find_runs(repeated.is_faulty)
+        first = log.time[int(np.argmax(repeated.is_faulty))]
         yield _sized_finding('stuck_samples', count, 0.0, repeated.p_value,
-                             f'{count} samples in {repeated.run_count} runs repeat the one '
+                             f'{count} samples in {len(runs)} runs repeat the one '
                              f'before, the first at {first:.3f} s; codes and noise explain '
-                             f'{repeated.expected_count:.2g} repeats in the whole log')
+                             f'at most {repeated.size:.2g} repeats in the whole log')
     if outlying is not None:
-        count = int(np.count_nonzero(outlying.is_outlier))
-        first = log.time[int(np.argmax(outlying.is_outlier))]
+        count = int(np.count_nonzero(outlying.is_faulty))
+        first = log.time[int(np.argmax(outlying.is_faulty))]
         yield _sized_finding('outliers', count, 0.0, outlying.p_value,
                              f'{count} single samples differ from their neighbours by up to '
-                             f'{outlying.largest_sigmas:.0f} sigma, the first at {first:.3f} s')
+                             f'{outlying.size:.0f} sigma, the first at {first:.3f} s')
     interval = float(np.median(np.diff(log.time)))
     noise = interval * noise_deviation
     if reference_step and (
@@ -335,242 +652,3 @@ def _sample_findings(repeated: RepeatedSamples | None, outlying: Outliers | None
                              'uncertain by '
                              f'{reference_step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, '
                              f'where the gyro has {noise_deviation / DEGREE:.3g} deg/s of noise')
-
-
-# the kind of the reference
-
-REFERENCE_KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro',
-                   'rest')
-#: Span over which the errors of gyro and reference are compared, s, and least ratio of the errors
-#: of a course to the noise of the gyro, also for a course that is straight between fixes (measured
-#: in drives: 4.6 to 920, all below 8 on straight lines between fixes; simulated odometry with
-#: noise up to 0.02 deg: up to 5).
-_COMPARISON_SPAN, _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 1.0, 8.0, 2.0
-#: Largest noise of an exact reference rate as a share of that of the gyro: it adds 1e-4 to the
-#: variance, which logs of up to 2e8 samples do not show. Largest error of an exact reference
-#: heading as a share of the difference of the headings over a second: a fifth of its variance.
-_MAX_RATE_NOISE_SHARE, _MAX_HEADING_ERROR_SHARE = 0.01, 0.25
-#: Largest ratio of the error of an encoder heading to its rounding error. The treatment of exact
-#: references takes rounding for white noise; but it is constant at rest, and jumps by up to a step
-#: when the motion resumes. Largest step, rad, at which this causes no false slips (bench: 0.0055
-#: deg, 50 Hz).
-_MAX_ROUNDING_RATIO, _FINE_ENCODER_STEP = 1.5, 0.01 * DEGREE
-#: Largest `_evenness` of a motion for which an encoder is taken as exact.
-_MAX_EVENNESS = 0.5
-#: Largest number of tones, and the probability of each in noise alone.
-_MAX_TONES, _TONE_CHANCE = 10, 1e-6
-#: Numerical error of a heading, rad.
-_NUMERICAL_ERROR = 1e-9
-#: Neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
-#: random walk, and of -0.5 for its integral, which is as smooth as a motion.
-_WHITE_CORRELATION_RATIO = -0.5
-#: Noise of a reference rate that is not white is detected from so many standard deviations on, in
-#: this quietest share of the log, in blocks of so many samples.
-_DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
-#: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
-#: straight between fixes.
-_MAX_STRAIGHT_RATIO = 0.1
-
-
-def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
-    """Return the kind of the reference of a log: as stated, or found from the log."""
-    if stated_kind is not None:
-        return Reference(stated_kind, 'as given')
-    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        return Reference('rate_command', 'the log has a reference rate')
-    heading = log.reference_heading
-    if heading is None or not np.isfinite(heading).any():
-        return Reference('rest', 'the log has no reference')
-    lost = float(find_lost_reference(np.isfinite(heading)).mean())
-    if lost > MIN_LOST_SHARE and _is_course(log):
-        return Reference('course', f'the heading is lost for {100.0 * lost:.2g} % of the log, as '
-                         'for a course at low speed, and its errors exceed those of the gyro')
-    if step := encoder_step(heading):
-        return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
-    return Reference('motion_capture', 'the heading has no steps')
-
-
-def _is_course(log: Log) -> bool:
-    """Tell whether the errors of a heading are as large as those of a course over ground."""
-    assert log.time is not None and log.output is not None and log.reference_heading is not None
-    walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
-    bent = np.abs(np.diff(log.reference_heading, 2))
-    # a heading between slower fixes lies on straight lines
-    usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = _FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large else _COURSE_NOISE_RATIO
-    return heading_difference(replace(log, reference_rate=None)).total_walk > larger * walk > 0.0
-
-
-def is_reference_limiting(log: Log, reference: Reference) -> bool:
-    """Tell whether the errors of the reference, not those of the gyro, limit a diagnosis."""
-    if log.time is None or log.output is None or reference.kind == 'rest':
-        return False
-    if reference.kind == 'rate_command' or log.reference_heading is None:
-        return log.reference_rate is not None and (rate_noise_share(log) > _MAX_RATE_NOISE_SHARE
-                                                   or heading_difference(log).is_significant)
-    if reference.kind == 'course' or reference.evidence == 'as given':
-        return True
-    errors, step = heading_difference(log), encoder_step(log.reference_heading)
-    # the rounding error of an encoder does not show while its shaft rests
-    rounding = step / math.sqrt(12.0)
-    interval = float(np.median(np.diff(log.time)))
-    rate_rounding = math.sqrt(2.0) * rounding / interval
-    if (rate_rounding > _MAX_RATE_NOISE_SHARE * white_noise_deviation(log.output)
-            and _evenness(log, step) > _MAX_EVENNESS):
-        return True
-    if not (errors.is_significant or replace(errors, constant_error=rounding).is_significant):
-        return False
-    return (reference.kind != 'encoder' or step > _FINE_ENCODER_STEP
-            or errors.constant_error > _MAX_ROUNDING_RATIO * rounding)
-
-
-def _evenness(log: Log, step: float) -> float:
-    """
-    Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
-
-    Rounding errors are independent from sample to sample if the rate varies. At a constant rate
-    they are a sawtooth, which passes for tones, and at rest they are constant.
-
-    """
-    assert log.time is not None and log.output is not None
-    interval = float(np.median(np.diff(log.time)))
-    # means over a fifth of a second, as the noise of single samples is too large
-    rate = uniform_filter1d(bridge_gaps(log.output),
-                            max(round(0.2 * _COMPARISON_SPAN / interval), 5))
-    count = max(round(2.0 * _COMPARISON_SPAN / interval), _BLOCK_SAMPLES)
-    blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
-    if not len(blocks):
-        return 1.0
-    return float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2))
-
-
-@dataclass(frozen=True)
-class HeadingDifference:
-    """
-    Difference of the headings of gyro and reference over a second.
-
-    Attributes
-    ----------
-    constant_error : standard deviation of the part that does not grow with time, rad: errors of
-        the reference, of stamps, or by vibration of the gyro
-    walk : angle random walk of the rest, at most that of the white noise of the gyro, rad/√s
-    total_walk : angle random walk that is equivalent to the whole difference in a second, rad/√s
-
-    """
-
-    constant_error: float
-    walk: float
-    total_walk: float
-
-    @property
-    def is_significant(self) -> bool:
-        """Tell whether the error is a significant part of the difference over a second."""
-        return (self.constant_error > max(_MAX_HEADING_ERROR_SHARE * self.total_walk,
-                                          _NUMERICAL_ERROR))
-
-
-def heading_difference(log: Log) -> HeadingDifference:
-    """
-    Separate the difference of the headings of gyro and reference by its growth over time.
-
-    Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    a lag and a scale factor of the motion are fitted. An error that was smoothed shows at lags
-    beyond its time constant.
-
-    """
-    assert log.time is not None and log.output is not None
-    interval, output = float(np.median(np.diff(log.time))), bridge_gaps(log.output)
-    turned, heading = integrate_with_curvature(log.time, output), log.reference_heading
-    slope = np.gradient(output, log.time)
-    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        rate = bridge_gaps(log.reference_rate)
-        motion = np.column_stack([output, slope, np.ones(len(output))])
-        heading = integrate_with_curvature(log.time, rate + _fit_tones(output - rate, motion))
-    assert heading is not None
-    longest = max(round(_COMPARISON_SPAN / interval), 4)
-    variance = {}
-    for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
-        off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
-                         for each in (heading - turned, turned, output, slope))
-        known = np.isfinite(off)
-        if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
-            columns = np.column_stack(motions)[known]
-            left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
-            variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
-                                       / float(stats.norm.isf(0.05))) ** 2
-    whole = variance.pop(1.0, 0.0)
-    error = max(((each - part * whole) / (6.0 * (1.0 - part)) for part, each in variance.items()),
-                default=0.0)
-    error = max(error, 0.0)
-    white = white_noise_deviation(log.output) * math.sqrt(interval)
-    walk = math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _COMPARISON_SPAN))
-    return HeadingDifference(math.sqrt(error), min(white, walk),
-                             math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
-
-
-def _fit_tones(difference: Array, motion: Array) -> Array:
-    """Return the tones in the difference of gyro and reference rate, shape (n,)."""
-    residual = difference - motion @ np.linalg.lstsq(motion, difference, rcond=None)[0]
-    count, tones = len(residual), np.zeros(len(residual))
-    for _ in range(_MAX_TONES):
-        power = np.abs(np.fft.rfft(residual, 2 * count)) ** 2
-        best = _BLOCK_SAMPLES + int(power[_BLOCK_SAMPLES:-2].argmax())
-        level = float(np.median(power[max(best - 100, 0):best + 100])) / math.log(2.0)
-        if power[best] < level * math.log(count / _TONE_CHANCE):
-            break
-        low, high = (float(np.sqrt(power[best + side])) for side in (-1, 1))
-        place = best + 0.5 * (low - high) / (low - 2.0 * float(np.sqrt(power[best])) + high)
-        phase = math.pi * place / count * np.arange(count)
-        wave = np.column_stack([np.cos(phase), np.sin(phase)])
-        tone = wave @ np.linalg.lstsq(wave, residual, rcond=None)[0]
-        residual, tones = residual - tone, tones + tone
-    return tones
-
-
-def rate_noise_share(log: Log) -> float:
-    """
-    Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
-
-    It is estimated where the reference is quietest. White noise is detected by third differences
-    of alternating sign, other noise by changes from sample to sample that the gyro does not show.
-
-    """
-    assert log.output is not None and log.reference_rate is not None
-    known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
-    rate, output = log.reference_rate[known], log.output[known]
-    if len(rate) < 100 or not np.ptp(rate) > 0.0:
-        return 0.0
-    line = np.polyfit(rate, output, 1)
-    every, rest = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
-    # a quick swing may have no three blocks in a row without a reversal, but as many half as long
-    fast = left = every[:0]
-    for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
-        quiet = _select_quietest(every, block)
-        part = every[:len(quiet)][quiet]
-        if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
-            fast, left = part, rest[:len(quiet)][quiet]
-    if not len(fast):
-        return 0.0
-    energy_of_fast = float(fast @ fast)
-    variance = energy_of_fast / len(fast) / 20.0
-    if not (variance > 0.0
-            and float(fast[1:] @ fast[:-1]) < _WHITE_CORRELATION_RATIO * energy_of_fast):
-        product = -fast * left / 20.0
-        # third differences of white noise are correlated over three samples
-        deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
-        variance = float(np.mean(product)) / line[0]
-        if not variance > _DETECTION_SIGMAS * deviation:
-            return 0.0
-    gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
-    return math.sqrt(variance / max(gyro, 1e-3 * variance))
-
-
-def _select_quietest(fast: Array, block: int) -> Mask:
-    """Tell which third differences of a rate are in the quietest blocks."""
-    blocks = len(fast) // block
-    energy = np.sum(fast[:blocks * block].reshape(blocks, block) ** 2, axis=1)
-    # selected by the blocks on both sides, as a block that is quiet itself may be so by chance;
-    # one with far more energy than these is a motion between two rests
-    sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
-    most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
-    return np.asarray(np.repeat((sides <= most) & (energy <= 3.0 * most), block))

@@ -28,16 +28,17 @@ import math
 
 from gyro_calibration.diagnosis.candidates import MIN_CHANNEL_RANGE, user_effects
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, mark_suspected
-from gyro_calibration.diagnosis.cross_validation import (
+from gyro_calibration.diagnosis.data_quality import inspect_record
+from gyro_calibration.diagnosis.extended_model import (
+    add_terms,
     gain_from_squares,
     heading_curve,
     heading_error_shares,
     HEADING_WINDOW,
     MAX_WINDOW_SHARE,
+    previous_origins,
     window_changes,
 )
-from gyro_calibration.diagnosis.data_quality import inspect_record
-from gyro_calibration.diagnosis.extended_model import add_terms, previous_origins
 from gyro_calibration.diagnosis.findings import (
     Curve,
     Diagnosis,

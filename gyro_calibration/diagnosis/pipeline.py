@@ -15,13 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 import math
 
+from gyro_calibration.calibration.dwells.samples import require_output
 from gyro_calibration.diagnosis.candidates import (
     common_channels,
     constant_channels,
-    fitted_shape_indices,
     is_named,
     observed_range,
     unnamed_variable,
@@ -34,20 +33,20 @@ from gyro_calibration.diagnosis.causes import (
     next_experiment,
     REFERENCES,
 )
-from gyro_calibration.diagnosis.cross_validation import heading_error_shares, measure_gain
-from gyro_calibration.diagnosis.data_quality import (
+from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, resolve_unit
+from gyro_calibration.diagnosis.expected_output import (
     classify_reference,
-    DataQuality,
-    inspect_record,
+    identify_sample_offset,
     is_reference_limiting,
-    resolve_unit,
 )
-from gyro_calibration.diagnosis.expected_output import identify_sample_offset
 from gyro_calibration.diagnosis.extended_model import (
     add_causes,
     add_origin_notes,
     extend_model,
+    heading_contributions,
+    heading_error_shares,
     is_scale_implausible,
+    measure_gain,
     merge_self_calibration,
     unmergeable_causes,
 )
@@ -69,10 +68,10 @@ from gyro_calibration.diagnosis.gates import (
 )
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.regression import (
-    estimate_noise_levels,
+    average_filtered_noise,
     fit_causes,
-    FittedValues,
     is_single_event,
+    RegressionFit,
     SelectedCause,
     Value,
 )
@@ -85,24 +84,22 @@ from gyro_calibration.diagnosis.residuals import (
     NOISE_NAMES,
     NoiseParameters,
     residual_curves,
-    unbiased_residuals,
 )
 from gyro_calibration.diagnosis.search import (
+    Causes,
+    choose_simplest,
     complexity_penalty,
-    eliminate_backward,
+    confirm,
     evidence_for,
-    find_alternatives,
     find_suspected,
-    held_out_sigmas,
     is_lasting,
-    MAX_PER_LOG,
     MAX_SLIPS,
-    MIN_PREDICTION_SIGMAS,
     refine_jointly,
-    remove_weakest,
     Search,
     search_causes,
     start_search,
+    UNPREDICTIVE,
+    withdraw_names,
 )
 from gyro_calibration.diagnosis.steps import CHECKS_STEP, OnProgress, ProgressSteps
 from gyro_calibration.diagnosis.words import format_amount
@@ -111,40 +108,27 @@ from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 #: Shares of the false-alarm rate: for the search for causes, for each noise figure, and for bias
 #: and scale factor error each.
 _SEARCH_ALARM_SHARE, _NOISE_ALARM_SHARE, _BIAS_ALARM_SHARE = 0.6, 0.03, 0.05
-#: Largest effect along the rate that is named, as a share of the largest rate.
-_MAX_RELATIVE_EFFECT = 0.5
-#: Probability of the differences between logs below which a cause does not repeat.
-_MIN_REPEAT_CHANCE = 1e-3
-#: Variables whose causes are named only if they have the same size in all logs.
-_REPEATING_VARIABLES = frozenset({'temperature', 'temperature_rate'})
 #: Probability that an effect of the minimum detectable size is found.
 _DETECTION_POWER = 0.95
 #: Names of the shape parameters of causes that are not effects of the catalogue.
 _SHAPE_NAMES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MAX_SLIPS)))}
 _SINGLE_EVENT_REMEDY = 'find its cause; it occurs in this log alone, and is not added to the model'
-#: Why a constant channel shows no cause, and the variable that is derived from the channel.
+#: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
                      'specific_force': 'the specific force does not change'}
-_DERIVED_VARIABLES = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
-#: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
-_STEP_SHARES = {
-    CHECKS_STEP: 1,
-    'data quality': 1,
-    'replay of the model': 1,
-    'search for causes': 78,
-    'alternatives': 11,
-    'noise figures': 1,
-    'cross-validation': 3,
-    'findings': 4}
+#: Shares of the steps in the computing time, %.
+_STEP_SHARES = {**dict.fromkeys((CHECKS_STEP, 'data quality', 'replay of the model'), 1),
+                'search for causes': 80,
+                **dict.fromkeys(('alternatives', 'noise figures', 'cross-validation',
+                                 'findings'), 4)}
 
-Causes = tuple[SelectedCause, ...]
 #: A cause and its alternatives, each with its deficit in log-likelihood.
 Alternatives = Sequence[tuple[SelectedCause, float]]
 
@@ -165,8 +149,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     false_alarm_rate : false alarms per diagnosis
     names : file names of the logs, for messages
     on_progress : is called with the share of the work done and the name of the step that begins
-    reference_kind : of the reference, one of `data_quality.REFERENCE_KINDS`; None is found from
-        the log
+    reference_kind : of the reference, one of `expected_output.REFERENCE_KINDS`; None is found
+        from the log
 
     Raises
     ------
@@ -220,31 +204,33 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     steps.begin('data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
     steps.begin('replay of the model')
-    replays = [replay(_in_true_unit(log, clean.unit_factor), clean.usable, generator,
-                      clean.update_interval, clean.heading_step, clean.output_step, model)
+    replays = [replay(replace(log, output=clean.unit_factor * require_output(log)), clean.usable,
+                      generator, clean.update_interval, clean.heading_step, clean.output_step,
+                      model)
                for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
-    search, everything = _search_with_filtered_noise(replays, generator,
-                                                     _SEARCH_ALARM_SHARE * rate, steps)
-    named, unnamed = _withdraw_names(search, everything)
-    named, unconfirmed = remove_weakest(search, named, partial(held_out_sigmas, search),
-                                        MIN_PREDICTION_SIGMAS)
-    named, contradicted = remove_weakest(search, named, partial(_size_sigmas, search),
-                                         NORMAL_QUANTILE_975)
-    refuted = {**{each.candidate.cause: 'it does not predict held-out stretches'
-                  for each in unconfirmed if not is_lasting(each.candidate)},
-               **{each.candidate.cause: 'the interval of its size includes 0'
-                  for each in contradicted}}
+    search = start_search(replays, generator, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
+    everything = search_causes(search)
+    averaged = average_filtered_noise(fit_causes(search.problem, everything)).problem.replays
+    if averaged is not search.problem.replays:
+        search = start_search(averaged, generator, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
+        everything = search_causes(search)
+    named, unnamed = withdraw_names(search, everything)
+    named, removed = confirm(search, named)
+    unconfirmed = [each for each, why in removed.items()
+                   if why == UNPREDICTIVE and is_lasting(each.candidate)]
+    refuted = {each.candidate.cause: why for each, why in removed.items()
+               if each not in unconfirmed}
     steps.begin('alternatives')
-    named, sets = _choose_simplest(search, named, unnamed)
-    found = FittedValues(fit_causes(search.problem, named), search.problem.replays)
+    named, sets = choose_simplest(search, named, unnamed)
+    found = fit_causes(search.problem, named)
     out = unmergeable_causes(model or GyroModel(), found)
     steps.begin('noise figures')
     # without a model, rounding of the output counts only if it is a finding
     rounds = (any(each.effect == QUANTIZATION.name for clean in quality for each in clean.findings)
               if model is None else any(term.effect is QUANTIZATION for term in model.terms))
     simulated = Noise() if model is None else model.noise
-    figures = fit_noise_parameters(found.fit, simulated, rounds)
+    figures = fit_noise_parameters(found, simulated, rounds)
     noise = figures.noise
     steps.begin('cross-validation')
     changed = [] if model is None else _model_value_findings(found, model, noise, rate)
@@ -256,30 +242,28 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
     steps.begin('findings')
-    more = find_suspected(search, (*named, *unnamed))
     taken = {each.candidate.cause for each in named}
-    doubtful = [each for each in unconfirmed
-                if is_lasting(each.candidate) and each.candidate.cause not in taken]
-    doubtful = doubtful or ([more.causes[-1]] if more else [])
+    doubtful = (tuple(each for each in unconfirmed if each.candidate.cause not in taken)
+                or find_suspected(search, (*named, *unnamed)))
     findings = [*_cause_findings(search, found, sets, unnamed, doubtful),
                 *_record_findings(quality, changed)]
     if model is not None:
-        findings += _noise_findings(figures, model, rate, found.replays)
+        findings += _noise_findings(figures, model, rate, search.problem.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
-    inside = FittedValues(fit_causes(search.problem, [each for each in named if each not in out])
-                          if out else found.fit, found.replays, lasting_only=True)
-    plain = FittedValues(fit_causes(search.problem, []), found.replays)
+    inside = replace(fit_causes(search.problem, [each for each in named if each not in out])
+                     if out else found, lasting_only=True)
+    plain = fit_causes(search.problem, [])
     deviation = _mean_bias_deviation(inside, noise)
     best = replace(add_causes(GyroModel(), plain, deviation), noise=noise)
     before = model or add_origin_notes(best, GyroModel(), quality)
     after = extend_model(model, inside, quality, findings, noise, deviation) if offered else before
     # Curves before the extension contain the best bias and scale factor error, unless these differ
     # significantly from those of the model.
-    left = model_residuals(found.replays) if changed else unbiased_residuals(plain)
+    left = model_residuals(search.problem.replays) if changed else plain.unbiased_residuals
     shown = inside if offered else plain
     of_heading = heading_error_shares(
-        [found.heading_contributions(run, plain if model is None else None)
+        [heading_contributions(found, run, plain if model is None else None)
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
     return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
@@ -290,28 +274,21 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      rate, heading_shares=of_heading)
 
 
-def _in_true_unit(log: Log, factor: float) -> Log:
-    """Return a log with its output multiplied by a factor."""
-    return log if factor == 1.0 or log.output is None else replace(log, output=log.output * factor)
-
-
-def _cause_findings(search: Search, fit: FittedValues, alternatives_of: Sequence[Alternatives],
-                    unnamed: Sequence[SelectedCause],
-                    suspected_causes: Sequence[SelectedCause]) -> Iterator[Finding]:
+def _cause_findings(search: Search, fit: RegressionFit, alternatives_of: Sequence[Alternatives],
+                    unnamed: Causes, suspected: Causes) -> Iterator[Finding]:
     """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
     for place, (known, members) in enumerate(zip(fit.causes, alternatives_of)):
         others = [(each.candidate.cause, lack)
                   for each, lack in members if each.candidate.cause != known.candidate.cause]
         yield cause_finding(
-            search, fit, place, _cause_p_value(search, (*fit.causes, *unnamed), place), members,
-            next_experiment(known.candidate.cause, others, observed_range(fit.replays)))
-    for known in suspected_causes:
+            search, fit, place, evidence_for(search, (*fit.causes, *unnamed), place), members,
+            next_experiment(known.candidate.cause, others, observed_range(search.problem.replays)))
+    for known in suspected:
         everything = refine_jointly(search, (*fit.causes, *unnamed, known))
-        with_it = FittedValues(fit_causes(search.problem, everything), fit.replays)
         place = len(everything) - 1
-        yield mark_suspected(
-            cause_finding(search, with_it, place, _cause_p_value(search, everything, place),
-                          [(everything[-1], 0.0)], ''))
+        yield mark_suspected(cause_finding(
+            search, fit_causes(search.problem, everything), place,
+            evidence_for(search, everything, place), [(everything[-1], 0.0)], ''))
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
@@ -324,117 +301,14 @@ def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding])
     return [*best.values(), *(each for each in changed if each.effect not in covered)]
 
 
-def _cause_p_value(search: Search, causes: Sequence[SelectedCause], cause_index: int) -> float:
-    """Return the p-value of a named cause, given the others."""
-    return search.null_distribution.p_value(causes[cause_index].candidate.cause,
-                                            evidence_for(search, causes, cause_index))
-
-
-def _search_with_filtered_noise(replays: Sequence[Replay], generator: np.random.Generator,
-                                rate: float, steps: ProgressSteps) -> tuple[Search, Causes]:
-    """Search for causes, and repeat it with levels for the noise if the residual is filtered."""
-    search = start_search(replays, generator, rate, steps.begin_part)
-    causes = search_causes(search)
-    as_filtered = estimate_noise_levels(fit_causes(search.problem, causes))
-    if as_filtered is search.problem.replays:
-        return search, causes
-    search = start_search(as_filtered, generator, rate, steps.begin_part)
-    return search, search_causes(search)
-
-
-def _withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
-    """
-    Separate named causes from structure without a name.
-
-    A name is withdrawn if structure without a name lies along the same variable, if there are many
-    tones, or if a cause along a temperature differs between logs.
-
-    """
-    exceeded_variables = {name for each in causes if not is_named(each.candidate)
-                          for name in unnamed_variable(each.candidate).split(' and ')}
-    tones = [each.candidate.log_index for each in causes
-             if each.candidate.cause == 'interference_tone']
-    if any(tones.count(run) >= MAX_PER_LOG['interference_tone'] for run in tones):
-        exceeded_variables.add('frequency')
-    kept = tuple(each for each in causes if is_named(each.candidate)
-                 and CAUSES[each.candidate.cause].along not in exceeded_variables)
-    fastest = max(float(np.abs(each.channels.rate).max()) for each in search.problem.replays)
-
-    def is_small(known: SelectedCause) -> bool:
-        """Tell whether an effect along the rate is small compared with the rate."""
-        return (CAUSES[known.candidate.cause].along != 'rate'
-                or known.candidate.amplitude is not None
-                or all(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)),
-                                           1)).max() < _MAX_RELATIVE_EFFECT * fastest
-                       for each in search.problem.replays))
-
-    kept = tuple(each for each in kept if _is_repeatable(search, causes, each) and is_small(each))
-    unnamed = tuple(each for each in causes if each not in kept)
-    if not unnamed:
-        return kept, ()
-    variables = {unnamed_variable(each.candidate) for each in unnamed
-                 if not is_named(each.candidate)}
-    rest = tuple(each for each in unnamed if not is_named(each.candidate)
-                 or CAUSES[each.candidate.cause].along not in variables)
-    left = eliminate_backward(search, refine_jointly(search, (*kept, *rest)))
-    keys = {(each.candidate.cause, each.candidate.log_index) for each in kept}
-    return tuple(each for each in left
-                 if (each.candidate.cause, each.candidate.log_index) in keys), rest
-
-
-def _size_sigmas(search: Search, causes: Causes) -> list[float]:
-    """Return the distance of the size of each cause from 0 in standard deviations."""
-    found, sigmas = FittedValues(fit_causes(search.problem, causes), search.problem.replays), []
-    for place, known in enumerate(causes):
-        sizes = found.coefficients(place) or list(found.shapes(place).values())
-        # sine or cosine alone may be 0 for a wave that is not
-        wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
-        sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
-                      else abs(sizes[0].value) / sizes[0].deviation)
-    return sigmas
-
-
-def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool:
-    """Tell whether a cause along a temperature has the same size in all logs within the noise."""
-    candidate, runs = cause.candidate, len(search.problem.replays)
-    if (runs == 1 or CAUSES[candidate.cause].along not in _REPEATING_VARIABLES or not cause.values
-            or candidate.amplitude is not None):
-        return True
-    alone = [replace(candidate, log_index=run) for run in range(runs - 1)]
-    more = 2.0 * (fit_causes(search.problem, causes, alone).log_likelihood
-                  - fit_causes(search.problem, causes).log_likelihood)
-    return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
-
-
-def _choose_simplest(search: Search, named: Causes,
-                     unnamed: Causes) -> tuple[Causes, list[Alternatives]]:
-    """Replace each cause by its simplest alternative, and return the alternatives of each."""
-    def size(known: SelectedCause) -> int:
-        """Return the number of fitted values of a cause."""
-        candidate = known.candidate
-        count = len(fitted_shape_indices(candidate))
-        return (count if candidate.amplitude is not None
-                else count + len(candidate.columns(search.problem.replays[0])))
-
-    sets: list[Alternatives] = []
-    for place in range(len(named)):
-        members = find_alternatives(search, (*named, *unnamed), place) or [(named[place], 0.0)]
-        sizes = [size(each) for each, _ in members]
-        if min(sizes) < size(named[place]):
-            chosen = members[int(np.argmin(sizes))][0]
-            named = refine_jointly(search, (*named[:place], chosen, *named[place + 1:]))
-        sets.append(members)
-    return named, sets
-
-
-def _mean_bias_deviation(fit: FittedValues, noise: Noise) -> float:
+def _mean_bias_deviation(fit: RegressionFit, noise: Noise) -> float:
     """Return the standard deviation of the mean bias of the logs, rad/s."""
     each = [noise.heading_variance(replay.duration) / replay.duration ** 2
-            for replay in fit.replays]
+            for replay in fit.problem.replays]
     return float(np.sqrt(np.mean(each) / len(each) + fit.bias_variance))
 
 
-def _model_value_findings(fit: FittedValues, model: GyroModel, noise: Noise,
+def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
                           false_alarm_rate: float) -> list[Finding]:
     """Return bias and scale factor error as findings if they differ from those of the model."""
     scale, bias = fit.scale_factor_error, float(np.mean(fit.biases))
@@ -489,31 +363,26 @@ def _noise_findings(noise_parameters: NoiseParameters, model: GyroModel, false_a
 
 def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     """Return the reason for each cause that these logs cannot show."""
-    replays = search.problem.replays
+    replays, of_motion = search.problem.replays, {'reference', *REFERENCES}
     has = common_channels(replays) | {'time', 'output'}
-    of_motion = frozenset({'reference', *REFERENCES})
-    has |= (of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES)
-            else frozenset())
+    if any(getattr(log, name) is not None for log in logs for name in REFERENCES):
+        has |= of_motion
     moves = any(np.any(each.reference[each.valid] != 0.0) for each in replays)
     reasons = {}
     for name, cause in CAUSES.items():
-        missing = sorted(cause.required_channels - has)
-        if missing:
+        if missing := sorted(cause.required_channels - has):
             reasons[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
         elif not moves and cause.required_channels & of_motion:
             reasons[name] = 'the reference shows no motion'
-    quiet = {name: _CONSTANT_REASONS[name] for name in constant_channels(replays)}
-    quiet |= {other: quiet[name] for name, other in _DERIVED_VARIABLES.items() if name in quiet}
-    for name, reason in quiet.items():
-        reasons.update({cause.name: reason for cause in CAUSES.values()
-                        if cause.along == name and cause.name not in reasons})
-    alike = 'in these logs it cannot be distinguished from a bias or a scale factor error'
-    hidden = sorted(search.unidentifiable & (CAUSES.keys() - reasons.keys()))
-    reasons.update(dict.fromkeys(hidden, alike))
+        elif constant := sorted(cause.required_channels & constant_channels(replays)):
+            reasons[name] = _CONSTANT_REASONS[constant[0]]
+        elif name in search.unidentifiable:
+            reasons[name] = ('in these logs it cannot be distinguished from a bias or a scale '
+                             'factor error')
     return reasons
 
 
-def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: FittedValues,
+def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: RegressionFit,
              unnamed: Sequence[SelectedCause], refuted: Mapping[str, str],
              unmergeable: Sequence[SelectedCause], gain: Gain | None,
              model: GyroModel | None) -> Iterator[str]:
@@ -550,9 +419,9 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: FittedVa
 
 # findings
 
-def cause_finding(search: Search, fit: FittedValues, cause_index: int, p_value: float,
+def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
                   alternatives: Alternatives, separate_by: str) -> Finding:
-    """Return the finding of a named cause with its alternatives."""
+    """Return the finding of a named cause with its evidence and alternatives."""
     known = fit.causes[cause_index]
     candidate, name = known.candidate, known.candidate.cause
     parameters = _cause_parameters(fit, cause_index)
@@ -563,22 +432,24 @@ def cause_finding(search: Search, fit: FittedValues, cause_index: int, p_value: 
     size = next(iter(parameters.values()))
     deviation = size.deviation
     if name == 'time_offset' and identify_sample_offset(size.estimate, deviation,
-                                                        fit.replays[0].interval):
+                                                        fit.problem.replays[0].interval):
         confounders.append('unit_error')
     # the evidence of a size of n standard deviations is n² / 2
     evidence_threshold = (search.null_distribution.threshold(name, search.rate)
                           + complexity_penalty(known))
     detectable_sigmas = (math.sqrt(2.0 * max(evidence_threshold, 0.0))
                          + float(norm.isf(1.0 - _DETECTION_POWER)))
-    log = ('' if candidate.log_index is None or len(fit.replays) == 1
+    log = ('' if candidate.log_index is None or len(fit.problem.replays) == 1
            else f'in log {candidate.log_index + 1}, ')
     where = None
     if name == 'bias_step':
-        where = candidate.shapes[0], float(fit.replays[candidate.log_index or 0].channels.time[-1])
+        time = fit.problem.replays[candidate.log_index or 0].channels.time
+        where = candidate.shapes[0], float(time[-1])
     elif name == 'reference_slip':
         where = min(candidate.shapes[1:]), max(candidate.shapes[1:])
     return make_finding(
-        name, parameters, p_value, tuple(dict.fromkeys(confounders)),
+        name, parameters, search.null_distribution.p_value(name, evidence),
+        tuple(dict.fromkeys(confounders)),
         minimum_detectable=detectable_sigmas * deviation if deviation > 0.0 else None,
         separate_by=separate_by or (CAUSES[name].separate_by if confounders else ''),
         evidence=(f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0
@@ -586,7 +457,7 @@ def cause_finding(search: Search, fit: FittedValues, cause_index: int, p_value: 
         remedy=_SINGLE_EVENT_REMEDY if is_single_event(known) else '')
 
 
-def _cause_parameters(fit: FittedValues, cause_index: int) -> dict[str, Estimate]:
+def _cause_parameters(fit: RegressionFit, cause_index: int) -> dict[str, Estimate]:
     """Return the parameters of a cause, first the one with the name of the cause."""
     candidate = fit.causes[cause_index].candidate
     coefficients, shapes = fit.coefficients(cause_index), fit.shapes(cause_index)
@@ -617,7 +488,7 @@ def _estimate(value: Value, unit: str) -> Estimate:
     return Estimate.from_half_width(value.value, NORMAL_QUANTILE_975 * value.deviation, unit)
 
 
-def _amplitude_and_phase(fit: FittedValues, cause_index: int, name: str,
+def _amplitude_and_phase(fit: RegressionFit, cause_index: int, name: str,
                          coefficients: Sequence[Value], unit: str) -> dict[str, Estimate]:
     """Return amplitude and phase of ``sine sin + cosine cos``, with intervals by covariance."""
     sine, cosine = (value.value for value in coefficients)
@@ -631,7 +502,7 @@ def _amplitude_and_phase(fit: FittedValues, cause_index: int, name: str,
             'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
 
 
-def unexplained_structures(search: Search, fit: FittedValues,
+def unexplained_structures(search: Search, fit: RegressionFit,
                            unnamed: Sequence[SelectedCause]) -> list[Unexplained]:
     """Return the structures without a name with the share of the residual that each explains."""
     causes = (*fit.causes, *unnamed)
@@ -640,12 +511,12 @@ def unexplained_structures(search: Search, fit: FittedValues,
         name = (CAUSES[known.candidate.cause].along if is_named(known.candidate)
                 else unnamed_variable(known.candidate))
         variables.setdefault(name, []).append(len(fit.causes) + place)
-    least = _residual_variance(search, fit, causes)
-    most = _residual_variance(search, fit, fit.causes)
+    least = _residual_variance(search, causes)
+    most = _residual_variance(search, fit.causes)
     structures = []
     for name, places in variables.items():
         without = _residual_variance(
-            search, fit, [known for place, known in enumerate(causes) if place not in places])
+            search, [known for place, known in enumerate(causes) if place not in places])
         chance = min(search.null_distribution.p_value(causes[place].candidate.cause,
                                                       evidence_for(search, causes, place))
                      for place in places)
@@ -653,9 +524,8 @@ def unexplained_structures(search: Search, fit: FittedValues,
     return structures
 
 
-def _residual_variance(search: Search, fit: FittedValues,
-                       causes: Sequence[SelectedCause]) -> float:
+def _residual_variance(search: Search, causes: Sequence[SelectedCause]) -> float:
     """Return the variance of the residual of some causes at the grid points."""
-    left = FittedValues(fit_causes(search.problem, causes), fit.replays)
-    return float(np.var(np.concatenate([each.resample(rest - bias) for each, rest, bias
-                                        in zip(fit.replays, left.residuals, left.biases)])))
+    left = fit_causes(search.problem, causes).unbiased_residuals
+    return float(np.var(np.concatenate([each.resample(rest) for each, rest
+                                        in zip(search.problem.replays, left)])))

@@ -41,7 +41,6 @@ from gyro_calibration.calibration.scatter import (
 )
 from gyro_calibration.calibration.selection import fit_supported_effects, replace_effect
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding
-from gyro_calibration.diagnosis.cross_validation import gain_from_squares, HEADING_WINDOW
 from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
 from gyro_calibration.diagnosis.dwell_fit import (
     assemble_model,
@@ -60,7 +59,11 @@ from gyro_calibration.diagnosis.dwell_fit import (
     value_change,
     visible_terms,
 )
-from gyro_calibration.diagnosis.extended_model import origin_notes
+from gyro_calibration.diagnosis.extended_model import (
+    gain_from_squares,
+    HEADING_WINDOW,
+    origin_notes,
+)
 from gyro_calibration.diagnosis.findings import (
     Curve,
     Diagnosis,

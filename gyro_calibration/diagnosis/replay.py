@@ -21,7 +21,7 @@ its variance by ``(3 sin / (2 + cos))²``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 import math
 
@@ -38,17 +38,6 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
-
-#: Largest number of parts of the frequency range in which filtered noise has separate levels;
-#: least number of coefficients in each; and lowest level, which limits the weight of a part that
-#: is nearly free of noise.
-_MAX_LEVEL_PARTS, _MIN_PART_COEFFICIENTS, _MIN_NOISE_LEVEL = 32, 100, 0.003
-#: Standard deviations by which the level of filtered noise falls; the standard deviation of the
-#: logarithm of a median of n is 2.33 over root n.
-_FALL_SIGMAS, _LOG_MEDIAN_SCATTER = 4.5, 2.33
-#: Numbers of random walks, of strengths and times of Gauss-Markov processes, and of corner
-#: frequencies of flicker in `noise_grid`.
-_WALK_COUNT, _STRENGTH_COUNT, _CORRELATION_TIME_COUNT, _FLICKER_CORNER_COUNT = 14, 7, 7, 14
 
 
 @dataclass(frozen=True)
@@ -118,35 +107,6 @@ def coefficient_angles(count: int) -> Array:
     return np.arange(1, count) * math.pi / count
 
 
-def relative_part_powers(whitened: Array) -> Array:
-    """
-    Return the power in equal parts of the angle relative to the second part: shape (parts,).
-
-    The first part is set to 1, because slow noise is described by `NoiseShape`. With too few
-    coefficients there is one part.
-
-    """
-    parts = np.array_split(whitened ** 2,
-                           max(min(_MAX_LEVEL_PARTS, len(whitened) // _MIN_PART_COEFFICIENTS), 1))
-    found = np.array([part.mean() for part in parts])
-    return (np.maximum(np.concatenate([found[1:2], found[1:]]) / found[1], _MIN_NOISE_LEVEL)
-            if len(found) > 1 else np.ones(1))
-
-
-def high_frequency_power_ratio(whitened: Array) -> float:
-    """Return the power in the last quarter of the angle over the second; 1 if insignificant."""
-    _, second, _, last = (float(np.median(part ** 2)) for part in np.array_split(whitened, 4))
-    by_chance = math.exp(-_FALL_SIGMAS * _LOG_MEDIAN_SCATTER * math.sqrt(8.0 / len(whitened)))
-    return last / second if last < by_chance * second else 1.0
-
-
-def interpolate_noise_level(angle: Array, part_levels: Array) -> Array:
-    """Return the level at each angle, by lines in the logarithm between middles of parts."""
-    return np.exp(
-        np.interp(angle, (np.arange(len(part_levels)) + 0.5) * math.pi / len(part_levels),
-                  np.log(part_levels)))
-
-
 def band_starts(angle: Array, interval: float, single_bands: int = 24,
                 ratio: float = 1.12) -> Array:
     """Return the first index of each band of coefficients: the lowest alone, then by ratio."""
@@ -167,15 +127,14 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     """
     lowest = 0.02 / duration ** 2
     highest = max(1e5 * lowest, 1e-3 / interval ** 2 * 1e-3)
-    walks = [0.0, *np.geomspace(lowest, highest, _WALK_COUNT)]
-    times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0,
-                         _CORRELATION_TIME_COUNT)
+    walks = [0.0, *np.geomspace(lowest, highest, 14)]
+    times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, 7)
     # By their spectral density at frequency 0 relative to white noise.
     strong = [(ratio / (2.0 * time), time) for time in times
-              for ratio in np.geomspace(0.3, 1000.0, _STRENGTH_COUNT)]
+              for ratio in np.geomspace(0.3, 1000.0, 7)]
     plain = [NoiseShape(walk, strength, time, rounding_ratio) for walk in walks
              for strength, time in [(0.0, 1.0), *strong]]
-    corners = np.geomspace(0.1 / duration, 0.3 / interval, _FLICKER_CORNER_COUNT)
+    corners = np.geomspace(0.1 / duration, 0.3 / interval, 14)
     return plain + [NoiseShape(walk, rounding_ratio=rounding_ratio, flicker_corner=corner)
                     for walk in walks[::4] for corner in corners]
 
@@ -184,7 +143,7 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 MAX_POINTS = 50_000
 #: Ratio of the power in the last to that in the second quarter of the frequencies, below which a
 #: record was smoothed (jumps have 0.18, noise not less). Longest averaging interval for it, s.
-SMOOTHED_POWER_RATIO, _MAX_AVERAGING_TIME = 0.05, 0.03
+_SMOOTHED_POWER_RATIO, _MAX_AVERAGING_TIME = 0.05, 0.03
 #: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
 _SMOOTHING_BINS, _ROUNDING_POWER_FACTOR = 101, 1.5
 #: Update intervals of a held reference, and steps of its change, from which on a constant value is
@@ -222,7 +181,6 @@ class Replay:
     simulated_error : error of the simulated output, rad/s, shape (n,), which is subtracted from
         `channels.output`
     rounding_variance : variance of a sample by quantization of the output, (rad/s)²
-    noise_levels : of filtered white noise: see `noise_levels`
 
     """
 
@@ -237,7 +195,6 @@ class Replay:
     available_channels: frozenset[str]
     simulated_error: Array
     rounding_variance: float = 0.0
-    noise_levels: Array = field(default_factory=lambda: np.ones(1))
 
     @property
     def point_interval(self) -> float:
@@ -307,18 +264,6 @@ class Replay:
     def transform_samples(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
         return cosine_transform(self.resample(values))
-
-    def noise_level(self) -> Array:
-        """Return the level of the white noise at each coefficient, shape (points - 1,)."""
-        return interpolate_noise_level(coefficient_angles(self.point_count), self.noise_levels)
-
-    def with_scaled_noise_levels(self, factors: Array) -> Replay:
-        """Return the log with its levels multiplied by factors, as its noise for gaps."""
-        fill_transform = cosine_transform(self.fill_noise) * np.sqrt(interpolate_noise_level(
-            coefficient_angles(len(self.fill_noise)) * self.decimation, factors))
-        filling = inverse_cosine_transform(fill_transform)
-        return replace(self, noise_levels=self.noise_levels * factors,
-                       fill_noise=filling / white_noise_deviation(filling))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return the log with another rate for the effects."""
@@ -412,11 +357,10 @@ def _even_time(time: Array) -> Array:
 
 def _smoothing_decimation(base_replay: Replay) -> int:
     """
-    Return the factor of the number of points to average, so that smoothing does not show.
+    Return the factor of the number of points to average, so that strong smoothing does not show.
 
-    A gyro with averaged samples, or a smoothed reference, has hardly any noise at the highest
-    frequencies. The noises of the grid do not describe that, so that small errors of motion and
-    reference would have too much weight there.
+    Otherwise the small errors of motion and reference would have so much weight at the highest
+    frequencies that a first search would name many causes for them.
 
     """
     residual, factor, decimation = base_replay.channels.output - base_replay.reference, 1, 1
@@ -425,7 +369,7 @@ def _smoothing_decimation(base_replay: Replay) -> int:
         power = averaged.transform_samples(residual) ** 2
         _, second, _, last = (float(np.median(part)) for part in np.array_split(power, 4))
         factor *= 2
-        if last < SMOOTHED_POWER_RATIO * second:
+        if last < _SMOOTHED_POWER_RATIO * second:
             decimation = factor
     return decimation
 
@@ -561,7 +505,7 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
     bend = np.abs(np.diff(np.pad(rate, 2, mode='edge'), 4)) / 24.0
     white = white_noise_deviation((output - rate)[valid])
     sharp = maximum_filter1d(bend > _CORNER_NOISE_SHARE * white + rounding, 5)
-    rounded = rounding ** 2 / 12.0 > 0.5 * white ** 2  # most of what looks white is of the steps
+    rounded = rounding > math.sqrt(6.0) * white  # most of what looks white is of the steps
     return np.zeros_like(sharp) if rounded or sharp[valid].mean() > _MAX_CORNER_SHARE else sharp
 
 

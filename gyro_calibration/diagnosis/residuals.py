@@ -23,28 +23,26 @@ from dataclasses import dataclass, replace
 from gyro_calibration.allan import allan_deviation
 from gyro_calibration.diagnosis.candidates import common_channels
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
-from gyro_calibration.diagnosis.regression import FittedValues, RegressionFit
+from gyro_calibration.diagnosis.regression import RegressionFit
 from gyro_calibration.diagnosis.replay import (
     coefficient_angles,
     cosine_transform,
     Replay,
     spline_derivative_gain,
 )
-from gyro_calibration.logs.log import Array, Mask
+from gyro_calibration.logs.log import Array
 from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 
 NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 #: Probability that a frequency band of noise alone is rejected, per log.
 _BAND_REJECTION_CHANCE = 1e-3
-#: Bins of a curve, and points of a line over time.
-CURVE_BINS, CURVE_POINTS = 40, 600
-#: Samples of which the Allan deviation is taken.
-_MAX_ALLAN_SAMPLES = 1 << 18
+#: Bins of a curve, points of a line over time, and samples of which the Allan deviation is taken.
+CURVE_BINS, CURVE_POINTS, _MAX_ALLAN_SAMPLES = 40, 600, 1 << 18
 
 
 @dataclass(frozen=True)
@@ -66,14 +64,15 @@ class NoiseParameters:
 
 
 @dataclass(frozen=True)
-class _BandEnergies:
+class BandEnergies:
     """
     The coefficients of b bands.
 
     Attributes
     ----------
     energy, count : of each band
-    unit_variances : variance of the bands by a figure of 1, shape (b, 3) or (b, 4)
+    unit_variances : variance of the bands by a figure of 1, shape (b, 3), or (b, 4) with rounding
+        of the reference
     known_variance : variance by other noise, shape (b,)
 
     """
@@ -83,14 +82,48 @@ class _BandEnergies:
     unit_variances: Array
     known_variance: Array
 
+    def take(self, kept: NDArray[np.bool_]) -> BandEnergies:
+        """Return some of the bands."""
+        return BandEnergies(self.energy[kept], self.count[kept], self.unit_variances[kept],
+                            self.known_variance[kept])
+
     def variance(self, logarithms: Array) -> Array:
         """Return the variance by squared figures, given by their logarithms."""
         return np.asarray(self.known_variance + self.unit_variances @ np.exp(logarithms))
 
-    def cost(self, logarithms: Array) -> float:
-        """Return twice the negative log likelihood of the logarithms of squared figures."""
-        variance = self.variance(logarithms)
-        return float((self.count * np.log(variance) + self.energy / variance).sum())
+    def fit(self, fixed: tuple[int, float] | None = None,
+            start: Array | None = None) -> tuple[Array, float]:
+        """
+        Return the most likely logarithms of squared figures, and twice their negative likelihood.
+
+        Parameters
+        ----------
+        fixed : index and logarithm of a squared figure that is not fitted
+        start : logarithms to begin with
+
+        """
+        usual = self.energy / self.count
+        begin = (start if start is not None
+                 else np.log((usual[:, None] / self.unit_variances).min(axis=0)))
+        free = np.array([place for place in range(len(begin)) if fixed is None
+                         or place != fixed[0]])
+        logarithms = begin.copy()
+        if fixed is not None:
+            logarithms[fixed[0]] = fixed[1]
+
+        def cost(some: Array) -> tuple[float, Array]:
+            logarithms[free] = some
+            variance = self.variance(logarithms)
+            slope = (self.count - self.energy / variance) / variance
+            return (float((self.count * np.log(variance) + self.energy / variance).sum()),
+                    (slope @ self.unit_variances[:, free]) * np.exp(some))
+
+        shifts = [0.0, *(-3.0 * (free == place) for place in free[1:])]
+        best = min((minimize(cost, begin[free] + shift, jac=True, method='L-BFGS-B',
+                             bounds=[(-60.0, 20.0)] * len(free)) for shift in shifts),
+                   key=lambda one: one.fun)
+        logarithms[free] = best.x
+        return logarithms, float(best.fun)
 
 
 def fit_noise_parameters(fit: RegressionFit, expected: Noise,
@@ -109,125 +142,86 @@ def fit_noise_parameters(fit: RegressionFit, expected: Noise,
         without the rounding noise; otherwise it may include it
 
     """
-    bands = _drop_tone_bands(_band_energies(fit))
+    bands = drop_tone_bands(_band_energies(fit))
     without = _fit_and_test(bands, expected)
     if is_rounding_modelled or not bands.known_variance.any():
         return without
-    whole = _fit_and_test(replace(bands, known_variance=np.zeros_like(bands.known_variance)),
-                          expected)
+    whole = _fit_and_test(replace(bands, known_variance=0.0 * bands.known_variance), expected)
     return replace(whole, p_values={name: max(chance, without.p_values[name])
                                     for name, chance in whole.p_values.items()})
 
 
-def _fit_and_test(bands: _BandEnergies, expected: Noise) -> NoiseParameters:
-    best, least = _fit_noise(bands, {})
-    parameters = {name: float(np.exp(0.5 * best[place])) for place, name in enumerate(NOISE_NAMES)}
-    floors = _significance_floors(bands, best)
-    noise = Noise(**{name: parameters[name] if best[place] > floors[place] else 0.0
+def _fit_and_test(bands: BandEnergies, expected: Noise) -> NoiseParameters:
+    best, least = bands.fit()
+    # a figure that is less than 1 % of the noise everywhere is 0
+    shares = (bands.unit_variances * np.exp(best) / bands.variance(best)[:, None]).max(axis=0)
+    noise = Noise(**{name: float(np.exp(0.5 * best[place])) if shares[place] > 0.01 else 0.0
                      for place, name in enumerate(NOISE_NAMES)})
-    chance, intervals = {}, {}
-    for place, name in enumerate(NOISE_NAMES):
-        intervals[name] = _likelihood_interval(bands, place, best, least)
-        if expected.angle_random_walk:
-            _, cost = _fit_noise(
-                bands, {place: 2.0 * float(np.log(max(getattr(expected, name), 1e-12)))}, best)
-            chance[name] = float(chi2.sf(max(cost - least, 0.0), 1))
-    return NoiseParameters(noise, intervals, chance)
+    chance = {}
+    for place, name in enumerate(NOISE_NAMES if expected.angle_random_walk else ()):
+        at = 2.0 * float(np.log(max(getattr(expected, name), 1e-12)))
+        chance[name] = float(chi2.sf(max(bands.fit((place, at), best)[1] - least, 0.0), 1))
+    return NoiseParameters(noise, {name: _likelihood_interval(bands, place, best, least)
+                                   for place, name in enumerate(NOISE_NAMES)}, chance)
 
 
-def _band_energies(fit: RegressionFit) -> _BandEnergies:
+def _band_energies(fit: RegressionFit) -> BandEnergies:
     problem, (angle, step) = fit.problem, fit.problem.coefficient_angles()
     left = np.concatenate(fit.residual_transforms()) * problem.deviation
-    # The noise parameters before a filter are those of frequencies below its cut-off.
-    used = np.concatenate(
-        [coefficient_angles(each.point_count) < 1.5 * np.pi / len(each.noise_levels)
-         for each in problem.replays])
     coarse = np.concatenate(
         [np.full(each.point_count - 1, each.rounding_variance / each.decimation)
          for each in problem.replays])
-    frequency = angle / (2.0 * np.pi * step)
-    wave = 2.0 - 2.0 * np.cos(angle)
-    parts = [1.0 / step, 1.0 / (2.0 * np.pi * frequency * step), step / wave]
-    if problem.reference_noise.rounding_ratio:
+    # The noise parameters before a filter are those of low frequencies.
+    used = np.concatenate(
+        [coefficient_angles(each.point_count) < (np.pi if each.decimation == 1 else 0.25 * np.pi)
+         for each in problem.replays])
+    parts = [1.0 / step, 1.0 / angle, step / (2.0 - 2.0 * np.cos(angle))]
+    if problem.noise_shapes[0].rounding_ratio:
         parts.append(spline_derivative_gain(angle) / step)
     energy, count, *totals = (np.add.reduceat(part * used, problem.band_starts)
                               for part in (left ** 2, np.ones(len(left)), coarse, *parts))
     kept = count > 0.0
     known, *means = (total[kept] / count[kept] for total in totals)
-    return _BandEnergies(energy[kept], count[kept], np.column_stack(means), known)
+    return BandEnergies(energy[kept], count[kept], np.column_stack(means), known)
 
 
-def _drop_tone_bands(bands: _BandEnergies) -> _BandEnergies:
+def drop_tone_bands(bands: BandEnergies) -> BandEnergies:
     """Remove bands with more energy than the noise of the others, the most unlikely first."""
-    kept: Mask = np.ones(len(bands.energy), dtype=bool)
+    kept = np.ones(len(bands.energy), dtype=bool)
     while kept.sum() > len(kept) / 2:
-        kept_bands = _BandEnergies(bands.energy[kept], bands.count[kept],
-                                   bands.unit_variances[kept], bands.known_variance[kept])
-        chances = np.where(kept, chi2.sf(
-            bands.energy / bands.variance(_fit_noise(kept_bands, {})[0]), bands.count), 1.0)
-        weakest = int(chances.argmin())
-        if chances[weakest] > _BAND_REJECTION_CHANCE / len(kept):
-            return kept_bands
-        kept[weakest] = False
+        variance = bands.variance(bands.take(kept).fit()[0])
+        chances = np.where(kept, chi2.sf(bands.energy / variance, bands.count), 1.0)
+        if chances.min() > _BAND_REJECTION_CHANCE / len(kept):
+            return bands.take(kept)
+        kept[chances.argmin()] = False
     return bands
 
 
-def _fit_noise(bands: _BandEnergies, fixed: dict[int, float],
-               start: Array | None = None) -> tuple[Array, float]:
-    """Return the most likely logarithms of squared figures, some of them fixed, and the cost."""
-    size = bands.unit_variances.shape[1]
-    free = [place for place in range(size) if place not in fixed]
-    usual = bands.energy / bands.count
-    begin = (start if start is not None
-             else np.log((usual[:, None] / bands.unit_variances).min(axis=0)))
-    logarithms = np.array([fixed.get(place, begin[place]) for place in range(size)])
-
-    def cost(some: Array) -> float:
-        logarithms[free] = some
-        return bands.cost(logarithms)
-
-    shifts = (0.0, *(-3.0 * (np.arange(len(free)) == place) for place in range(1, len(free))))
-    best = min((minimize(cost, begin[free] + shift, method='L-BFGS-B',
-                         bounds=[(-60.0, 20.0)] * len(free)) for shift in shifts),
-               key=lambda one: one.fun)
-    logarithms[free] = best.x
-    return logarithms.copy(), float(best.fun)
-
-
-def _significance_floors(bands: _BandEnergies, best: Array) -> Array:
-    """Return the logarithms below which a figure is less than 1 % of the noise everywhere."""
-    variance = bands.variance(best)
-    return np.log(0.01 * (variance[:, None] / bands.unit_variances).min(axis=0))
-
-
-def _likelihood_interval(bands: _BandEnergies, place: int, best: Array,
+def _likelihood_interval(bands: BandEnergies, place: int, best: Array,
                          min_cost: float) -> tuple[float, float]:
-    """Return the 95 % interval of a figure by the profile of the cost."""
-    limit = min_cost + float(chi2.ppf(0.95, 1))
+    """Return the 95 % interval of a figure by the profile of the likelihood."""
+    def excess(shift: float) -> float:
+        return (bands.fit((place, best[place] + shift), best)[1] - min_cost
+                - float(chi2.ppf(0.95, 1)))
+
     ends = []
-    for direction in (-1.0, 1.0):
-        inside, step = 0.0, 0.02
-        while (step < 12.0
-               and _fit_noise(bands, {place: best[place] + direction * step}, best)[1] < limit):
-            inside, step = step, step * 1.6
-        ends.append(best[place] + direction * 0.5 * (inside + step) if step < 12.0
-                    else -np.inf if direction < 0 else best[place] + 12.0)
-    return float(np.exp(0.5 * ends[0])), float(np.exp(0.5 * ends[1]))
+    for shift, unlimited in ((-0.02, -np.inf), (0.02, 12.0)):
+        while abs(shift) < 12.0 and excess(shift) < 0.0:
+            shift *= 2.0
+        ends.append(unlimited if abs(shift) >= 12.0
+                    else brentq(excess, 0.0, shift, xtol=1e-3))
+    return float(np.exp(0.5 * (best[place] + ends[0]))), float(
+        np.exp(0.5 * (best[place] + ends[1])))
 
 
 # curves
-
-def unbiased_residuals(fit: FittedValues) -> list[Array]:
-    """Return the residual of each log without its bias, rad/s, shape (n,)."""
-    return [residual - bias for residual, bias in zip(fit.residuals, fit.biases)]
-
 
 def model_residuals(replays: Sequence[Replay]) -> list[Array]:
     """Return the residual of the given model for each log, rad/s, shape (n,)."""
     return [each.channels.output - each.reference for each in replays]
 
 
-def residual_curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
+def residual_curves(before: Sequence[Array], after: RegressionFit) -> list[Curve]:
     """
     Return the mean residual in bins of each variable that changes in the logs.
 
@@ -237,11 +231,11 @@ def residual_curves(before: Sequence[Array], after: FittedValues) -> list[Curve]
     after : the extended simulation
 
     """
-    replays = after.replays
+    replays = after.problem.replays
     simulated = [each.simulated_error + error - rest
                  for each, error, rest in zip(replays, model_residuals(replays), before)]
     values = [np.concatenate([part[each.valid] for part, each in zip(parts, replays)])
-              for parts in (before, unbiased_residuals(after), simulated)]
+              for parts in (before, after.unbiased_residuals, simulated)]
     found = [_binned_curve(name, unit, [of(each)[each.valid] for each in replays], values, after)
              for name, unit, of in _curve_variables(replays)]
     return [each for each in found if len(each.at) > 1] + [_amplitude_spectrum(before, after)]
@@ -269,7 +263,7 @@ def _curve_variables(
 
 
 def _binned_curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
-                  after: FittedValues) -> Curve:
+                  after: RegressionFit) -> Curve:
     """Return means in even bins between the 0.1 % and 99.9 % quantiles, of 10 or more samples."""
     at = np.concatenate(parts)
     low, high = np.quantile(at, [0.001, 0.999])
@@ -286,7 +280,7 @@ def _binned_curve(name: str, unit: str, parts: Sequence[Array], values: Sequence
                  np.sqrt(_bin_variances(after, bins)[enough]) / count[enough], simulated)
 
 
-def _bin_variances(fit: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
+def _bin_variances(fit: RegressionFit, bins: Sequence[NDArray[np.intp]]) -> Array:
     """
     Return the variance by noise of the sum of the residual in each bin, (rad/s)², shape (BINS,).
 
@@ -294,9 +288,11 @@ def _bin_variances(fit: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array
     among the samples of one grid point is white.
 
     """
-    total = np.zeros(CURVE_BINS)
-    for each, residual, variance, place in zip(fit.replays, fit.residuals,
-                                               _coefficient_variances(fit.fit), bins):
+    problem, total = fit.problem, np.zeros(CURVE_BINS)
+    relative = (fit.noise_probability * fit.residual_squares
+                / fit.degrees_of_freedom) @ (1.0 / problem.weights)
+    variances = problem.split_by_log(problem.deviation ** 2 * problem.by_coefficient(relative))
+    for each, residual, variance, place in zip(problem.replays, fit.residuals, variances, bins):
         point = np.minimum(each.grid_index // each.decimation, each.point_count - 1)
         counts = np.bincount(place * each.point_count + point,
                              minlength=CURVE_BINS * each.point_count).astype(float)
@@ -308,20 +304,10 @@ def _bin_variances(fit: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array
     return total
 
 
-def _coefficient_variances(fit: RegressionFit) -> list[Array]:
-    """Return each log's variances of coefficients, averaged over noises, shape (points - 1,)."""
-    problem, by_noise = fit.problem, fit.noise_likelihood
-    relative = (by_noise.probability[0] * by_noise.residual_squares[0]
-                / fit.marginalized.degrees_of_freedom) @ (1.0 / problem.noises.weights)
-    count = np.diff(np.append(problem.band_starts, len(problem.deviation)))
-    variance = problem.deviation ** 2 * np.repeat(relative, count)
-    return np.split(variance, np.cumsum([each.point_count - 1 for each in problem.replays])[:-1])
-
-
-def _amplitude_spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
+def _amplitude_spectrum(before: Sequence[Array], after: RegressionFit) -> Curve:
     """Return the largest amplitude of the first log's residual in bins of frequency."""
-    each = after.replays[0]
-    series = [each.resample(left[0]) for left in (before, unbiased_residuals(after))]
+    each = after.problem.replays[0]
+    series = [each.resample(left[0]) for left in (before, after.unbiased_residuals)]
     amplitude = [np.sqrt(2.0) * np.abs(np.fft.rfft(values))[1:] * np.sqrt(2.0) / len(values)
                  for values in series]
     frequency = np.fft.rfftfreq(len(series[0]), each.point_interval)[1:]
@@ -334,18 +320,18 @@ def _amplitude_spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
 
 
-def heading_error_curve(before: Sequence[Array], after: FittedValues) -> HeadingCurve:
+def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> HeadingCurve:
     """Return the heading error over the first log, by its residual before and after extension."""
-    each = after.replays[0]
+    each = after.problem.replays[0]
     lines = [np.cumsum(each.resample(left[0])) * each.point_interval
-             for left in (before, unbiased_residuals(after))]
+             for left in (before, after.unbiased_residuals)]
     some = np.unique(np.linspace(0, each.point_count - 1, CURVE_POINTS).astype(int))
     return HeadingCurve(some * each.point_interval, lines[0][some], lines[1][some])
 
 
-def allan_curves(fit: FittedValues, fitted: Noise, expected: Noise) -> NoiseCurve:
+def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> NoiseCurve:
     """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
-    each = fit.replays[0]
+    each = fit.problem.replays[0]
     allan = allan_deviation(
         each.resample(fit.residuals[0])[:_MAX_ALLAN_SAMPLES], each.point_interval)
     times = allan.time

@@ -9,22 +9,21 @@
 # under the License.
 
 """
-Search for the causes that the data support.
+Search for the causes that the data support, and their confirmation.
 
 Causes are added one by one, the strongest first. The shapes of the candidates are refined before
 one is selected, so that a large effect of a slightly wrong shape leaves no residual that other
-causes would explain. In the end each cause is removed on trial, to find out whether another one
-explains the data better, or none is needed.
+causes would explain. A cause that is selected is confirmed if it predicts stretches of the logs
+that are held out, and if the interval of its size excludes 0.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from dataclasses import field as field_of
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import math
-from typing import Any, TypeAlias
+from typing import Any
 
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
@@ -35,25 +34,20 @@ from gyro_calibration.diagnosis.candidates import (
     generic_terms,
     indices_by_cause,
     is_named,
-    MIN_THERMAL_LAG,
     propose_candidates,
-    step_time_spacing,
+    unnamed_variable,
     with_shape,
 )
+from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR
-from gyro_calibration.diagnosis.noise_likelihood import (
-    column_evidence,
-    draw_residuals,
-    Indices,
-    log_sum_exp,
-    marginalize_nuisances,
-    noise_likelihood,
-)
 from gyro_calibration.diagnosis.regression import (
     add_cause,
-    add_nuisance_columns,
     build_problem,
+    column_evidence,
+    draw_residuals,
     fit_causes,
+    free_amplitude,
+    Indices,
     is_rate_distortion,
     RegressionFit,
     RegressionProblem,
@@ -61,45 +55,44 @@ from gyro_calibration.diagnosis.regression import (
     with_distorted_rate,
 )
 from gyro_calibration.diagnosis.replay import cosine_transform, inverse_cosine_transform, Replay
-from gyro_calibration.diagnosis.steps import OnPart
-from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
+from scipy.special import logsumexp
+from scipy.stats import chi2
 
-#: Residuals of noise alone that are drawn for the distribution of the evidence.
-NOISE_DRAWS = 400
-#: Most likely noises from which these residuals are drawn, at most.
-MAX_DRAWN_NOISES = 60
-#: Least penalty of a fitted shape, in log-likelihood.
-SHAPE_PENALTY = 2.0
-#: Causes without a grid of first shapes: all frequencies or times are scanned.
-SCANNED_CAUSES = frozenset({'interference_tone', 'reference_slip'})
-#: Largest number of a kind in one log: all slips form one cause, and more tones indicate a
-#: disturbance that is not periodic.
+#: Residuals of noise alone that are drawn for the distribution of the evidence, and most likely
+#: noises from which they are drawn, at most.
+NOISE_DRAWS, MAX_DRAWN_NOISES = 400, 60
+#: Penalties in log-likelihood: of a fitted shape, at least; of each column beyond the first; and
+#: of a structure without a name.
+SHAPE_PENALTY, COLUMN_PENALTY, UNNAMED_PENALTY = 2.0, 1.2, 4.0
+#: Largest number of a scanned cause in one log: all slips form one cause, and more tones indicate
+#: a disturbance that is not periodic.
 MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
 #: Least number of periods of a tone in a log; slower variations are bias wander.
 MIN_TONE_PERIODS = 20
-#: Durations of a slip of the reference that are tried, s.
-SLIP_DURATIONS = (0.0, 0.05, 0.1, 0.2, 0.4)
-#: Largest number of slips in a log.
-MAX_SLIPS = 20
-#: Largest deficit in log-likelihood, relative to the best noise, of the noises that are kept.
-MAX_LIKELIHOOD_DEFICIT = 12.0
-#: Evidence above which an effect distorts the likelihood of the noises, so that all are kept.
-STRONG_EVIDENCE = 60.0
-#: Penalty of each column beyond the first, in log-likelihood.
-COLUMN_PENALTY = 1.2
-#: Additional penalty of a structure without a name, in log-likelihood.
-UNNAMED_PENALTY = 4.0
-#: Largest number of candidates that are refined in each step.
-MAX_CONFOUNDERS = 9
-#: Largest number of named causes.
-MAX_CAUSES = 6
+#: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
+SLIP_DURATIONS, MAX_SLIPS = (0.0, 0.05, 0.1, 0.2, 0.4), 20
+#: Largest numbers of candidates that are refined in each step, and of causes.
+MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
+#: Half-width of the range in which a shape is refined, in logarithms.
+_SHAPE_RANGE = 0.8
+#: Exponents with which distortions of fixed amplitude grow with their shapes.
+_SHAPE_EXPONENTS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
 #: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
 #: standard deviations (one-sided 5 %). The gain of one stretch is limited to a likelihood ratio of
 #: 20, so that no single stretch establishes a cause. Number of stretches of all logs together.
 MIN_PREDICTION_SIGMAS, MAX_STRETCH_GAIN, STRETCH_COUNT = 1.65, 3.0, 64
+#: Probability of the differences between logs below which a cause does not repeat, and variables
+#: whose causes are named only if they have the same size in all logs.
+_MIN_REPEAT_CHANCE, _REPEATING_VARIABLES = 1e-3, ('temperature', 'temperature_rate')
+
+#: Why a cause is not named.
+UNPREDICTIVE = 'it does not predict held-out stretches'
+
+Causes = tuple[SelectedCause, ...]
 
 
 @dataclass(frozen=True)
@@ -108,7 +101,7 @@ class NullDistribution:
     Distribution of the evidence of causes in noise alone: an exponential tail.
 
     The evidence exceeds `tail_start` with the probability `tail_probability`, and falls by e every
-    `tail_scale`.
+    `tail_scale`. That of a scanned cause, which has none, contains the number of places already.
 
     """
 
@@ -118,24 +111,23 @@ class NullDistribution:
 
     def threshold(self, cause: str, rate: float) -> float:
         """Return the evidence that noise alone exceeds with a given probability."""
-        # scanned: its evidence contains the number of places already
         if cause not in self.tail_start:
-            return -float(np.log(rate))
+            return -math.log(rate)
         return (self.tail_start[cause]
-                + self.tail_scale[cause] * float(np.log(self.tail_probability / rate)))
+                + self.tail_scale[cause] * math.log(self.tail_probability / rate))
 
     def p_value(self, cause: str, evidence: float) -> float:
         """Return the probability that noise alone reaches an evidence."""
         if cause not in self.tail_start:
-            return float(np.exp(-max(evidence, 0.0)))
-        return min(1.0, self.tail_probability * float(np.exp(
-            min(-(evidence - self.tail_start[cause]) / self.tail_scale[cause], 700.0))))
+            return math.exp(-max(evidence, 0.0))
+        above = (evidence - self.tail_start[cause]) / self.tail_scale[cause]
+        return min(1.0, self.tail_probability * math.exp(min(-above, 700.0)))
 
 
 @dataclass(frozen=True)
 class CandidateColumns:
     """
-    All candidates with their columns, for the rate that the gyro senses.
+    Candidates with their columns, for the rate that the gyro senses.
 
     Attributes
     ----------
@@ -149,26 +141,30 @@ class CandidateColumns:
     groups: tuple[tuple[int, ...], ...]
     columns: Array
 
-
-def log_mean_exp(logarithms: Array) -> Array:
-    """Return the logarithm of the mean of likelihoods along the last axis."""
-    return log_sum_exp(logarithms) - np.log(logarithms.shape[-1])
+    def evidence(self, problem: RegressionProblem, nuisances: Array,
+                 residuals: Iterable[Array]) -> Array:
+        """Return the evidence, (d, candidates), less the penalty of columns beyond the first."""
+        penalty = COLUMN_PENALTY * np.array([len(group) - 1.0 for group in self.groups])
+        return column_evidence(problem, nuisances, self.columns, self.groups, residuals) - penalty
 
 
 def make_candidate_columns(problem: RegressionProblem, candidates: Sequence[Candidate],
                            causes: Sequence[SelectedCause] = ()) -> CandidateColumns:
     """Compute the whitened columns of candidates."""
-    if not candidates:
-        return CandidateColumns((), (), np.empty((0, len(problem.deviation))))
     replays = [with_distorted_rate(each, causes) for each in problem.replays]
     parts = [candidate_transforms(each, replays) / problem.deviation for each in candidates]
-    ends = np.cumsum([len(part) for part in parts])
+    ends = np.cumsum([len(part) for part in parts]).tolist()
     groups = tuple(tuple(range(end - len(part), end)) for end, part in zip(ends, parts))
-    return CandidateColumns(tuple(candidates), groups, np.concatenate(parts))
+    return CandidateColumns(tuple(candidates), groups,
+                            np.concatenate([np.empty((0, len(problem.deviation))), *parts]))
 
 
-#: Causes with their shapes.
-CausesKey: TypeAlias = 'tuple[tuple[Any, ...], ...]'
+@dataclass(frozen=True)
+class SearchStep:
+    """A list of causes and its score."""
+
+    causes: Causes
+    score: float
 
 
 @dataclass(frozen=True)
@@ -193,12 +189,12 @@ class Search:
     candidate_columns: CandidateColumns
     null_distribution: NullDistribution
     rate: float
-    scanned_causes: frozenset[str] = SCANNED_CAUSES
+    scanned_causes: frozenset[str] = frozenset(MAX_PER_LOG)
     unidentifiable: frozenset[str] = frozenset()
-    columns_cache: dict[CausesKey, CandidateColumns] = field_of(default_factory=dict)
-    step_cache: dict[CausesKey, tuple[SearchStep | None, list[SearchStep]]] = field_of(
+    columns_cache: dict[tuple[Any, ...], CandidateColumns] = field(default_factory=dict)
+    step_cache: dict[tuple[Any, ...], tuple[SearchStep | None, list[SearchStep]]] = field(
         default_factory=dict)
-    on_part: OnPart = lambda words: None
+    on_part: Callable[[str], object] = lambda words: None
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -210,90 +206,55 @@ class Search:
         return evidence - self.null_distribution.threshold(cause, rate_factor * self.rate)
 
 
-def screen_candidates(fit: RegressionFit, columns: CandidateColumns) -> Array:
-    """Return the evidence of all candidates given the named causes, shape (candidates,)."""
-    noises, starts = fit.problem.noises, fit.problem.band_starts
-    by = marginalize_nuisances(fit.columns, columns.columns, columns.groups, starts, noises)
-    shown = noise_likelihood(fit.residual[None], fit.columns, columns.columns, starts, noises, by)
-    return _penalize_columns(column_evidence(shown, by, columns.groups), columns)[0]
-
-
-def _penalize_columns(evidence: Array, columns: CandidateColumns) -> Array:
-    """Return evidence, shape (d, candidates), less the penalty of columns beyond the first."""
-    return evidence - COLUMN_PENALTY * np.array([len(group) - 1.0 for group in columns.groups])
+def start_search(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006,
+                 on_part: Callable[[str], object] = lambda words: None) -> Search:
+    """Set up a search: candidates, noises, and the distribution of evidence in noise."""
+    on_part('candidate causes')
+    found = [*propose_candidates(replays), *generic_terms(replays)]
+    problem = build_problem(replays)
+    columns, fit = make_candidate_columns(problem, found), fit_causes(problem, [])
+    if not np.isfinite(fit.noise_log_likelihood).all():
+        raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
+                          'check columns and units')
+    shown, places = columns.evidence(problem, fit.columns, [fit.residual[None]])[0], (
+        indices_by_cause(found))
+    on_part('significance, by simulated noise')
+    return Search(problem, columns, simulate_null_distribution(fit, columns, generator),
+                  rate / len(places), on_part=on_part, unidentifiable=frozenset(
+                      cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
 
 
 def simulate_null_distribution(fit: RegressionFit, columns: CandidateColumns,
                                generator: np.random.Generator) -> NullDistribution:
     """Return the distribution of the evidence of causes in residuals of noise alone."""
-    probable = fit.noise_likelihood.probability[0]
+    probable = fit.noise_probability
     kept = np.sort(np.argsort(-probable)[:MAX_DRAWN_NOISES])
-    noises = fit.problem.noises.take(kept)
-    starts = fit.problem.band_starts
-    by = marginalize_nuisances(fit.columns, columns.columns, columns.groups, starts, noises)
-    count = np.diff(np.append(starts, len(fit.residual)))
-    single = fit.columns.astype(np.float32), columns.columns.astype(np.float32)
-    found = []
-    for _ in range(NOISE_DRAWS // 100):
-        residuals = draw_residuals(noises, count, probable[kept] / probable[kept].sum(), 100,
-                                   generator)
-        shown = noise_likelihood(residuals, *single, starts, noises, by)
-        found.append(_penalize_columns(column_evidence(shown, by, columns.groups), columns))
-    null_evidence = np.concatenate(found)
+    problem = fit.problem.with_noises(kept)
+    shown = columns.evidence(problem, fit.columns, (
+        draw_residuals(problem, probable[kept] / probable[kept].sum(), 100, generator)
+        for _ in range(NOISE_DRAWS // 100)))
     start, scale, share = {}, {}, 0.15
     for cause, own in indices_by_cause(columns.candidates).items():
-        if not np.isfinite(null_evidence[:, own]).any():
+        if not np.isfinite(shown[:, own]).any():
             start[cause], scale[cause] = 0.0, 1.0  # not identifiable in these data
             continue
-        ordered = np.sort(log_mean_exp(null_evidence[:, own]))
+        ordered = np.sort(logsumexp(shown[:, own], axis=1) - math.log(len(own)))
         most = ordered[int((1.0 - share) * len(ordered)):]
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
     return NullDistribution(start, scale, share)
 
 
-def start_search(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006,
-                 on_part: OnPart = lambda words: None) -> Search:
-    """Set up a search: candidates, likely noises, and the distribution of evidence in noise."""
-    on_part('candidate causes')
-    found = [*propose_candidates(replays), *generic_terms(replays)]
-    everywhere = build_problem(replays)
-    problem = _drop_unlikely_noises(everywhere, found)
-    fit, columns = fit_causes(problem, []), make_candidate_columns(problem, found)
-    shown, places = screen_candidates(fit, columns), indices_by_cause(found)
-    if shown.max() > STRONG_EVIDENCE:
-        problem, fit = everywhere, fit_causes(everywhere, [])
-    unidentifiable = frozenset(
-        cause for cause, own in places.items() if not np.isfinite(shown[own]).any())
-    on_part('significance, by simulated noise')
-    return Search(problem, columns, simulate_null_distribution(fit, columns, generator),
-                  rate / len(places), unidentifiable=unidentifiable, on_part=on_part)
-
-
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
     """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
-    found = [each for each in search.candidates if each.cause in causes]
     problem = build_problem(replays)
     return replace(search, problem=problem, rate=rate, columns_cache={}, step_cache={},
-                   candidate_columns=make_candidate_columns(problem, found),
-                   scanned_causes=SCANNED_CAUSES & frozenset(causes))
+                   candidate_columns=make_candidate_columns(
+                       problem, [each for each in search.candidates if each.cause in causes]),
+                   scanned_causes=search.scanned_causes & frozenset(causes))
 
 
-def _drop_unlikely_noises(problem: RegressionProblem,
-                          candidates: Sequence[Candidate]) -> RegressionProblem:
-    """Remove noises that are unlikely both without causes and with one column of each cause."""
-    by_cause = indices_by_cause([each for each in candidates if is_named(each)])
-    middle = [candidates[places[len(places) // 2]] for places in by_cause.values()]
-    tried = [fit.noise_likelihood.log_likelihood[0]
-             for fit in (fit_causes(problem, []), fit_causes(problem, [], middle))]
-    kept = np.flatnonzero(
-        np.any([each > each.max() - MAX_LIKELIHOOD_DEFICIT for each in tried], axis=0))
-    if not len(kept):
-        raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
-                          'check columns and units')
-    return replace(problem, noise_shapes=tuple(problem.noise_shapes[place] for place in kept),
-                   noises=problem.noises.take(kept))
-
+# one more cause
 
 @dataclass(frozen=True)
 class _ScreenedCandidate:
@@ -302,237 +263,6 @@ class _ScreenedCandidate:
     candidate: Candidate
     evidence: float
     mean_evidence: float
-
-
-# scans over all frequencies and times
-
-def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
-    """Return the logs that may contain one more instance of a cause."""
-    taken = [known.candidate.log_index for known in fit.causes if known.candidate.cause == cause]
-    return [run
-            for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]]
-
-
-def find_tones(fit: RegressionFit) -> list[_ScreenedCandidate]:
-    """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
-    found, left = [], fit.whitened_series()
-    for run in _logs_to_scan(fit, 'interference_tone'):
-        each, white = fit.problem.replays[run], left[run]
-        # Zero padding: a tone between two frequencies of the log would lose half of its power.
-        power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
-        lowest = 2 * MIN_TONE_PERIODS
-        if len(power) > 2 * lowest:
-            best = lowest + int(power[lowest:-2].argmax())
-            frequency = _unalias_frequency(each, 0.5 * best / each.duration)
-            if each.heading_step and not _is_tone_of_gyro(each, frequency):
-                continue
-            most, places = float(power[best]) - COLUMN_PENALTY, len(power) * len(left)
-            found.append(
-                _ScreenedCandidate(effect_candidate('interference_tone', frequency, log_index=run),
-                                   most, most - float(np.log(places))))
-    return [max(found, key=lambda one: one.mean_evidence)] if found else []
-
-
-def _unalias_frequency(replay: Replay, frequency: float) -> float:
-    """Return the frequency of a tone before averaging: the strongest of its aliases."""
-    if replay.decimation == 1:
-        return frequency
-    samples = replace(replay, decimation=1)
-    power = np.abs(np.fft.rfft(samples.resample(replay.channels.output - replay.reference),
-                               2 * samples.point_count)) ** 2
-    alias_frequencies = np.arange(replay.decimation // 2 + 1) / replay.point_interval
-    places = (2.0 * samples.duration
-              * np.concatenate([alias_frequencies + frequency, alias_frequencies[1:] - frequency]))
-
-    def relative_power(at: float) -> float:
-        """Return the ratio of the power at a frequency to that of its neighbours."""
-        place = round(at)
-        usual = np.median(power[max(place - 60, 0):place + 61])
-        return float(power[place - 2:place + 3].max() / usual)
-
-    best = max(places[places < len(power) - 3], key=relative_power)
-    return float(best) / (2.0 * samples.duration)
-
-
-def _is_tone_of_gyro(replay: Replay, frequency: float) -> bool:
-    """Tell whether a tone is in the output, not only in the reference of an encoder."""
-    wave = np.exp(-2.0j * np.pi * frequency * replay.channels.time[replay.valid])
-    output, reference = (np.abs(np.mean(values[replay.valid] * wave))
-                         for values in (replay.channels.output, replay.reference))
-    return bool(output > 0.7 * reference)
-
-
-def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
-    """Return the clearest jumps of the reference's heading, where it accelerates."""
-    found = []
-    parts = np.cumsum([each.point_count - 1 for each in fit.problem.replays])[:-1]
-    divided = np.split(fit.problem.whitening_factors(
-        int(fit.noise_likelihood.log_likelihood[0].argmax())) / fit.problem.deviation, parts)
-    left = fit.whitened_series()
-    for run in _logs_to_scan(fit, 'reference_slip'):
-        each, white, factor = fit.problem.replays[run], left[run], divided[run]
-        acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
-        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
-        if acceleration.max() > 0.0 and len(moments):
-            tried = [_fit_slips(each, run, white, factor, moments,
-                                max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
-            # The largest number indicates a continuous disturbance, not slips.
-            if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
-                found += tried
-    return [max(found, key=lambda one: one.mean_evidence)] if found else []
-
-
-def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
-               width: float) -> _ScreenedCandidate:
-    """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
-    time = np.arange(replay.point_count) * replay.point_interval
-    likely = float(np.log(len(indices) * len(SLIP_DURATIONS)))
-    size, deviation = _matched_filter(white, factor, time, width)
-    wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
-    value = 0.5 * (size[indices] / deviation) ** 2 - likely - COLUMN_PENALTY
-    # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
-    # of an encoder is constant at rest, and differs by up to a step between two rests.
-    is_temporary = wide[indices] / size[indices] < 0.3
-    value[is_temporary | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
-    chosen: list[float] = []
-    total = 0.0
-    for place in np.argsort(-value)[:200]:
-        single = _isolated_point(replay, int(indices[place]), width)
-        if single is not None and not _is_jump_of_reference(replay, float(time[single])):
-            continue
-        if (value[place] <= 0.0 and chosen) or len(chosen) == MAX_SLIPS:
-            break
-        at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
-        if all(abs(at - other) > 1.0 for other in chosen):
-            chosen.append(at)
-            total += float(value[place])
-    return _ScreenedCandidate(
-        effect_candidate('reference_slip', width, *chosen, log_index=log_index),
-        total + likely * len(chosen), total if chosen else -np.inf)
-
-
-def _matched_filter(white: Array, whitening_factor: Array, time: Array,
-                    width: float) -> tuple[Array, float]:
-    """Return the size of a pulse at each time, rad, and its standard deviation."""
-    kernel = inverse_cosine_transform(
-        cosine_transform(gaussian_pulse(time, time[len(time) // 2], width)) * whitening_factor)
-    return (correlate(white, kernel, 'same') / (kernel @ kernel),
-            float(1.0 / np.sqrt(kernel @ kernel)))
-
-
-def _isolated_point(replay: Replay, index: int, width: float) -> int | None:
-    """Return the point near another that has most of the deviation; None if there are several."""
-    left = replay.resample(replay.channels.output - replay.channels.rate)
-    reach = max(3, round(2.0 * width / replay.point_interval))
-    begin = max(index - reach, 0)
-    near = left[begin:index + reach + 1]
-    off = (near - np.median(near)) ** 2
-    return (begin + int(off.argmax()) if off.max() > max(40.0 * np.median(off), 0.4 * off.sum())
-            else None)
-
-
-def _is_jump_of_reference(replay: Replay, moment: float) -> bool:
-    """Tell whether the reference jumps more than the output at a time."""
-    at = int(np.clip(np.searchsorted(replay.channels.time[replay.valid],
-                                     moment + replay.channels.time[replay.valid][0]),
-                     3, replay.valid.sum() - 4))
-    off = [np.abs(np.diff(values[replay.valid][at - 3:at + 4], 2)).max()
-           for values in (replay.reference, replay.channels.output)]
-    return bool(off[0] > off[1])
-
-
-# one more cause
-
-def _columns_given_causes(search: Search, causes: Sequence[SelectedCause]) -> CandidateColumns:
-    """Return all candidates for the rate that the gyro senses, with shapes to two digits."""
-    changes = [each for each in causes if is_rate_distortion(each.candidate.cause)]
-    key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes))
-                for each in changes)
-    if not changes:
-        return search.candidate_columns
-    if key not in search.columns_cache:
-        search.columns_cache.clear()  # one is hundreds of megabytes
-        search.columns_cache[key] = make_candidate_columns(
-            search.problem, search.candidates, changes)
-    return search.columns_cache[key]
-
-
-@dataclass(frozen=True)
-class SearchStep:
-    """A list of causes and its score."""
-
-    causes: tuple[SelectedCause, ...]
-    score: float
-
-
-def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> SearchStep:
-    """
-    Add a cause with its best shape near the given one.
-
-    Parameters
-    ----------
-    fit : fit to which the cause is added
-    candidate : the cause
-    penalty : penalty for the choice of its shape, in log-likelihood
-
-    """
-    if not fitted_shape_indices(candidate) or candidate.cause == 'reference_slip':
-        done = add_cause(fit, candidate)
-        columns = COLUMN_PENALTY * max(done.column_counts[-1] - 1, 0)
-        margin = 0.0 if is_named(candidate) else UNNAMED_PENALTY
-        return SearchStep((*fit.causes, SelectedCause(candidate, penalty=penalty)),
-                          done.log_likelihood - columns - penalty - margin)
-    begin = candidate if candidate.amplitude is None else _linearized_start(fit, candidate)
-    place = fitted_shape_indices(candidate)[0]
-    low, high = _shape_bounds(fit.original_replays, begin, place)
-
-    def cost(at: float) -> float:
-        return -add_cause(fit,
-                          with_shape(begin, place, _to_shape(at, begin, place))).log_likelihood
-
-    best = minimize_scalar(cost, bounds=(low, high), method='bounded',
-                           options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
-    columns = COLUMN_PENALTY if candidate.cause == 'interference_tone' else 0.0
-    found = SelectedCause(with_shape(begin, place, _to_shape(best.x, begin, place)),
-                          penalty=penalty)
-    return SearchStep((*fit.causes, found), -float(best.fun) - penalty - columns)
-
-
-def _to_shape(search_value: float, candidate: Candidate, shape_index: int) -> float:
-    return (search_value if candidate.cause == 'bias_step'
-            else float(np.copysign(np.exp(search_value), candidate.shapes[shape_index])))
-
-
-def _shape_bounds(replays: Sequence[Replay], candidate: Candidate,
-                  shape_index: int) -> tuple[float, float]:
-    """Return the bounds of the search for a shape, in logarithms except for times."""
-    shape = candidate.shapes[shape_index]
-    if candidate.cause == 'bias_step':
-        width = 1.5 * max(step_time_spacing(each, len(replays)) for each in replays)
-        return shape - width, shape + width
-    if candidate.amplitude is not None:
-        return float(np.log(abs(shape))) - 0.7, float(np.log(abs(shape))) + 0.7
-    if candidate.cause == 'interference_tone':
-        width = 1.0 / (shape * replays[candidate.log_index or 0].duration)
-        return float(np.log(shape)) - width, float(np.log(shape)) + width
-    width = 0.8
-    low = float(np.log(MIN_THERMAL_LAG)) if candidate.cause == 'thermal_lag' else -np.inf
-    return max(float(np.log(abs(shape))) - width, low), float(np.log(abs(shape))) + width
-
-
-#: Exponent with which an effect grows with its shape.
-_SHAPE_EXPONENTS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
-
-
-def _linearized_start(fit: RegressionFit, candidate: Candidate) -> Candidate:
-    """Return a cause of fixed amplitude with the shape that a fit of its amplitude suggests."""
-    if candidate.cause not in _SHAPE_EXPONENTS:
-        return candidate
-    own = candidate_transforms(candidate, fit.problem.replays) / fit.problem.deviation
-    free = add_nuisance_columns(fit, own)
-    ratio, place = float(free.estimates[0][-1]), fitted_shape_indices(candidate)[0]
-    factor = math.copysign(abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio)
-    return with_shape(candidate, place, candidate.shapes[place] * factor)
 
 
 def find_strongest(search: Search,
@@ -559,30 +289,91 @@ def _search_strongest(search: Search, causes: Sequence[SelectedCause],
                       ) -> tuple[SearchStep | None, list[SearchStep]]:
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit, causes)
-    if not any(search.excess_evidence(each.candidate.cause, each.mean_evidence) > 0.0
-               for each in first):
-        found = [refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
-                 for each in first if is_lasting(each.candidate)
-                 and search.excess_evidence(each.candidate.cause, each.mean_evidence,
-                                            SUSPECTED_RATE_FACTOR) > 0.0]
-        return None, sorted(found, key=lambda step: -step.score)
-    top = max(first, key=lambda each: each.evidence)
-    # Causes that distort the rate are equal to first order; large ones need refined shapes.
-    alike = is_rate_distortion(top.candidate.cause)
-    worth = [each for each in first if each.evidence > 0.8 * top.evidence - 8.0
-             or (alike and is_rate_distortion(each.candidate.cause))]
-    worth = [each for each in worth if is_named(each.candidate)
-             or search.excess_evidence(each.candidate.cause, each.mean_evidence) > 0.0]
+    significant = [each for each in first if search.excess_evidence(
+        each.candidate.cause, each.mean_evidence) > 0.0]
+    if significant:
+        top = max(first, key=lambda each: each.evidence)
+        # Causes that distort the rate are equal to first order; large ones need refined shapes.
+        alike = is_rate_distortion(top.candidate.cause)
+        worth = [each for each in first if (is_named(each.candidate) or each in significant) and (
+            each.evidence > 0.8 * top.evidence - 8.0
+            or alike and is_rate_distortion(each.candidate.cause))]
+    else:
+        worth = [each for each in first if is_lasting(each.candidate) and search.excess_evidence(
+            each.candidate.cause, each.mean_evidence, SUSPECTED_RATE_FACTOR) > 0.0]
     worth.sort(key=lambda each: -each.evidence)
-    steps = [refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
-             for each in worth[:MAX_CONFOUNDERS]]
+    steps = sorted((refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
+                    for each in worth[:MAX_CONFOUNDERS]), key=lambda step: -step.score)
+    if not significant:
+        return None, steps
     # The screening fits a free size at the first shape; after refinement a cause may explain less
     # than its penalty.
-    steps = sorted((step for step in steps if step.score > fit.log_likelihood),
-                   key=lambda step: -step.score)
-    beyond = (step for step in steps if search.excess_evidence(
-        step.causes[-1].candidate.cause, step.score - fit.log_likelihood) > 0.0)
-    return next(beyond, None), steps
+    steps = [step for step in steps if step.score > fit.log_likelihood]
+    return next((step for step in steps if search.excess_evidence(
+        step.causes[-1].candidate.cause, step.score - fit.log_likelihood) > 0.0), None), steps
+
+
+def _screen_causes(search: Search, fit: RegressionFit,
+                   causes: Sequence[SelectedCause]) -> list[_ScreenedCandidate]:
+    """Return the best first shape of each cause."""
+    found = _columns_given_causes(search, causes).evidence(search.problem, fit.columns,
+                                                           [fit.residual[None]])[0]
+    # A second cause without a free size would only correct the shape of the first.
+    taken = {each.candidate.cause for each in causes if each.candidate.amplitude is not None}
+    first = [_ScreenedCandidate(search.candidates[max(own, key=lambda place: found[place])],
+                                float(found[own].max()),
+                                float(logsumexp(found[own])) - math.log(len(own)))
+             for cause, own in indices_by_cause(search.candidates).items()
+             if cause not in taken and np.isfinite(found[own]).any()]
+    scans = {'interference_tone': find_tones, 'reference_slip': find_slips}
+    return first + [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)
+                    if np.isfinite(each.mean_evidence)]
+
+
+def _columns_given_causes(search: Search, causes: Sequence[SelectedCause]) -> CandidateColumns:
+    """Return all candidates for the rate that the gyro senses, with shapes to two digits."""
+    key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes))
+                for each in causes if is_rate_distortion(each.candidate.cause))
+    if not key:
+        return search.candidate_columns
+    if key not in search.columns_cache:
+        search.columns_cache.clear()  # one is hundreds of megabytes
+        search.columns_cache[key] = make_candidate_columns(search.problem, search.candidates,
+                                                           causes)
+    return search.columns_cache[key]
+
+
+def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> SearchStep:
+    """
+    Add a cause with its best shape near the given one.
+
+    Parameters
+    ----------
+    fit : fit to which the cause is added
+    candidate : the cause
+    penalty : penalty for the choice of its shape, in log-likelihood
+
+    """
+    if fitted_shape_indices(candidate) and candidate.cause != 'reference_slip':
+        place = fitted_shape_indices(candidate)[0]
+        if candidate.cause in _SHAPE_EXPONENTS:  # begin with the shape that a free amplitude has
+            ratio = free_amplitude(fit, candidate)
+            candidate = with_shape(candidate, place, candidate.shapes[place] * math.copysign(
+                abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio))
+        first, half = candidate.shapes[place], candidate.half_width
+
+        def moved(by: float) -> Candidate:
+            return with_shape(candidate, place, first + by if half else first * math.exp(by))
+
+        half_range = half or _SHAPE_RANGE
+        best = minimize_scalar(lambda by: -add_cause(fit, moved(by)).log_likelihood,
+                               bounds=(-half_range, half_range), method='bounded',
+                               options={'xatol': 4e-3 * half_range, 'maxiter': 14})
+        candidate = moved(best.x)
+    done = add_cause(fit, candidate)
+    score = (done.log_likelihood - COLUMN_PENALTY * max(done.column_counts[-1] - 1, 0) - penalty
+             - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
+    return SearchStep((*fit.causes, SelectedCause(candidate, penalty=penalty)), score)
 
 
 def is_lasting(candidate: Candidate) -> bool:
@@ -595,61 +386,139 @@ def is_lasting(candidate: Candidate) -> bool:
     return is_named(candidate) and candidate.log_index is None and candidate.amplitude is None
 
 
-def find_suspected(search: Search, selected: Sequence[SelectedCause]) -> SearchStep | None:
-    """Return the named causes and one more, at `SUSPECTED_RATE_FACTOR` times the rate."""
+def find_suspected(search: Search, selected: Causes) -> Causes:
+    """Return one more cause at `SUSPECTED_RATE_FACTOR` times the rate, if there is one."""
     _, steps = find_strongest(search, selected)
     score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
     cause_names = {each.candidate.cause for each in selected}
     for step in steps:
-        candidate = step.causes[-1].candidate
-        if (is_lasting(candidate) and candidate.cause not in cause_names
-                and search.excess_evidence(candidate.cause, step.score - score,
+        found = step.causes[-1]
+        if (is_lasting(found.candidate) and found.candidate.cause not in cause_names
+                and search.excess_evidence(found.candidate.cause, step.score - score,
                                            SUSPECTED_RATE_FACTOR) > 0.0):
-            return step
-    return None
+            return (found,)
+    return ()
 
 
-def _screen_causes(search: Search, fit: RegressionFit,
-                   causes: Sequence[SelectedCause]) -> list[_ScreenedCandidate]:
-    """Return the best first shape of each cause."""
-    found = screen_candidates(fit, _columns_given_causes(search, causes))
-    # A second cause without a free size would only correct the shape of the first.
-    taken = {each.candidate.cause for each in causes if each.candidate.amplitude is not None}
-    first = [_ScreenedCandidate(search.candidates[max(own, key=lambda place: found[place])],
-                                float(found[own].max()), float(log_mean_exp(found[own])))
-             for cause, own in indices_by_cause(search.candidates).items()
-             if cause not in taken and np.isfinite(found[own]).any()]
-    scans = {'interference_tone': find_tones, 'reference_slip': find_slips}
-    return first + [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)
-                    if np.isfinite(each.mean_evidence)]
+# scans over all frequencies and times
+
+def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
+    """Return the logs that may contain one more instance of a cause."""
+    taken = [known.candidate.log_index for known in fit.causes if known.candidate.cause == cause]
+    return [run
+            for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]]
 
 
-def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> tuple[SelectedCause, ...]:
-    """Refine all shapes and values together by Gauss-Newton steps."""
-    current = tuple(causes)
-    for _ in range(3 if causes else 0):
-        done = fit_causes(search.problem, current)
-        values, _ = done.estimates
-        current = tuple(_gauss_newton_update(done, place, values) for place in range(len(current)))
-    return current
+def find_tones(fit: RegressionFit) -> list[_ScreenedCandidate]:
+    """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
+    found, left = [], fit.whitened_series()
+    for run in _logs_to_scan(fit, 'interference_tone'):
+        each, white = fit.problem.replays[run], left[run]
+        # Zero padding: a tone between two frequencies of the log would lose half of its power.
+        power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
+        lowest = 2 * MIN_TONE_PERIODS
+        if len(power) > 2 * lowest:
+            best = lowest + int(power[lowest:-2].argmax())
+            frequency = 0.5 * best / each.duration
+            # of all frequencies that are this one in means over some samples
+            places = np.arange(each.decimation // 2 + 1) / each.point_interval
+            aliases = np.concatenate([places + frequency, places[1:] - frequency])
+            frequency = max(aliases.tolist(), key=lambda at: _amplitude(
+                each, each.channels.output - each.reference, at))
+            # that of an encoder may be its own
+            if each.heading_step and (
+                    _amplitude(each, each.channels.output, frequency)
+                    < 0.7 * _amplitude(each, each.reference, frequency)):
+                continue
+            most, count = float(power[best]) - COLUMN_PENALTY, len(power) * len(left)
+            found.append(_ScreenedCandidate(
+                effect_candidate('interference_tone', frequency, log_index=run,
+                                 half_width=1.0 / each.duration), most, most - math.log(count)))
+    return [max(found, key=lambda one: one.mean_evidence)] if found else []
 
 
-def _gauss_newton_update(fit: RegressionFit, cause_index: int, values: Array) -> SelectedCause:
-    known = fit.causes[cause_index]
-    own = dict(zip(fit.column_owners, values))
-    free = tuple(float(own.get((cause_index, number), 0.0))
-                 for number in range(fit.column_counts[cause_index]))
-    found = free or (known.candidate.amplitude or 0.0,)
-    candidate = known.candidate
-    for shape in fitted_shape_indices(candidate):
-        change = own.get((cause_index, -1 - shape), 0.0)
-        before = candidate.shapes[shape]
-        candidate = with_shape(candidate, shape, before
-                               + float(np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
-    return replace(known, candidate=candidate, values=found or known.values)
+def _amplitude(replay: Replay, values: Array, frequency: float) -> float:
+    """Return the amplitude of a frequency in samples."""
+    wave = np.exp(-2.0j * np.pi * frequency * replay.channels.time[replay.valid])
+    return float(2.0 * np.abs(np.mean(values[replay.valid] * wave)))
 
 
-def search_causes(search: Search) -> tuple[SelectedCause, ...]:
+def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
+    """Return the clearest jumps of the reference's heading, where it accelerates."""
+    found, left = [], fit.whitened_series()
+    factors = [own / each for own, each in zip(fit.whitening_factors(), fit.problem.split_by_log(
+        fit.problem.deviation))]
+    for run in _logs_to_scan(fit, 'reference_slip'):
+        each = fit.problem.replays[run]
+        acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
+        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
+        if acceleration.max() > 0.0 and len(moments):
+            tried = [_fit_slips(each, run, left[run], factors[run], moments,
+                                max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
+            # The largest number indicates a continuous disturbance, not slips.
+            if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
+                found += tried
+    return [max(found, key=lambda one: one.mean_evidence)] if found else []
+
+
+def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
+               width: float) -> _ScreenedCandidate:
+    """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
+    time = np.arange(replay.point_count) * replay.point_interval
+    likely = math.log(len(indices) * len(SLIP_DURATIONS))
+    size, deviation = _matched_filter(white, factor, time, width)
+    wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
+    value = 0.5 * (size[indices] / deviation) ** 2 - likely - COLUMN_PENALTY
+    # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
+    # of an encoder is constant at rest, and differs by up to a step between two rests.
+    is_temporary = wide[indices] / size[indices] < 0.3
+    value[is_temporary | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
+    chosen: list[float] = []
+    total = 0.0
+    channels = replay.channels
+    residual, output, reference = (replay.resample(each) for each in (
+        channels.output - channels.rate, channels.output, replay.reference))
+    for place in np.argsort(-value)[:200]:
+        if _is_sample_of_gyro(residual, output, reference, int(indices[place]),
+                              max(3, round(2.0 * width / replay.point_interval))):
+            continue
+        if (value[place] <= 0.0 and chosen) or len(chosen) == MAX_SLIPS:
+            break
+        at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
+        if all(abs(at - other) > 1.0 for other in chosen):
+            chosen.append(at)
+            total += float(value[place])
+    return _ScreenedCandidate(
+        effect_candidate('reference_slip', width, *chosen, log_index=log_index),
+        total + likely * len(chosen), total if chosen else -np.inf)
+
+
+def _is_sample_of_gyro(residual: Array, output: Array, reference: Array, index: int,
+                       reach: int) -> bool:
+    """Tell whether one sample of the output, not of the reference, has most of a deviation."""
+    begin = max(index - reach, 0)
+    near = residual[begin:index + reach + 1]
+    off = (near - np.median(near)) ** 2
+    if off.max() <= max(40.0 * np.median(off), 0.4 * off.sum()):
+        return False
+    at = begin + int(off.argmax())
+    of_output, of_reference = (np.abs(np.diff(each[max(at - 3, 0):at + 4], 2)).max()
+                               for each in (output, reference))
+    return bool(of_output >= of_reference)
+
+
+def _matched_filter(white: Array, whitening_factor: Array, time: Array,
+                    width: float) -> tuple[Array, float]:
+    """Return the size of a pulse at each time, rad, and its standard deviation."""
+    kernel = inverse_cosine_transform(
+        cosine_transform(gaussian_pulse(time, time[len(time) // 2], width)) * whitening_factor)
+    return (correlate(white, kernel, 'same') / (kernel @ kernel),
+            float(1.0 / np.sqrt(kernel @ kernel)))
+
+
+# the growing search
+
+def search_causes(search: Search) -> Causes:
     """
     Return the causes that the data support, with values.
 
@@ -670,79 +539,129 @@ def search_causes(search: Search) -> tuple[SelectedCause, ...]:
                    + (0.0 if is_named(each.candidate) else UNNAMED_PENALTY) for each in named))
 
 
+def _select_forward(search: Search) -> Causes:
+    """Add causes one by one (forward selection)."""
+    named: Causes = ()
+    for _ in range(2 * MAX_CAUSES):  # some are removed again
+        step, _ = find_strongest(search, named) if len(named) < MAX_CAUSES else (None, [])
+        if step is None:
+            break
+        named = eliminate_backward(search, refine_jointly(search, step.causes))
+    return named
+
+
+def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> Causes:
+    """Refine all shapes and values together by Gauss-Newton steps."""
+    current = tuple(causes)
+    for _ in range(3 if causes else 0):
+        done = fit_causes(search.problem, current)
+        current = tuple(_gauss_newton_update(done, place) for place in range(len(current)))
+    return current
+
+
+def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> SelectedCause:
+    known, candidate = fit.causes[cause_index], fit.causes[cause_index].candidate
+    own = dict(zip(fit.column_owners, fit.estimates[0].tolist()))
+    values = tuple(own.get((cause_index, number), 0.0)
+                   for number in range(fit.column_counts[cause_index]))
+    for shape in fitted_shape_indices(candidate):
+        most = 0.3 * abs(candidate.shapes[shape])
+        change = np.clip(own.get((cause_index, -1 - shape), 0.0), -most, most)
+        candidate = with_shape(candidate, shape, candidate.shapes[shape] + float(change))
+    return replace(known, candidate=candidate, values=values or (candidate.amplitude or 0.0,))
+
+
 def complexity_penalty(cause: SelectedCause) -> float:
     """Return the penalty of shapes and columns of a cause, in log-likelihood."""
     shapes = max(cause.penalty, SHAPE_PENALTY * len(fitted_shape_indices(cause.candidate)))
     return shapes + COLUMN_PENALTY * max(len(cause.values) - 1, 0)
 
 
-def _select_forward(search: Search) -> tuple[SelectedCause, ...]:
-    """Add causes one by one (forward selection)."""
-    named: tuple[SelectedCause, ...] = ()
-    for _ in range(2 * MAX_CAUSES):  # some are removed again
-        step, _ = find_strongest(search, named) if len(named) < MAX_CAUSES else (None, [])
-        if step is None:
-            break
-        named = refine_jointly(search, step.causes)
-        if len(named) > 1:
-            named = eliminate_backward(search, named)
-    return _exchange_causes(search, eliminate_backward(search, named))
-
-
-def eliminate_backward(search: Search,
-                       causes: tuple[SelectedCause, ...]) -> tuple[SelectedCause, ...]:
-    """Remove causes that are not significant given the others, the weakest first."""
-    return remove_weakest(search, causes, lambda some: [
-        search.excess_evidence(each.candidate.cause, evidence_for(search, some, place))
-        for place, each in enumerate(some)], 0.0)[0]
-
-
-def remove_weakest(search: Search, causes: tuple[SelectedCause, ...],
-                   strength_of: Callable[[tuple[SelectedCause, ...]], Sequence[float]],
-                   threshold: float) -> tuple[tuple[SelectedCause, ...], list[SelectedCause]]:
-    """Remove the weakest cause and refine the others until all exceed a strength."""
-    removed: list[SelectedCause] = []
-    while causes:
-        found = strength_of(causes)
-        weakest = int(np.argmin(found))
-        if found[weakest] > threshold:
-            break
-        removed.append(causes[weakest])
-        causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
-    return causes, removed
-
-
-def _exchange_causes(search: Search,
-                     causes: tuple[SelectedCause, ...]) -> tuple[SelectedCause, ...]:
-    """Remove each cause on trial, and replace it if another is better or none is needed."""
-    for known in causes[:-1]:
-        others = tuple(each for each in causes if each is not known)
-        step, _ = find_strongest(search, others)
-        if step is None:
-            return refine_jointly(search, others)
-        if (step.causes[-1].candidate.cause != known.candidate.cause
-                and step.score > fit_causes(search.problem, causes).log_likelihood + 1.0):
-            return refine_jointly(search, step.causes)
-    return causes
-
-
-def find_alternatives(search: Search, causes: tuple[SelectedCause, ...],
-                      cause_index: int) -> list[tuple[SelectedCause, float]]:
-    """Return a named cause and its alternatives, with their deficits in log-likelihood."""
-    cause = causes[cause_index].candidate.cause
-    _, steps = find_strongest(search, causes[:cause_index] + causes[cause_index + 1:])
-    mine = max((step.score for step in steps if step.causes[-1].candidate.cause == cause),
-               default=np.inf)
-    return [(step.causes[-1], mine - step.score) for step in steps
-            if mine - step.score < RULED_OUT_DEFICIT and is_named(step.causes[-1].candidate)]
-
-
 def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: int) -> float:
     """Return the evidence for one of the causes given the others."""
-    others = tuple(each for number, each in enumerate(causes) if number != cause_index)
+    others = [*causes[:cause_index], *causes[cause_index + 1:]]
     return (fit_causes(search.problem, causes).log_likelihood
             - fit_causes(search.problem, others).log_likelihood
             - complexity_penalty(causes[cause_index]))
+
+
+def eliminate_backward(search: Search, causes: Causes) -> Causes:
+    """Remove causes that are not significant given the others, the weakest first."""
+    while causes:
+        excess = [search.excess_evidence(each.candidate.cause, evidence_for(search, causes, place))
+                  for place, each in enumerate(causes)]
+        weakest = int(np.argmin(excess))
+        if excess[weakest] > 0.0:
+            break
+        causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
+    return causes
+
+
+# names
+
+def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
+    """
+    Separate named causes from structure without a name.
+
+    A name is withdrawn if structure without a name lies along the same variable, if there are many
+    tones, or if a cause along a temperature differs between logs.
+
+    """
+    variables = {unnamed_variable(each.candidate)
+                 for each in causes if not is_named(each.candidate)}
+    exceeded = {name for variable in variables for name in variable.split(' and ')}
+    tones = [each.candidate.log_index for each in causes
+             if each.candidate.cause == 'interference_tone']
+    if any(tones.count(run) >= MAX_PER_LOG['interference_tone'] for run in tones):
+        exceeded.add('frequency')
+    kept = [each for each in causes
+            if is_named(each.candidate) and CAUSES[each.candidate.cause].along not in exceeded
+            and _is_repeatable(search, causes, each)]
+    unnamed = tuple(each for each in causes if each not in kept
+                    and (not is_named(each.candidate)
+                         or CAUSES[each.candidate.cause].along not in variables))
+    if len(kept) == len(causes):
+        return causes, ()
+    left = eliminate_backward(search, refine_jointly(search, (*kept, *unnamed)))
+    keys = {(each.candidate.cause, each.candidate.log_index) for each in kept}
+    return tuple(each for each in left
+                 if (each.candidate.cause, each.candidate.log_index) in keys), unnamed
+
+
+def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool:
+    """Tell whether a cause along a temperature has the same size in all logs within the noise."""
+    candidate, runs = cause.candidate, len(search.problem.replays)
+    if (runs == 1 or CAUSES[candidate.cause].along not in _REPEATING_VARIABLES
+            or candidate.amplitude is not None):
+        return True
+    alone = [SelectedCause(replace(candidate, log_index=run)) for run in range(runs - 1)]
+    more = 2.0 * (fit_causes(search.problem, [*causes, *alone]).log_likelihood
+                  - fit_causes(search.problem, causes).log_likelihood)
+    return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
+
+
+# confirmation
+
+def confirm(search: Search, causes: Causes) -> tuple[Causes, dict[SelectedCause, str]]:
+    """
+    Remove causes that do not predict held-out stretches, or whose intervals include 0.
+
+    Returns
+    -------
+    the confirmed causes, and the removed ones with the reason
+
+    """
+    removed = {}
+    while causes:
+        predicted = np.array(held_out_sigmas(search, causes)) / MIN_PREDICTION_SIGMAS
+        sizes = np.array(_size_sigmas(search, causes)) / NORMAL_QUANTILE_975
+        weakest = int(np.argmin(np.minimum(predicted, sizes)))
+        if min(predicted[weakest], sizes[weakest]) > 1.0:
+            break
+        removed[causes[weakest]] = (UNPREDICTIVE if predicted[weakest] <= 1.0
+                                    else 'the interval of its size includes 0')
+        causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
+    return causes, removed
 
 
 def prediction_sigmas(log_likelihood_gains: Array) -> float:
@@ -779,3 +698,48 @@ def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[flo
         found.append(prediction_sigmas(
             0.5 * np.bincount(stretch, before ** 2 - (before - size[stretch] * added) ** 2)))
     return found
+
+
+def _size_sigmas(search: Search, causes: Causes) -> list[float]:
+    """Return the distance of the size of each cause from 0 in standard deviations."""
+    found, sigmas = fit_causes(search.problem, causes), []
+    for place, known in enumerate(causes):
+        sizes = found.coefficients(place) or list(found.shapes(place).values())
+        # sine or cosine alone may be 0 for a wave that is not
+        wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
+        sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
+                      else abs(sizes[0].value) / sizes[0].deviation)
+    return sigmas
+
+
+def choose_simplest(search: Search, named: Causes, unnamed: Causes,
+                    ) -> tuple[Causes, list[list[tuple[SelectedCause, float]]]]:
+    """
+    Replace each cause by its simplest alternative.
+
+    Returns
+    -------
+    the causes, and for each itself and its alternatives, with their deficits in log-likelihood
+
+    """
+    def size(known: SelectedCause) -> int:
+        """Return the number of fitted values of a cause."""
+        candidate = known.candidate
+        return len(fitted_shape_indices(candidate)) + (
+            0 if candidate.amplitude is not None
+            else len(candidate.columns(search.problem.replays[0])))
+
+    sets = []
+    for place in range(len(named)):
+        cause = named[place].candidate.cause
+        _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
+        mine = max((step.score for step in steps if step.causes[-1].candidate.cause == cause),
+                   default=np.inf)
+        members = [(step.causes[-1], mine - step.score) for step in steps
+                   if mine - step.score < RULED_OUT_DEFICIT
+                   and is_named(step.causes[-1].candidate)] or [(named[place], 0.0)]
+        chosen = min((each for each, _ in members), key=size)
+        if size(chosen) < size(named[place]):
+            named = refine_jointly(search, (*named[:place], chosen, *named[place + 1:]))
+        sets.append(members)
+    return named, sets

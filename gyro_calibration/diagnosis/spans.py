@@ -41,15 +41,13 @@ from gyro_calibration.calibration.noise_grid import (
     heading_noise,
     SharedNoise,
 )
-from gyro_calibration.diagnosis.data_quality import (
-    encoder_step,
-    heading_difference,
-    rate_noise_share,
-)
 from gyro_calibration.diagnosis.expected_output import (
     bridge_gaps,
+    encoder_step,
+    heading_difference,
     integrate_trapezoidal,
     integrate_with_curvature,
+    rate_noise_share,
 )
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import robust_deviation, white_noise_deviation

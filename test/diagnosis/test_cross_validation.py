@@ -10,7 +10,7 @@
 
 """The stated improvement by an extended model on held-out blocks: the state before, and limits."""
 
-from gyro_calibration.diagnosis.cross_validation import (
+from gyro_calibration.diagnosis.extended_model import (
     heading_error_shares,
     jackknife_change,
     measure_gain,

@@ -20,12 +20,7 @@ from gyro_calibration.diagnosis.extended_model import (
     unmergeable_causes,
 )
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression import (
-    build_problem,
-    fit_causes,
-    FittedValues,
-    SelectedCause,
-)
+from gyro_calibration.diagnosis.regression import build_problem, fit_causes, SelectedCause
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import headline, is_in_extended_model
@@ -86,7 +81,7 @@ def on_top(own, found, *shapes, supply=None):
     log = replace(drive(), supply=supply)
     laid = replay(log, np.ones(len(log), dtype=bool), np.random.default_rng(3), model=model)
     named = [SelectedCause(effect_candidate(found, *shapes), (1e-4,))]
-    return model, FittedValues(fit_causes(build_problem([laid]), named), (laid,))
+    return model, fit_causes(build_problem([laid]), named)
 
 
 VOLTS = 12.0 + np.sin(0.05 * TIME)
@@ -105,9 +100,10 @@ BESIDE = {'bias_temperature': (term('bias_temperature', 25.0, 1e-4), 'bias_tempe
                          ids=BESIDE)
 def test_the_extended_model_says_what_model_and_finding_say_together(own, found, shapes):
     model, outcome = on_top(own, found, *shapes, supply=VOLTS)
-    new, (laid,) = add_causes(model, outcome, 1e-5), outcome.replays
+    new, (laid,) = add_causes(model, outcome, 1e-5), outcome.problem.replays
     channels, rate = laid.channels, laid.channels.rate
-    together = rate + laid.simulated_error + outcome.explained_outputs[0] + outcome.biases[0]
+    together = (rate + laid.simulated_error + outcome.total_contribution(laid, 0)
+                + outcome.biases[0])
     assert (not unmergeable_causes(model, outcome) and new.output_from_channels(
         channels.with_rate(rate, rate)) == pytest.approx(together, abs=1e-12))
     # how well the error is known is what the model, the bias and the finding say of it

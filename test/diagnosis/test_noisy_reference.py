@@ -13,7 +13,7 @@
 from dataclasses import replace
 
 from diagnosed import judge_findings, log_of
-from gyro_calibration.diagnosis.data_quality import (
+from gyro_calibration.diagnosis.expected_output import (
     classify_reference,
     heading_difference,
     is_reference_limiting,

@@ -11,15 +11,13 @@
 """The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
 from gyro_calibration.diagnosis.pipeline import _noise_findings
-from gyro_calibration.diagnosis.regression import build_problem, fit_causes, FittedValues
+from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.residuals import (
-    _BandEnergies,
-    _drop_tone_bands,
-    _fit_noise,
+    BandEnergies,
+    drop_tone_bands,
     NoiseParameters,
     residual_curves,
-    unbiased_residuals,
 )
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel
@@ -44,8 +42,8 @@ def record(noise, generator, duration, interval):
 def inside(log, generator):
     """Return which bins of all curves but the spectrum are within their bands, and how many."""
     laid = replay(log, np.ones(len(log.time), dtype=bool), generator)
-    found = FittedValues(fit_causes(build_problem([laid]), []), (laid,))
-    shown = [each for each in residual_curves(unbiased_residuals(found), found)
+    found = fit_causes(build_problem([laid]), [])
+    shown = [each for each in residual_curves(found.unbiased_residuals, found)
              if each.along != 'frequency']
     off = np.concatenate([np.abs(each.after) / each.deviation for each in shown])
     assert ({'time', 'rate', 'heading', 'temperature',
@@ -71,11 +69,11 @@ def test_a_vibration_is_not_in_the_angle_random_walk(tone):
     parts = np.column_stack([np.ones(60), 1.0 / frequency, 1.0 / frequency ** 2])
     energy = 4.0 * generator.chisquare(count)
     energy[56] *= tone
-    bands = _BandEnergies(energy, count, parts, np.zeros(60))
-    used = _drop_tone_bands(bands)
+    bands = BandEnergies(energy, count, parts, np.zeros(60))
+    used = drop_tone_bands(bands)
     assert len(used.energy) == (60 if tone == 1.0 else 59)
-    assert np.exp(0.5 * _fit_noise(used, {})[0][0]) == pytest.approx(2.0, rel=0.03)
-    assert tone == 1.0 or np.exp(0.5 * _fit_noise(bands, {})[0][0]) > 2.2
+    assert np.exp(0.5 * used.fit()[0][0]) == pytest.approx(2.0, rel=0.03)
+    assert tone == 1.0 or np.exp(0.5 * bands.fit()[0][0]) > 2.2
 
 
 FIGURES = NoiseParameters(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3)},
