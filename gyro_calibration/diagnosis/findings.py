@@ -218,7 +218,13 @@ class Gain:
     @property
     def is_worse(self) -> bool:
         """Tell whether the extended model has significantly larger errors."""
-        return any(change is not None and change.is_worse for change in (self.rate, self.heading))
+        return any(change.is_worse for _, change, _ in self.rows())
+
+    def rows(self) -> list[tuple[str, Change, str]]:
+        """Return what was measured before and after, with its unit of SI."""
+        heading = ([] if self.heading is None
+                   else [(f'heading error over {self.window:g} s', self.heading, 'rad')])
+        return [*heading, ('rate error', self.rate, 'rad/s')]
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
