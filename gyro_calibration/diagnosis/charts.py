@@ -142,10 +142,11 @@ def _draw_svg(chart: Chart, known: Sequence[Mask]) -> Markup:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
     text, grid = _STYLES['text'][0], _STYLES['grid'][0]
-    style = {'svg.fonttype': 'none', 'svg.hashsalt': chart.name, 'font.size': 11,
-             'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'text.color': text,
-             'axes.edgecolor': grid, 'axes.labelcolor': text, 'grid.color': grid,
-             'xtick.color': text, 'ytick.color': text, 'legend.frameon': False}
+    style: dict[Any, Any] = {
+        'svg.fonttype': 'none', 'svg.hashsalt': chart.name, 'font.size': 11,
+        'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'text.color': text,
+        'axes.edgecolor': grid, 'axes.labelcolor': text, 'grid.color': grid,
+        'xtick.color': text, 'ytick.color': text, 'legend.frameon': False}
     file = StringIO()
     with matplotlib.rc_context(style), warnings.catch_warnings():
         warnings.simplefilter('ignore')  # of letters that the font lacks
