@@ -60,7 +60,6 @@ from gyro_calibration.diagnosis.spans import (
     lay_out_spans,
     MIN_STRETCHES,
     SpanFit,
-    wander_noise,
     whiten_regression,
     WhitenedRegression,
 )
@@ -75,19 +74,15 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-#: Least and largest number of parts of a log that are held out in turn, and least length, s.
-_MIN_PARTS, _MAX_PARTS, _MIN_PART_DURATION = 2, 6, 80.0
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
 #: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
 _STEP_SHARES = {CHECKS_STEP: 4, 'data quality': 3, 'bias and scale factor error': 26,
                 'search for causes': 45, 'cross-validation': 4, 'findings': 18}
-#: Standard deviations of a value that is found in 95 % of logs, and of a lag that is ruled out.
-DETECTION_SIGMAS, _LAG_EXCLUSION_SIGMAS = 4.8, 3.0
+#: Standard deviations of a value that is found in 95 % of logs.
+DETECTION_SIGMAS = 4.8
 #: Longest lag of a gyro, s.
 _MAX_GYRO_LAG = 0.1
-#: Bins of a curve.
-_CURVE_BINS = 20
 #: Shares of the false-alarm rate: for the search for causes, for a delay, and, with a model, for
 #: bias and scale factor error. A delay between two clocks is usual and has a separate level.
 _SEARCH_ALARM_SHARE = 0.6
@@ -115,7 +110,7 @@ MAX_CAUSES, FOLD_COUNT = 4, 5
 #: that nearly cancel each other.
 _MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
 #: Variables whose causes are similar to errors of an encoder that repeat with its position.
-_MOTION_VARIABLES = frozenset({'rate', 'rate_change', 'heading'})
+_MOTION_VARIABLES = frozenset({'rate', 'heading'})
 #: Largest likelihood ratio between the best cause and an equivalent one.
 _MAX_LIKELIHOOD_RATIO = 25.0
 
@@ -157,14 +152,14 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
         # causes that do not improve the prediction are not added to the model
         model_fit = plain
-        if not plain.spans.is_fine:
+        if not plain.spans.treatment.is_fine:
             found = [replace(each, is_established=False) for each in found]
             extended = plain
         gain = _cross_validated_gain(plain, plain)
     steps.begin('findings')
     parts, time = _heading_contributions(extended), extended.spans.time
     noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
-    rates = extended.spans.point_rates()
+    rates = extended.spans.point_means(np.asarray(extended.spans.channels.rate))
     motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
     of_heading = heading_error_shares([(parts, time)],
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
@@ -197,27 +192,19 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
 def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: float,
                     reference: Reference) -> Iterator[Finding]:
     """Give delay, and with a model bias and scale factor error, if they are established."""
-    lag = next((each for each in fit.causes if each.cause == 'bandwidth'), None)
     own_clock = reference.kind not in _SAME_CLOCK
     for place, name in enumerate(BASE_VALUES):
         if name != 'time_offset' and model is None:
             continue
-        value, deviation = float(fit.values[place]), math.sqrt(fit.covariance[place, place])
+        value, variance = float(fit.values[place]), float(fit.covariance[place, place])
         if name == 'bias' and model is not None:
             # the mean bias of a log differs from that of the model by bias wander
             duration = float(fit.spans.time[-1] - fit.spans.time[0])
-            wander = max(2.0 / math.pi * each.bias_instability ** 2
-                         + each.rate_random_walk ** 2 * duration / 3.0
-                         for each in (_gyro_noise(fit), model.noise))
-            deviation = math.sqrt(deviation ** 2 + wander)
-        if name == 'time_offset' and lag is not None:
-            # to first order a lag is a delay
-            place_of_lag = fit.value_slice(lag).start
-            constant = _lag_estimate(float(fit.values[place_of_lag]), fit.half_width(place_of_lag))
-            value -= constant.estimate
-            deviation = math.hypot(deviation, constant.deviation)
-        effective = float(fit.effective_stretches[place])
-        freedom = float(fit.freedom[place])
+            variance += max(2.0 / math.pi * each.bias_instability ** 2
+                            + each.rate_random_walk ** 2 * duration / 3.0
+                            for each in (_gyro_noise(fit), model.noise))
+        deviation = math.sqrt(variance)
+        effective, freedom = float(fit.effective_stretches[place]), float(fit.freedom[place])
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
         share = 1.0 if name == 'time_offset' and own_clock else _VALUE_ALARM_SHARES[name]
         if chance >= share * false_alarm_rate or effective < MIN_STRETCHES:
@@ -226,13 +213,13 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                    NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place])
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         if name == 'time_offset':
-            of_reference = not 0.0 < value < _MAX_GYRO_LAG
-            if not (of_reference or lag) and _is_lag_possible(fit, value):
+            of_gyro = 0.0 < value < _MAX_GYRO_LAG
+            if of_gyro and _is_lag_possible(fit, value):
                 confounders = ['bandwidth']
             if own_clock:
                 known = {'remedy': 'synchronize the clocks of gyro and reference; the model does '
                          'not contain it'}
-                if of_reference:
+                if not of_gyro:
                     known['cause'] = 'The gyro has a time offset from its reference.'
         yield make_finding(name, {name: Estimate.from_half_width(value, half, CAUSES[name].unit)},
                            max(chance, MIN_PROBABILITY), confounders,
@@ -241,57 +228,46 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
 
 
 def _is_lag_possible(fit: SpanFit, delay: float) -> bool:
-    """Tell whether a lag explains the log as well as the delay does."""
-    if not fit.spans.is_fine:
+    """Tell whether a lag explains the log as well as the delay does, to three sigma."""
+    if not fit.spans.treatment.is_fine:
         return True
     data = whiten_regression(fit, (*fit.causes, CauseTerm('bandwidth')))
     place = len(fit.values)
     inverse = np.linalg.pinv(data.design.T @ data.design)
     square = float((inverse @ data.design.T @ data.observed)[place])
-    return (abs(square - 0.5 * delay ** 2)
-            < _LAG_EXCLUSION_SIGMAS * math.sqrt(inverse[place, place]))
+    return abs(square - 0.5 * delay ** 2) < 3.0 * math.sqrt(inverse[place, place])
 
 
 def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
+    term = found_cause.cause_term
     fit = (extended if found_cause.is_established
-           else fit_spans(extended.spans, [*extended.causes, found_cause.cause_term]))
-    name, known = found_cause.cause_term.cause, CAUSES[found_cause.cause_term.cause]
-    places = fit.value_slice(found_cause.cause_term)
+           else fit_spans(extended.spans, [*extended.causes, term]))
+    places = fit.value_slice(term)
     values = fit.values[places]
     half = np.array([fit.half_width(place) for place in range(places.start, places.stop)])
-    effect = CATALOGUE.get(name)
+    effect = CATALOGUE.get(term.cause)
     unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
-            else known.unit)
-    if name == 'bandwidth':
-        parameters = {name: _lag_estimate(float(values[0]), float(half[0]))}
-    else:
-        size = float(values[0]) if len(values) == 1 else float(np.hypot(*values))
-        within = half[0] if len(values) == 1 else float(np.hypot(*(values * half))) / size
-        parameters = {name: Estimate.from_half_width(size, float(within), unit)}
+            else CAUSES[term.cause].unit)
+    size, within = float(values[0]), float(half[0])
+    if len(values) > 1:
+        size = float(np.hypot(*values))
+        within = float(np.hypot(*(values * half))) / size
+    parameters = {term.cause: Estimate.from_half_width(size, within, unit)}
     for parameter, value in zip(() if effect is None else effect.nonlinear_parameters,
-                                found_cause.cause_term.shapes):
+                                term.shapes):
         if parameter.default is None and parameter.name not in parameters:
             parameters[parameter.name] = Estimate.from_half_width(value, 0.0, parameter.unit)
     shown = make_finding(
-        name, parameters, found_cause.p_value,
-        [other for other in found_cause.probability if other != name],
-        minimum_detectable=(DETECTION_SIGMAS * float(half[0]) / NORMAL_QUANTILE_975
-                            if len(values) == 1 and name != 'bandwidth' else None),
+        term.cause, parameters, found_cause.p_value,
+        [other for other in found_cause.probability if other != term.cause],
+        minimum_detectable=(DETECTION_SIGMAS * within / NORMAL_QUANTILE_975
+                            if len(values) == 1 else None),
         evidence=f'it adds {found_cause.prediction_gain:.1f} to the log-likelihood of held-out '
-        'stretches, and '
-        f'is selected in {100.0 * found_cause.selection_share:.0f} % of the folds',
+        f'stretches, and is selected in {100.0 * found_cause.selection_share:.0f} % of the folds',
         probability=found_cause.probability,
-        where=((found_cause.cause_term.shapes[0], float(fit.spans.time[-1]))
-               if found_cause.cause_term.is_single_event else None))
+        where=((term.shapes[0], float(fit.spans.time[-1])) if term.is_single_event else None))
     return shown if found_cause.is_established else mark_suspected(shown)
-
-
-def _lag_estimate(half_square: float, half_width: float) -> Estimate:
-    """Return a time constant from half of its square."""
-    low, size, high = (math.sqrt(2.0 * max(half_square + change, 0.0))
-                       for change in (-half_width, 0.0, half_width))
-    return Estimate(size, (low, high), 's')
 
 
 def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
@@ -318,10 +294,7 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
     for cause in fit.causes:
         own_places = fit.value_slice(cause)
         values = fit.values[own_places].tolist()
-        if cause.cause == 'bandwidth':
-            terms.append(Term(CATALOGUE['bandwidth'], (math.sqrt(2.0 * max(values[0], 1e-10)),)))
-            places.append(None)
-        elif cause.cause in CATALOGUE:
+        if cause.cause in CATALOGUE:
             terms.append(Term(CATALOGUE[cause.cause], (*cause.shapes, *values)))
             places += [*(None for _ in cause.shapes), *range(own_places.start, own_places.stop)]
     covariance = np.zeros((len(places), len(places)))
@@ -341,7 +314,7 @@ def _gyro_noise(fit: SpanFit) -> Noise:
     return Noise(fit.noise_size('angle_random_walk'),
                  **{part.name: fit.noise_size(part.name)
                     if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
-                    for part in wander_noise(fit.spans)})
+                    for part in fit.spans.bias_wander()[1]})
 
 
 # gain
@@ -362,8 +335,8 @@ def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
 def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     """Hold out each part of a log in turn, fit the others, and predict heading and rate there."""
     time, spans = plain.spans.time, plain.spans
-    duration, count = float(time[-1] - time[0]), len(time) - 1
-    parts = int(np.clip(duration / _MIN_PART_DURATION, _MIN_PARTS, _MAX_PARTS))
+    duration = float(time[-1] - time[0])
+    parts = int(np.clip(duration / 80.0, 2, 6))
     number = np.minimum(((time[1:] - time[0]) * parts / duration).astype(int), parts - 1)
     window = min(HEADING_WINDOW, MAX_WINDOW_SHARE * duration / parts)
     # under the noise of the plain fit, given the prior of the wandering bias
@@ -384,7 +357,7 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
         rows = np.append(kept, len(spans.observed) + np.arange(prior))
         for name, (columns, white) in models.items():
             values = np.linalg.lstsq(white[rows], noisy.observed[rows], rcond=None)[0]
-            left = (spans.observed - columns @ values[:columns.shape[1]])[:count][held]
+            left = (spans.observed - columns @ values[:columns.shape[1]])[held]
             stamps = time[held[0]:held[-1] + 2]
             turned = window_changes(left, stamps, window)
             squares[name].append((float(np.sum((left / np.diff(stamps)) ** 2)),
@@ -440,8 +413,7 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
     measured = fit.spans.span_integrals(fit.spans.log.output)[:len(steps)] / steps
     before, after = (-each / steps
                      for each in (sum(parts.values(), 0.0 * parts['left']), parts['left']))
-    order = np.array_split(np.argsort(measured, kind='stable'),
-                           min(_CURVE_BINS, len(steps) // 4 + 1))
+    order = np.array_split(np.argsort(measured, kind='stable'), min(20, len(steps) // 4 + 1))
     at, given, left = (np.array([float(each[part].mean()) for part in order])
                        for each in (measured, before, after))
     deviation = np.array([float(after[part].std()) / math.sqrt(len(part)) for part in order])
@@ -483,7 +455,7 @@ def propose_terms(fit: SpanFit) -> Iterator[CauseTerm]:
     so that none of these is a candidate.
 
     """
-    return (each for each in _columns(fit)
+    return (each for each in _all_terms(fit)
             if not (fit.scale_held and _follows_the_rate(each.cause)))
 
 
@@ -493,23 +465,22 @@ def _follows_the_rate(cause: str) -> bool:
     return (cause == 'reference_once_per_rev' if effect is None else 'rate' in effect.inputs)
 
 
-def _columns(done: SpanFit) -> Iterator[CauseTerm]:
-    """Give the columns of all causes for the channels that the log has."""
-    log, fine, time = done.spans.log, done.spans.is_fine, done.spans.time
+def _all_terms(done: SpanFit) -> Iterator[CauseTerm]:
+    log, fine, time = done.spans.log, done.spans.treatment.is_fine, done.spans.time
     duration = float(time[-1] - time[0])
     for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
                  'rate_ramp', 'heading_sensitivity', 'reference_once_per_rev'):
         yield CauseTerm(name)
-    if fine:
-        yield CauseTerm('bandwidth', is_positive=True)
     for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist():
         yield CauseTerm('warm_up', (constant,))
     for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist():
-        yield CauseTerm('bias_step', (moment,), is_single_event=True)
+        yield CauseTerm('bias_step', (moment,))
         if not fine:
-            yield CauseTerm('reference_slip', (moment,), is_single_event=True)
-    if log.temperature is not None and np.ptp(log.temperature) > 0.2:
-        middle = float(log.temperature.mean())
+            yield CauseTerm('reference_slip', (moment,))
+    has = {name for name, least in MIN_CHANNEL_RANGE.items()
+           if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
+    if 'temperature' in has:
+        middle = float(np.mean(np.asarray(log.temperature)))
         for name in ('bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature'):
             yield CauseTerm(name, (middle,))
         for filter_time in (3.0, 10.0):
@@ -519,12 +490,11 @@ def _columns(done: SpanFit) -> Iterator[CauseTerm]:
                 yield CauseTerm('thermal_lag', (constant,))
             for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4)):
                 yield CauseTerm('thermal_hysteresis', (filter_time, threshold))
-    if log.specific_force is not None and np.ptp(log.specific_force) > 0.0:
+    if 'specific_force' in has:
         yield CauseTerm('acceleration_sensitivity')
         yield CauseTerm('vibration_rectification', (1.0,))
-    if log.supply is not None and np.ptp(log.supply) > 0.0:
+    if 'supply' in has:
         yield CauseTerm('supply_sensitivity', (5.0,))
-    has = [name for name in MIN_CHANNEL_RANGE if getattr(log, name) is not None]
     for name, shapes in user_effects(has, has_motion=True):
         yield CauseTerm(name, shapes)
 
@@ -615,7 +585,7 @@ def _find_best_cause(fit: SpanFit, rich_fit: SpanFit, open_terms: Sequence[Cause
     stretches = chances[place][2]
     found = _cross_fit(data, columns, places, open_terms, equivalent_causes)
     # errors of a course are correlated over time, so that distant stretches must be predicted too
-    prediction_sigma, predicted, chosen = max(found) if fit.spans.is_fine else min(found)
+    prediction_sigma, predicted, chosen = max(found) if fit.spans.treatment.is_fine else min(found)
     probability = {name: chance for name, chance in probabilities(
         {name: gain - chances[other][1] for name, other in best_of.items()}).items()
         if name in equivalent_causes}
@@ -632,13 +602,10 @@ def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[s
     base, _ = np.linalg.qr(data.design[rows])
     both = np.column_stack([columns, data.observed])[rows]
     both -= base @ (base.T @ both)
-    clusters = [each[rows] for each in (data.row_stretches, *data.row_sectors)]
+    clusters = [each[rows] for each in data.clusters]
     sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
     found = []
     for place, each in zip(places, open_terms):
-        if each.is_positive and float(both[:, place.start] @ both[:, -1]) <= 0.0:
-            found.append((1.0, 0.0, 0.0))
-            continue
         own = clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1]
         found.append(_cluster_robust_evidence(both[:, place], both[:, -1], own,
                                               1e-6 * sizes[place]))
@@ -690,7 +657,7 @@ def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice]
         log_likelihood_gains: list[float] = []
         same_choices = 0
         for fold in sets:
-            held = np.isin(data.row_stretches, fold)
+            held = np.isin(data.clusters[0], fold)
             rest = ~held
             evidences = _term_evidences(data, columns, places, open_terms, rest)
             best = int(np.argmax([gain for _, gain, _ in evidences]))
@@ -699,7 +666,7 @@ def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice]
             for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):
                 values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
                 off.append(data.observed[held] - design[held] @ values)
-            log_likelihood_gains += np.bincount(np.searchsorted(fold, data.row_stretches[held]),
+            log_likelihood_gains += np.bincount(np.searchsorted(fold, data.clusters[0][held]),
                                                 0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
         found.append((prediction_sigmas(np.array(log_likelihood_gains)),
                       float(np.sum(log_likelihood_gains)), same_choices / folds))
