@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 from gyro_calibration.diagnosis.candidates import MIN_CHANNEL_RANGE, user_effects
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, mark_suspected
@@ -60,6 +61,7 @@ from gyro_calibration.diagnosis.spans import (
     lay_out_spans,
     MIN_STRETCHES,
     SpanFit,
+    Spans,
     whiten_regression,
     WhitenedRegression,
 )
@@ -83,10 +85,9 @@ _STEP_SHARES = {CHECKS_STEP: 4, 'data quality': 3, 'bias and scale factor error'
 DETECTION_SIGMAS = 4.8
 #: Longest lag of a gyro, s.
 _MAX_GYRO_LAG = 0.1
-#: Shares of the false-alarm rate: for the search for causes, for a delay, and, with a model, for
-#: bias and scale factor error. A delay between two clocks is usual and has a separate level.
-_SEARCH_ALARM_SHARE = 0.6
-_VALUE_ALARM_SHARES = {'bias': 0.05, 'scale_factor_error': 0.05, 'time_offset': 0.1}
+#: Shares of the false-alarm rate: for the search for causes, and for each value. A delay between
+#: two clocks is usual and has a separate level.
+_SEARCH_ALARM_SHARE, _VALUE_ALARM_SHARE = 0.6, 0.05
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -206,7 +207,7 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
         deviation = math.sqrt(variance)
         effective, freedom = float(fit.effective_stretches[place]), float(fit.freedom[place])
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
-        share = 1.0 if name == 'time_offset' and own_clock else _VALUE_ALARM_SHARES[name]
+        share = 1.0 if name == 'time_offset' and own_clock else _VALUE_ALARM_SHARE
         if chance >= share * false_alarm_rate or effective < MIN_STRETCHES:
             continue
         half = min(float(student.ppf(0.975, freedom)) * deviation,
@@ -423,6 +424,14 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
 
 # the search
 
+class Evidence(NamedTuple):
+    """Evidence for a term: p-value of it alone, gain in log-likelihood, effective stretches."""
+
+    chance: float
+    gain: float
+    stretches: float
+
+
 @dataclass(frozen=True)
 class FoundCause:
     """
@@ -503,25 +512,27 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
                   on_part: OnPart) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
     found: list[FoundCause] = []
-    candidate_terms = list(propose_terms(fit))
+    candidates = list(propose_terms(fit))
     # noise given one column of each cause, so that it does not absorb their contributions
-    columns = {each.cause: each for each in candidate_terms if not each.is_single_event}
+    columns = {each.cause: each for each in candidates if not each.is_single_event}
     rich_fit = fit_spans(fit.spans, list(columns.values()))
     while len(found) < MAX_CAUSES:
         found_terms = [each.cause_term for each in found]
         names = {each.cause for each in found_terms}
         on_part(f'search for causes after {len(found)} found' if found else 'search for causes')
-        best = _find_best_cause(fit, rich_fit,
-                                [each for each in candidate_terms if each.cause not in names],
-                                found_terms, false_alarm_rate)
+        # what a scale factor error that is kept at 0 would explain is no evidence of a cause
+        data = whiten_regression(replace(fit, prior=np.array(fit.spans.treatment.prior)),
+                                 found_terms, rich_fit, use_max_random_walk=True)
+        best = _find_best_cause(fit.spans, data,
+                                [each for each in candidates if each.cause not in names],
+                                false_alarm_rate)
         if best is None:
             break
         found.append(best)
     found = [each for each in found if each.prediction_gain > 0.0]
-    extended = fit
-    while established_terms := [each.cause_term for each in found if each.is_established]:
-        extended = fit_spans(fit.spans, established_terms)
-        worst = max(established_terms, key=lambda each: _implausibility(extended, each))
+    while established := [each.cause_term for each in found if each.is_established]:
+        extended = fit_spans(fit.spans, established)
+        worst = max(established, key=lambda each: _implausibility(extended, each))
         if _implausibility(extended, worst) < 1.0:
             return extended, found
         found = [replace(each, is_established=each.is_established and each.cause_term != worst)
@@ -542,83 +553,71 @@ def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
     return float(added / np.abs(fit.spans.channels.rate).max()) / _MAX_RELATIVE_EFFECT
 
 
-def _find_best_cause(fit: SpanFit, rich_fit: SpanFit, open_terms: Sequence[CauseTerm],
-                     found_terms: Sequence[CauseTerm],
+def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[CauseTerm],
                      false_alarm_rate: float) -> FoundCause | None:
     """Return the best of the remaining causes, given those found; None if insignificant."""
-    # what a scale factor error that is kept at 0 would explain is no evidence of a cause
-    data = whiten_regression(replace(fit, prior=np.array(fit.spans.treatment.prior)), found_terms,
-                             rich_fit, use_max_random_walk=True)
-    widths = [fit.spans.cause_columns(each) for each in open_terms]
+    widths = [spans.cause_columns(each) for each in terms]
     columns = data.whiten_columns(np.column_stack(widths))
-    edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])
-    places = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:])]
-    chances = _term_evidences(data, columns, places, open_terms,
-                              np.ones(len(data.observed), dtype=bool))
+    ends = np.cumsum([each.shape[1] for each in widths]).tolist()
+    places = list(map(slice, [0, *ends], ends))
+    evidences = _term_evidences(data, columns, places, terms,
+                                np.ones(len(data.observed), dtype=bool))
     # single events are never established, and are not counted in the number of the others
-    lasting = sum(not each.is_single_event for each in open_terms)
-    corrected_chances = [chance * (len(open_terms) if each.is_single_event else lasting)
-                         for each, (chance, _, _) in zip(open_terms, chances)]
-    strongest = int(np.argmin(corrected_chances))
-    once = open_terms[strongest].is_single_event
-    level = false_alarm_rate if once else SUSPECTED_RATE_FACTOR * false_alarm_rate
-    if min(corrected_chances[strongest], 1.0) > level:
+    lasting = sum(not each.is_single_event for each in terms)
+    p_values = [min(evidence.chance * (len(terms) if each.is_single_event else lasting), 1.0)
+                for each, evidence in zip(terms, evidences)]
+    strongest = min(range(len(terms)), key=lambda place: (p_values[place], place))
+    level = false_alarm_rate * (1.0 if terms[strongest].is_single_event else SUSPECTED_RATE_FACTOR)
+    if p_values[strongest] > level:
         return None
-    best_of: dict[str, int] = {}
-    for other, each in enumerate(open_terms):
-        if each.cause not in best_of or chances[other][1] > chances[best_of[each.cause]][1]:
-            best_of[each.cause] = other
-    gain = chances[strongest][1]
-    least = gain - math.log(_MAX_LIKELIHOOD_RATIO)
-    equivalent_causes = {name: other for name, other in best_of.items()
-                         if chances[other][1] > least or other == strongest}
-    # the simplest of the equivalent causes: with the fewest values and fitted shapes
+    best_of = {terms[place].cause: place
+               for place in sorted(range(len(terms)), key=lambda place: evidences[place].gain)}
+    gain = evidences[strongest].gain
+    equivalent = {name: place for name, place in best_of.items() if place == strongest
+                  or gain - evidences[place].gain < math.log(_MAX_LIKELIHOOD_RATIO)}
 
-    def count_values(other: int) -> int:
-        effect = CATALOGUE.get(open_terms[other].cause)
-        return widths[other].shape[1] + sum(
-            each.default is None for each in getattr(effect, 'nonlinear_parameters', ()))
+    def complexity(place: int) -> tuple[int, float]:
+        """Return the number of values and fitted shapes, and the p-value."""
+        shapes = getattr(CATALOGUE.get(terms[place].cause), 'nonlinear_parameters', ())
+        return (widths[place].shape[1] + sum(each.default is None for each in shapes),
+                p_values[place])
 
-    place = min(equivalent_causes.values(),
-                key=lambda other: (count_values(other), corrected_chances[other]))
-    column, p_value = open_terms[place], min(corrected_chances[place], 1.0)
-    stretches = chances[place][2]
-    found = _cross_fit(data, columns, places, open_terms, equivalent_causes)
+    simplest = min(equivalent.values(), key=complexity)
+    folds = [_cross_fit(data, columns, places, terms, equivalent, sets)
+             for sets in _fold_sets(data.stretch_count)]
     # errors of a course are correlated over time, so that distant stretches must be predicted too
-    prediction_sigma, predicted, chosen = max(found) if fit.spans.treatment.is_fine else min(found)
+    sigmas, predicted, selected = max(folds) if spans.treatment.is_fine else min(folds)
     probability = {name: chance for name, chance in probabilities(
-        {name: gain - chances[other][1] for name, other in best_of.items()}).items()
-        if name in equivalent_causes}
-    established = (p_value < false_alarm_rate and prediction_sigma > MIN_PREDICTION_SIGMAS
-                   and chosen == 1.0 and not column.is_single_event and stretches >= MIN_STRETCHES)
-    return FoundCause(column, max(p_value, MIN_PROBABILITY), predicted, chosen, established,
-                      probability)
+        {name: gain - evidences[place].gain for name, place in best_of.items()}).items()
+        if name in equivalent}
+    established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
+                   and selected == 1.0 and not terms[simplest].is_single_event
+                   and evidences[simplest].stretches >= MIN_STRETCHES)
+    return FoundCause(terms[simplest], max(p_values[simplest], MIN_PROBABILITY), predicted,
+                      selected, established, probability)
 
 
 def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[slice],
-                    open_terms: Sequence[CauseTerm],
-                    rows: Mask) -> list[tuple[float, float, float]]:
-    """Return chance, gain in log-likelihood and effective stretches of each cause."""
+                    terms: Sequence[CauseTerm], rows: Mask) -> list[Evidence]:
+    """Return the evidence for each term in some of the rows."""
     base, _ = np.linalg.qr(data.design[rows])
     both = np.column_stack([columns, data.observed])[rows]
     both -= base @ (base.T @ both)
     clusters = [each[rows] for each in data.clusters]
-    sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
-    found = []
-    for place, each in zip(places, open_terms):
-        own = clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1]
-        found.append(_cluster_robust_evidence(both[:, place], both[:, -1], own,
-                                              1e-6 * sizes[place]))
-    return found
+    least = 1e-6 * (np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300)
+    return [_cluster_robust_evidence(
+        both[:, place], both[:, -1],
+        clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], least[place])
+        for place, each in zip(places, terms)]
 
 
 def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
-                             min_sizes: Array) -> tuple[float, float, float]:
-    """Return chance, gain in log-likelihood and effective number by the worst clusters."""
+                             min_sizes: Array) -> Evidence:
+    """Return the least evidence by any of the clusterings."""
     information = x.T @ x
     size = np.sqrt(np.diag(information))
     if not (size > min_sizes).all():
-        return 1.0, 0.0, 0.0
+        return Evidence(1.0, 0.0, 0.0)
     # by the residual with the candidate: scores that contain the effect would overestimate scatter
     off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
     count, found = x.shape[1], []
@@ -631,43 +630,42 @@ def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArr
         scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
         max_variance_ratio = float(np.linalg.eigvalsh(root @ scatter @ root.T).max())
         statistic, freedom = square / max(max_variance_ratio, 1.0), max(effective - count, 1.0)
-        found.append((float(fisher.sf(statistic / count, count, freedom)), 0.5 * statistic,
-                      effective))
+        found.append(Evidence(float(fisher.sf(statistic / count, count, freedom)),
+                              0.5 * statistic, effective))
     return max(found)
 
 
+def _fold_sets(stretch_count: int) -> list[list[NDArray[np.intp]]]:
+    """Return two divisions of the stretches into five: every fifth one, and fifths of the log."""
+    # in the first, slow causes are also predicted by the bias wander of neighbouring stretches
+    numbers, folds = np.arange(stretch_count), min(FOLD_COUNT, stretch_count)
+    return [[numbers[fold::folds] for fold in range(folds)], np.array_split(numbers, folds)]
+
+
 def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice],
-               open_terms: Sequence[CauseTerm],
-               equivalent_causes: Mapping[str, int]) -> list[tuple[float, float, float]]:
+               terms: Sequence[CauseTerm], equivalent: Mapping[str, int],
+               folds: Sequence[NDArray[np.intp]]) -> tuple[float, float, float]:
     """
     Select and fit without each fold, and predict it.
 
     Returns
     -------
-    for folds of every fifth stretch, and for fifths of the log (in the first, slow causes are also
-    predicted by the bias wander of neighbouring stretches): gain in log-likelihood over its
-    standard deviation by the scatter of stretches, the gain, and the share of the folds in which
-    one of the equivalent causes was selected
+    gain in log-likelihood over its standard deviation by the scatter of stretches, the gain, and
+    the share of the folds in which one of the equivalent causes was selected
 
     """
-    numbers = np.arange(data.stretch_count)
-    folds = min(FOLD_COUNT, len(numbers))
-    found = []
-    for sets in ([numbers[fold::folds] for fold in range(folds)], np.array_split(numbers, folds)):
-        log_likelihood_gains: list[float] = []
-        same_choices = 0
-        for fold in sets:
-            held = np.isin(data.clusters[0], fold)
-            rest = ~held
-            evidences = _term_evidences(data, columns, places, open_terms, rest)
-            best = int(np.argmax([gain for _, gain, _ in evidences]))
-            same_choices += open_terms[best].cause in equivalent_causes
-            off = []
-            for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):
-                values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
-                off.append(data.observed[held] - design[held] @ values)
-            log_likelihood_gains += np.bincount(np.searchsorted(fold, data.clusters[0][held]),
-                                                0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
-        found.append((prediction_sigmas(np.array(log_likelihood_gains)),
-                      float(np.sum(log_likelihood_gains)), same_choices / folds))
-    return found
+    gains: list[float] = []
+    same_choices = 0
+    for fold in folds:
+        held = np.isin(data.clusters[0], fold)
+        rest = ~held
+        evidences = _term_evidences(data, columns, places, terms, rest)
+        best = int(np.argmax([each.gain for each in evidences]))
+        same_choices += terms[best].cause in equivalent
+        off = []
+        for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):
+            values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
+            off.append(data.observed[held] - design[held] @ values)
+        gains += np.bincount(np.searchsorted(fold, data.clusters[0][held]),
+                             0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
+    return prediction_sigmas(np.array(gains)), float(np.sum(gains)), same_choices / len(folds)

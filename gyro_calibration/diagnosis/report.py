@@ -31,11 +31,9 @@ from gyro_calibration.diagnosis.words import (
     as_sentence,
     cause_paragraphs,
     cause_title,
-    change_phrase,
     display_unit,
     format_amount,
     format_quantity,
-    heading_error_sentence,
     headline,
     is_model_extended,
     lists,
@@ -79,7 +77,6 @@ def render_report(diagnosis: Diagnosis) -> str:
         'header',
         element('p', ' · '.join(filter(None, ['Diagnosis', gyro, logs])), class_='about'),
         element('h1', what), element('p', gained, class_='gained'),
-        element('p', heading_error_sentence(diagnosis), class_='gained'),
         element('p', verdict_phrase(diagnosis), class_=f'verdict {diagnosis.verdict}'))
     sections = (element('section', element('h2', title), *parts)
                 for title, content in _sections(diagnosis) if (parts := list(content)))
@@ -155,10 +152,8 @@ def _gain(diagnosis: Diagnosis) -> Iterator[Markup]:
     parts = [] if diagnosis.heading is None else [draw_chart(_heading_chart(diagnosis.heading))]
     if (gain := diagnosis.gain) is not None:
         rows = gain.rows()
-        changes = [f' The extended model {change_phrase(change, unit, f"the {what}")}.'
-                   for what, change, unit in rows]
         yield element('p', f'Measured on {to_printable(gain.held_out)}, which took no part in the '
-                      'choice or the fit.' + ''.join(changes))
+                      'choice or the fit.')
         reductions = [Estimate(won, change.interval or (won, won), unit)
                       for _, change, unit in rows for won in [change.before - change.after]]
         parts.append(_table(['rms', 'before', 'after', 'reduction, 95 % interval'], [

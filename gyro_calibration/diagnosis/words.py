@@ -202,24 +202,6 @@ def verdict_phrase(diagnosis: Diagnosis) -> str:
                 diagnosis.verdict]
 
 
-def heading_error_sentence(diagnosis: Diagnosis) -> str:
-    """Return the shares of refitted values and of named causes in the heading error."""
-    shares = diagnosis.heading_shares
-    named = {each.effect for each in diagnosis.findings if each.status == 'established'}
-    if not (shares and named):
-        return ''
-    refitted = [name for name in ('bias', 'scale_factor_error')
-                if name in shares and name not in named]
-    parts = []
-    if refitted:
-        parts.append(f'{_format_share(sum(shares[name] for name in refitted))} is '
-                     f'{join_list(list(map(readable_name, refitted)))}, refitted in any case')
-    causes = [shares[name] for name in named & set(shares)]
-    parts.append(f'{_format_share(sum(causes))} is of the named causes' if causes
-                 else 'no part is of the named causes')
-    return f'Of the mean square heading error over 60 s, {", and ".join(parts)}.'
-
-
 def is_model_extended(diagnosis: Diagnosis) -> bool:
     """Tell whether the model was extended: its effects, their values or its noise."""
     before, after = diagnosis.before, diagnosis.model

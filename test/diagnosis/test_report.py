@@ -317,23 +317,6 @@ def test_among_several_causes_a_set_is_in_brackets_and_sizes_are_in_data_sheet_u
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
 
 
-@pytest.mark.parametrize('effect, shares, words', [
-    ('time_offset', {'bias': 0.81, 'scale_factor_error': 0.188, 'reference': 0.002, 'left': 0.0},
-     '100 % is bias and scale factor error, refitted in any case, and no part is of the named '
-     'causes.'),
-    ('bias_temperature', {'bias': 0.3, 'scale_factor_error': 0.1, 'bias_temperature': 0.55,
-                          'reference': 0.0, 'left': 0.05},
-     '40 % is bias and scale factor error, refitted in any case, and 55 % is of the named '
-     'causes.'),
-    ('bias', {'bias': 0.7, 'scale_factor_error': 0.2, 'reference': 0.0, 'left': 0.1},
-     '20 % is scale factor error, refitted in any case, and 70 % is of the named causes.')])
-def test_what_is_refitted_in_any_case_is_not_of_the_named_causes(effect, shares, words):
-    found = replace(temperature_finding(()), effect=effect)
-    text = Page(render_report(replace(extended(), findings=(found,), heading_shares=shares))).text
-    assert f'Of the mean square heading error over 60 s, {words}' in text
-    assert 'Extended: causes were found' in text and 'each difference has a cause' not in text
-
-
 def test_a_verdict_says_that_no_cause_was_added_to_the_model():
     whole = extended()
     text = Page(render_report(replace(whole, model=whole.before))).text
