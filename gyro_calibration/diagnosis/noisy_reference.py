@@ -290,21 +290,17 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
     own = 1.0 + sum(
         term.values[0] for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in fit.values[:2])
-    terms = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))]
-    places: list[int | None] = [1, 0]
+    terms, rows = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))], [1, 0]
     for cause in fit.causes:
-        own_places = fit.value_slice(cause)
-        values = fit.values[own_places].tolist()
         if cause.cause in CATALOGUE:
-            terms.append(Term(CATALOGUE[cause.cause], (*cause.shapes, *values)))
-            places += [*(None for _ in cause.shapes), *range(own_places.start, own_places.stop)]
-    covariance = np.zeros((len(places), len(places)))
-    fits = [row for row, place in enumerate(places) if place is not None]
-    chosen = [place for place in places if place is not None]
-    covariance[np.ix_(fits, fits)] = fit.covariance[np.ix_(chosen, chosen)]
+            places = fit.value_slice(cause)
+            terms.append(Term(CATALOGUE[cause.cause],
+                              (*cause.shapes, *fit.values[places].tolist())))
+            # shapes, as the last row, have no variance
+            rows += [*(-1 for _ in cause.shapes), *range(places.start, places.stop)]
+    covariance = np.pad(fit.covariance, (0, 1))[np.ix_(rows, rows)]
     assert log.output is not None
-    output = log.output[np.isfinite(log.output)]
-    new = add_terms(base_model, terms, covariance, [output],
+    new = add_terms(base_model, terms, covariance, [log.output[np.isfinite(log.output)]],
                     [] if log.temperature is None else [log.temperature])
     return new if base_model.noise.angle_random_walk else replace(new, noise=_gyro_noise(fit))
 

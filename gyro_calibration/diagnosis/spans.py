@@ -69,9 +69,6 @@ BASE_VALUES = ('scale_factor_error', 'bias', 'time_offset')
 MIN_STRETCHES = 3.0
 #: Trial delays of a reference, s.
 _TRIAL_DELAYS = np.arange(-1.5, 1.501, 0.05)
-#: Largest share of noise in the column of a delay, and largest half-width of the means that reduce
-#: it, s.
-_MAX_RATE_NOISE_SHARE, _MAX_SMOOTHING_HALF_WIDTH = 0.05, 0.5
 #: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
@@ -213,30 +210,17 @@ class Spans:
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
         rate = np.asarray(self.channels.rate)
-        changes = np.append(self._rate_changes(), np.zeros(len(self.rests)))
         return np.column_stack([-self.span_integrals(rate),
-                                -self.span_integrals(np.ones_like(rate)), changes])
+                                -self.span_integrals(np.ones_like(rate)), self._rate_changes()])
 
     def _rate_changes(self) -> Array:
-        """
-        Return the change of the rate over spans, shape (n,), without much noise.
-
-        Noise in this column would bias the delay. So the rate is a mean over a time for which its
-        noise is a small share of the column.
-
-        """
-        assert self.log.time is not None and self.log.output is not None
+        """Return the change of the rate, as a mean over two samples, shape (n + r,)."""
+        time, output = np.asarray(self.log.time), np.asarray(self.log.output)
         turned = (np.asarray(self.channels.heading) if self.treatment.is_fine
-                  else integrate_with_curvature(self.log.time, self.log.output))
-        at, half = self.value_times + self.delay, float(np.median(np.diff(self.log.time)))
-        while True:
-            forth, back = (np.interp(at + way, self.log.time, turned) for way in (half, -half))
-            change = np.diff(np.bincount(self.point_index, (forth - back) / (2.0 * half))
-                             / np.bincount(self.point_index))
-            if (self.walk_bounds[0] ** 2 / half < _MAX_RATE_NOISE_SHARE * np.mean(change ** 2)
-                    or half > _MAX_SMOOTHING_HALF_WIDTH):
-                return np.asarray(change)
-            half *= 2.0
+                  else integrate_with_curvature(time, output))
+        half = float(np.median(np.diff(time)))
+        forth, back = (np.interp(time + way, time, turned) for way in (half, -half))
+        return self.span_changes((forth - back) / (2.0 * half))
 
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
