@@ -13,9 +13,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel
@@ -31,9 +31,37 @@ SUSPECTED_RATE_FACTOR = 5.0
 RULED_OUT_DEFICIT = 3.2
 
 
+class Record:
+    """A dataclass that is data for a file; `KEYS` are its fields with another key, or none."""
+
+    KEYS: ClassVar[Mapping[str, str | None]] = {}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as data."""
+        names = [each.name for each in fields(self)]  # type: ignore[arg-type]
+        found = {key: _to_data(getattr(self, name)) for name in names
+                 if (key := self.KEYS.get(name, name))}
+        if 'p_value' in found:
+            found['p_value'] = max(found['p_value'], MIN_PROBABILITY)
+        return found
+
+
+def _to_data(value: Any) -> Any:
+    if isinstance(value, Record):
+        return value.to_dict()
+    if isinstance(value, Noise):
+        return {name: getattr(value, name)
+                for name in ('angle_random_walk', 'bias_instability', 'rate_random_walk')}
+    if isinstance(value, Mapping):
+        return {name: _to_data(each) for name, each in value.items()}
+    return list(map(_to_data, value)) if isinstance(value, (tuple, list)) else value
+
+
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Record):
     """A value with its 95 % interval, in SI."""
+
+    KEYS = {'interval': 'ci95'}
 
     estimate: float
     interval: tuple[float, float]
@@ -54,10 +82,6 @@ class Estimate:
         """Return whether the interval includes zero."""
         return self.interval[0] <= 0.0 <= self.interval[1]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
-        return {'estimate': self.estimate, 'ci95': list(self.interval), 'unit': self.unit}
-
 
 def probabilities(deficits: Mapping[str, float]) -> dict[str, float]:
     """Return the probabilities of causes by their deficits in log-likelihood, largest first."""
@@ -67,13 +91,13 @@ def probabilities(deficits: Mapping[str, float]) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Gate:
+class Gate(Record):
     """
     A check before causes are named.
 
     Attributes
     ----------
-    name : wrapped_heading, motion, tilt, sense, unit, time_unit or model
+    name : wrapped_heading, motion, sense, unit, time_unit or model
     passed : None if the log does not show it
     evidence : the measured numbers, in words
     remedy : what to do if it failed
@@ -81,23 +105,17 @@ class Gate:
 
     """
 
+    KEYS = {'evidence': 'said', 'factor': None}
+
     name: str
     passed: bool | None
     evidence: str
     remedy: str = ''
     factor: tuple[float, tuple[float, float]] | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
-        return {
-            'name': self.name,
-            'passed': self.passed,
-            'said': self.evidence,
-            'remedy': self.remedy}
-
 
 @dataclass(frozen=True)
-class Finding:
+class Finding(Record):
     """
     One cause.
 
@@ -123,6 +141,8 @@ class Finding:
 
     """
 
+    KEYS = {'along': None}
+
     effect: str
     cause: str
     parameters: Mapping[str, Estimate]
@@ -138,35 +158,18 @@ class Finding:
     where: tuple[float, float] | None = None
     remedy: str = ''
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
-        return {'effect': self.effect, 'cause': self.cause,
-                'parameters': {name: value.to_dict() for name, value in self.parameters.items()},
-                'p_value': max(self.p_value, MIN_PROBABILITY),
-                'minimum_detectable': self.minimum_detectable,
-                'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by,
-                'evidence': self.evidence, 'status': self.status,
-                'probability': dict(self.probability),
-                'share_of_heading_error': self.share_of_heading_error,
-                'where': None if self.where is None else list(self.where), 'remedy': self.remedy}
-
 
 @dataclass(frozen=True)
-class Unexplained:
+class Unexplained(Record):
     """Structure without a name: variable, share of the residual's variance, and p-value."""
 
     along: str
     share_of_variance: float
     p_value: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
-        return {'along': self.along, 'share_of_variance': self.share_of_variance,
-                'p_value': max(self.p_value, MIN_PROBABILITY)}
-
 
 @dataclass(frozen=True)
-class Change:
+class Change(Record):
     """
     A root mean square error before and after the extension.
 
@@ -177,6 +180,8 @@ class Change:
 
     """
 
+    KEYS = {'interval': 'ci95'}
+
     before: float
     after: float
     interval: tuple[float, float] | None
@@ -185,11 +190,6 @@ class Change:
     def is_worse(self) -> bool:
         """Tell whether the error increased significantly."""
         return self.interval is not None and self.interval[1] < 0.0
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
-        return {'before': self.before, 'after': self.after,
-                'ci95': None if self.interval is None else list(self.interval)}
 
 
 @dataclass(frozen=True)
@@ -218,14 +218,13 @@ class Gain:
     @property
     def is_worse(self) -> bool:
         """Tell whether the extended model has significantly larger errors."""
-        return any(change is not None and change.is_worse for change in (self.rate, self.heading))
+        return any(change.is_worse for _, change, _ in self.rows())
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
-        heading = (None if self.heading is None
-                   else {'window_s': self.window, **self.heading.to_dict()})
-        return {'held_out': self.held_out, 'rate_rms': self.rate.to_dict(),
-                'heading_rms': heading, **self.models}
+    def rows(self) -> list[tuple[str, Change, str]]:
+        """Return what was measured before and after, with its unit of SI."""
+        heading = ([] if self.heading is None
+                   else [(f'heading error over {self.window:g} s', self.heading, 'rad')])
+        return [*heading, ('rate error', self.rate, 'rad/s')]
 
 
 @dataclass(frozen=True)
@@ -296,7 +295,7 @@ class NoiseCurve:
 
 
 @dataclass(frozen=True)
-class Reference:
+class Reference(Record):
     """
     The reference of a log.
 
@@ -308,13 +307,11 @@ class Reference:
 
     """
 
+    KEYS = {'evidence': 'known'}
+
     kind: str
     evidence: str
     noise: Mapping[str, float] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as data."""
-        return {'kind': self.kind, 'known': self.evidence, 'noise': dict(self.noise)}
 
 
 @dataclass(frozen=True)
@@ -376,24 +373,23 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
+        gain = self.gain
+        heading = (None if gain is None or gain.heading is None
+                   else {'window_s': gain.window, **_to_data(gain.heading)})
         return {
             'schema': SCHEMA,
             'verdict': self.verdict,
             'false_alarm_rate': self.false_alarm_rate,
-            'findings': [finding.to_dict() for finding in self.findings],
-            'unexplained': [each.to_dict() for each in self.unexplained],
-            'noise': _noise_to_dict(self.noise),
-            'simulated_noise': _noise_to_dict(self.simulated),
-            'gain': None if self.gain is None else self.gain.to_dict(),
+            'findings': _to_data(self.findings),
+            'unexplained': _to_data(self.unexplained),
+            'noise': _to_data(self.noise),
+            'simulated_noise': _to_data(self.simulated),
+            'gain': None if gain is None else {
+                'held_out': gain.held_out, 'rate_rms': _to_data(gain.rate),
+                'heading_rms': heading, **gain.models},
             'cannot_show': dict(self.cannot_show),
             'remarks': list(self.remarks),
             'logs': list(self.logs),
-            'gates': [gate.to_dict() for gate in self.gates],
+            'gates': _to_data(self.gates),
             'heading_shares': dict(self.heading_shares),
-            'reference': None if self.reference is None else self.reference.to_dict()}
-
-
-def _noise_to_dict(noise: Noise) -> dict[str, float]:
-    return {'angle_random_walk': noise.angle_random_walk,
-            'bias_instability': noise.bias_instability,
-            'rate_random_walk': noise.rate_random_walk}
+            'reference': _to_data(self.reference)}

@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 from gyro_calibration.diagnosis.candidates import MIN_CHANNEL_RANGE, user_effects
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, mark_suspected
@@ -61,7 +62,7 @@ from gyro_calibration.diagnosis.spans import (
     lay_out_spans,
     MIN_STRETCHES,
     SpanFit,
-    wander_noise,
+    Spans,
     whiten_regression,
     WhitenedRegression,
 )
@@ -76,23 +77,18 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-#: Least and largest number of parts of a log that are held out in turn, and least length, s.
-_MIN_PARTS, _MAX_PARTS, _MIN_PART_DURATION = 2, 6, 80.0
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
 #: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
 _STEP_SHARES = {CHECKS_STEP: 4, 'data quality': 3, 'bias and scale factor error': 26,
                 'search for causes': 45, 'cross-validation': 4, 'findings': 18}
-#: Standard deviations of a value that is found in 95 % of logs, and of a lag that is ruled out.
-DETECTION_SIGMAS, _LAG_EXCLUSION_SIGMAS = 4.8, 3.0
+#: Standard deviations of a value that is found in 95 % of logs.
+DETECTION_SIGMAS = 4.8
 #: Longest lag of a gyro, s.
 _MAX_GYRO_LAG = 0.1
-#: Bins of a curve.
-_CURVE_BINS = 20
-#: Shares of the false-alarm rate: for the search for causes, for a delay, and, with a model, for
-#: bias and scale factor error. A delay between two clocks is usual and has a separate level.
-_SEARCH_ALARM_SHARE = 0.6
-_VALUE_ALARM_SHARES = {'bias': 0.05, 'scale_factor_error': 0.05, 'time_offset': 0.1}
+#: Shares of the false-alarm rate: for the search for causes, and for each value. A delay between
+#: two clocks is usual and has a separate level.
+_SEARCH_ALARM_SHARE, _VALUE_ALARM_SHARE = 0.6, 0.05
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -116,7 +112,7 @@ MAX_CAUSES, FOLD_COUNT = 4, 5
 #: that nearly cancel each other.
 _MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
 #: Variables whose causes are similar to errors of an encoder that repeat with its position.
-_MOTION_VARIABLES = frozenset({'rate', 'rate_change', 'heading'})
+_MOTION_VARIABLES = frozenset({'rate', 'heading'})
 #: Largest likelihood ratio between the best cause and an equivalent one.
 _MAX_LIKELIHOOD_RATIO = 25.0
 
@@ -158,14 +154,14 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
         # causes that do not improve the prediction are not added to the model
         model_fit = plain
-        if not plain.spans.is_fine:
+        if not plain.spans.treatment.is_fine:
             found = [replace(each, is_established=False) for each in found]
             extended = plain
         gain = _cross_validated_gain(plain, plain)
     steps.begin('findings')
     parts, time = _heading_contributions(extended), extended.spans.time
     noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
-    rates = extended.spans.point_rates()
+    rates = extended.spans.point_means(np.asarray(extended.spans.channels.rate))
     motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
     of_heading = heading_error_shares([(parts, time)],
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
@@ -198,42 +194,34 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
 def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: float,
                     reference: Reference) -> Iterator[Finding]:
     """Give delay, and with a model bias and scale factor error, if they are established."""
-    lag = next((each for each in fit.causes if each.cause == 'bandwidth'), None)
     own_clock = reference.kind not in _SAME_CLOCK
     for place, name in enumerate(BASE_VALUES):
         if name != 'time_offset' and model is None:
             continue
-        value, deviation = float(fit.values[place]), math.sqrt(fit.covariance[place, place])
+        value, variance = float(fit.values[place]), float(fit.covariance[place, place])
         if name == 'bias' and model is not None:
             # the mean bias of a log differs from that of the model by bias wander
             duration = float(fit.spans.time[-1] - fit.spans.time[0])
-            wander = max(2.0 / math.pi * each.bias_instability ** 2
-                         + each.rate_random_walk ** 2 * duration / 3.0
-                         for each in (_gyro_noise(fit), model.noise))
-            deviation = math.sqrt(deviation ** 2 + wander)
-        if name == 'time_offset' and lag is not None:
-            # to first order a lag is a delay
-            place_of_lag = fit.value_slice(lag).start
-            constant = _lag_estimate(float(fit.values[place_of_lag]), fit.half_width(place_of_lag))
-            value -= constant.estimate
-            deviation = math.hypot(deviation, constant.deviation)
-        effective = float(fit.effective_stretches[place])
-        freedom = float(fit.freedom[place])
+            variance += max(2.0 / math.pi * each.bias_instability ** 2
+                            + each.rate_random_walk ** 2 * duration / 3.0
+                            for each in (_gyro_noise(fit), model.noise))
+        deviation = math.sqrt(variance)
+        effective, freedom = float(fit.effective_stretches[place]), float(fit.freedom[place])
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
-        share = 1.0 if name == 'time_offset' and own_clock else _VALUE_ALARM_SHARES[name]
+        share = 1.0 if name == 'time_offset' and own_clock else _VALUE_ALARM_SHARE
         if chance >= share * false_alarm_rate or effective < MIN_STRETCHES:
             continue
         half = min(float(student.ppf(0.975, freedom)) * deviation,
                    NORMAL_QUANTILE_975 * fit.spans.treatment.prior[place])
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         if name == 'time_offset':
-            of_reference = not 0.0 < value < _MAX_GYRO_LAG
-            if not (of_reference or lag) and _is_lag_possible(fit, value):
+            of_gyro = 0.0 < value < _MAX_GYRO_LAG
+            if of_gyro and _is_lag_possible(fit, value):
                 confounders = ['bandwidth']
             if own_clock:
                 known = {'remedy': 'synchronize the clocks of gyro and reference; the model does '
                          'not contain it'}
-                if of_reference:
+                if not of_gyro:
                     known['cause'] = 'The gyro has a time offset from its reference.'
         yield make_finding(name, {name: Estimate.from_half_width(value, half, CAUSES[name].unit)},
                            max(chance, MIN_PROBABILITY), confounders,
@@ -242,57 +230,46 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
 
 
 def _is_lag_possible(fit: SpanFit, delay: float) -> bool:
-    """Tell whether a lag explains the log as well as the delay does."""
-    if not fit.spans.is_fine:
+    """Tell whether a lag explains the log as well as the delay does, to three sigma."""
+    if not fit.spans.treatment.is_fine:
         return True
     data = whiten_regression(fit, (*fit.causes, CauseTerm('bandwidth')))
     place = len(fit.values)
     inverse = np.linalg.pinv(data.design.T @ data.design)
     square = float((inverse @ data.design.T @ data.observed)[place])
-    return (abs(square - 0.5 * delay ** 2)
-            < _LAG_EXCLUSION_SIGMAS * math.sqrt(inverse[place, place]))
+    return abs(square - 0.5 * delay ** 2) < 3.0 * math.sqrt(inverse[place, place])
 
 
 def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     """Return a cause that the search found, with its values given the established ones."""
+    term = found_cause.cause_term
     fit = (extended if found_cause.is_established
-           else fit_spans(extended.spans, [*extended.causes, found_cause.cause_term]))
-    name, known = found_cause.cause_term.cause, CAUSES[found_cause.cause_term.cause]
-    places = fit.value_slice(found_cause.cause_term)
+           else fit_spans(extended.spans, [*extended.causes, term]))
+    places = fit.value_slice(term)
     values = fit.values[places]
     half = np.array([fit.half_width(place) for place in range(places.start, places.stop)])
-    effect = CATALOGUE.get(name)
+    effect = CATALOGUE.get(term.cause)
     unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
-            else known.unit)
-    if name == 'bandwidth':
-        parameters = {name: _lag_estimate(float(values[0]), float(half[0]))}
-    else:
-        size = float(values[0]) if len(values) == 1 else float(np.hypot(*values))
-        within = half[0] if len(values) == 1 else float(np.hypot(*(values * half))) / size
-        parameters = {name: Estimate.from_half_width(size, float(within), unit)}
+            else CAUSES[term.cause].unit)
+    size, within = float(values[0]), float(half[0])
+    if len(values) > 1:
+        size = float(np.hypot(*values))
+        within = float(np.hypot(*(values * half))) / size
+    parameters = {term.cause: Estimate.from_half_width(size, within, unit)}
     for parameter, value in zip(() if effect is None else effect.nonlinear_parameters,
-                                found_cause.cause_term.shapes):
+                                term.shapes):
         if parameter.default is None and parameter.name not in parameters:
             parameters[parameter.name] = Estimate.from_half_width(value, 0.0, parameter.unit)
     shown = make_finding(
-        name, parameters, found_cause.p_value,
-        [other for other in found_cause.probability if other != name],
-        minimum_detectable=(DETECTION_SIGMAS * float(half[0]) / NORMAL_QUANTILE_975
-                            if len(values) == 1 and name != 'bandwidth' else None),
+        term.cause, parameters, found_cause.p_value,
+        [other for other in found_cause.probability if other != term.cause],
+        minimum_detectable=(DETECTION_SIGMAS * within / NORMAL_QUANTILE_975
+                            if len(values) == 1 else None),
         evidence=f'it adds {found_cause.prediction_gain:.1f} to the log-likelihood of held-out '
-        'stretches, and '
-        f'is selected in {100.0 * found_cause.selection_share:.0f} % of the folds',
+        f'stretches, and is selected in {100.0 * found_cause.selection_share:.0f} % of the folds',
         probability=found_cause.probability,
-        where=((found_cause.cause_term.shapes[0], float(fit.spans.time[-1]))
-               if found_cause.cause_term.is_single_event else None))
+        where=((term.shapes[0], float(fit.spans.time[-1])) if term.is_single_event else None))
     return shown if found_cause.is_established else mark_suspected(shown)
-
-
-def _lag_estimate(half_square: float, half_width: float) -> Estimate:
-    """Return a time constant from half of its square."""
-    low, size, high = (math.sqrt(2.0 * max(half_square + change, 0.0))
-                       for change in (-half_width, 0.0, half_width))
-    return Estimate(size, (low, high), 's')
 
 
 def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
@@ -314,24 +291,17 @@ def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
     own = 1.0 + sum(
         term.values[0] for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in fit.values[:2])
-    terms = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))]
-    places: list[int | None] = [1, 0]
+    terms, rows = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))], [1, 0]
     for cause in fit.causes:
-        own_places = fit.value_slice(cause)
-        values = fit.values[own_places].tolist()
-        if cause.cause == 'bandwidth':
-            terms.append(Term(CATALOGUE['bandwidth'], (math.sqrt(2.0 * max(values[0], 1e-10)),)))
-            places.append(None)
-        elif cause.cause in CATALOGUE:
-            terms.append(Term(CATALOGUE[cause.cause], (*cause.shapes, *values)))
-            places += [*(None for _ in cause.shapes), *range(own_places.start, own_places.stop)]
-    covariance = np.zeros((len(places), len(places)))
-    fits = [row for row, place in enumerate(places) if place is not None]
-    chosen = [place for place in places if place is not None]
-    covariance[np.ix_(fits, fits)] = fit.covariance[np.ix_(chosen, chosen)]
+        if cause.cause in CATALOGUE:
+            places = fit.value_slice(cause)
+            terms.append(Term(CATALOGUE[cause.cause],
+                              (*cause.shapes, *fit.values[places].tolist())))
+            # shapes, as the last row, have no variance
+            rows += [*(-1 for _ in cause.shapes), *range(places.start, places.stop)]
+    covariance = np.pad(fit.covariance, (0, 1))[np.ix_(rows, rows)]
     assert log.output is not None
-    output = log.output[np.isfinite(log.output)]
-    new = add_terms(base_model, terms, covariance, [output],
+    new = add_terms(base_model, terms, covariance, [log.output[np.isfinite(log.output)]],
                     [] if log.temperature is None else [log.temperature])
     return new if base_model.noise.angle_random_walk else replace(new, noise=_gyro_noise(fit))
 
@@ -342,7 +312,7 @@ def _gyro_noise(fit: SpanFit) -> Noise:
     return Noise(fit.noise_size('angle_random_walk'),
                  **{part.name: fit.noise_size(part.name)
                     if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
-                    for part in wander_noise(fit.spans)})
+                    for part in fit.spans.bias_wander()[1]})
 
 
 # gain
@@ -363,8 +333,8 @@ def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
 def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     """Hold out each part of a log in turn, fit the others, and predict heading and rate there."""
     time, spans = plain.spans.time, plain.spans
-    duration, count = float(time[-1] - time[0]), len(time) - 1
-    parts = int(np.clip(duration / _MIN_PART_DURATION, _MIN_PARTS, _MAX_PARTS))
+    duration = float(time[-1] - time[0])
+    parts = int(np.clip(duration / 80.0, 2, 6))
     number = np.minimum(((time[1:] - time[0]) * parts / duration).astype(int), parts - 1)
     window = min(HEADING_WINDOW, MAX_WINDOW_SHARE * duration / parts)
     # under the noise of the plain fit, given the prior of the wandering bias
@@ -385,7 +355,7 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
         rows = np.append(kept, len(spans.observed) + np.arange(prior))
         for name, (columns, white) in models.items():
             values = np.linalg.lstsq(white[rows], noisy.observed[rows], rcond=None)[0]
-            left = (spans.observed - columns @ values[:columns.shape[1]])[:count][held]
+            left = (spans.observed - columns @ values[:columns.shape[1]])[held]
             stamps = time[held[0]:held[-1] + 2]
             turned = window_changes(left, stamps, window)
             squares[name].append((float(np.sum((left / np.diff(stamps)) ** 2)),
@@ -441,8 +411,7 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
     measured = fit.spans.span_integrals(fit.spans.log.output)[:len(steps)] / steps
     before, after = (-each / steps
                      for each in (sum(parts.values(), 0.0 * parts['left']), parts['left']))
-    order = np.array_split(np.argsort(measured, kind='stable'),
-                           min(_CURVE_BINS, len(steps) // 4 + 1))
+    order = np.array_split(np.argsort(measured, kind='stable'), min(20, len(steps) // 4 + 1))
     at, given, left = (np.array([float(each[part].mean()) for part in order])
                        for each in (measured, before, after))
     deviation = np.array([float(after[part].std()) / math.sqrt(len(part)) for part in order])
@@ -451,6 +420,14 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
 
 
 # the search
+
+class Evidence(NamedTuple):
+    """Evidence for a term: p-value of it alone, gain in log-likelihood, effective stretches."""
+
+    chance: float
+    gain: float
+    stretches: float
+
 
 @dataclass(frozen=True)
 class FoundCause:
@@ -484,7 +461,7 @@ def propose_terms(fit: SpanFit) -> Iterator[CauseTerm]:
     so that none of these is a candidate.
 
     """
-    return (each for each in _columns(fit)
+    return (each for each in _all_terms(fit)
             if not (fit.scale_held and _follows_the_rate(each.cause)))
 
 
@@ -494,23 +471,22 @@ def _follows_the_rate(cause: str) -> bool:
     return (cause == 'reference_once_per_rev' if effect is None else 'rate' in effect.inputs)
 
 
-def _columns(done: SpanFit) -> Iterator[CauseTerm]:
-    """Give the columns of all causes for the channels that the log has."""
-    log, fine, time = done.spans.log, done.spans.is_fine, done.spans.time
+def _all_terms(done: SpanFit) -> Iterator[CauseTerm]:
+    log, fine, time = done.spans.log, done.spans.treatment.is_fine, done.spans.time
     duration = float(time[-1] - time[0])
     for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
                  'rate_ramp', 'heading_sensitivity', 'reference_once_per_rev'):
         yield CauseTerm(name)
-    if fine:
-        yield CauseTerm('bandwidth', is_positive=True)
     for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist():
         yield CauseTerm('warm_up', (constant,))
     for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist():
-        yield CauseTerm('bias_step', (moment,), is_single_event=True)
+        yield CauseTerm('bias_step', (moment,))
         if not fine:
-            yield CauseTerm('reference_slip', (moment,), is_single_event=True)
-    if log.temperature is not None and np.ptp(log.temperature) > 0.2:
-        middle = float(log.temperature.mean())
+            yield CauseTerm('reference_slip', (moment,))
+    has = {name for name, least in MIN_CHANNEL_RANGE.items()
+           if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
+    if 'temperature' in has:
+        middle = float(np.mean(np.asarray(log.temperature)))
         for name in ('bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature'):
             yield CauseTerm(name, (middle,))
         for filter_time in (3.0, 10.0):
@@ -520,12 +496,11 @@ def _columns(done: SpanFit) -> Iterator[CauseTerm]:
                 yield CauseTerm('thermal_lag', (constant,))
             for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4)):
                 yield CauseTerm('thermal_hysteresis', (filter_time, threshold))
-    if log.specific_force is not None and np.ptp(log.specific_force) > 0.0:
+    if 'specific_force' in has:
         yield CauseTerm('acceleration_sensitivity')
         yield CauseTerm('vibration_rectification', (1.0,))
-    if log.supply is not None and np.ptp(log.supply) > 0.0:
+    if 'supply' in has:
         yield CauseTerm('supply_sensitivity', (5.0,))
-    has = [name for name in MIN_CHANNEL_RANGE if getattr(log, name) is not None]
     for name, shapes in user_effects(has, has_motion=True):
         yield CauseTerm(name, shapes)
 
@@ -534,25 +509,27 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
                   on_part: OnPart) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
     found: list[FoundCause] = []
-    candidate_terms = list(propose_terms(fit))
+    candidates = list(propose_terms(fit))
     # noise given one column of each cause, so that it does not absorb their contributions
-    columns = {each.cause: each for each in candidate_terms if not each.is_single_event}
+    columns = {each.cause: each for each in candidates if not each.is_single_event}
     rich_fit = fit_spans(fit.spans, list(columns.values()))
     while len(found) < MAX_CAUSES:
         found_terms = [each.cause_term for each in found]
         names = {each.cause for each in found_terms}
         on_part(f'search for causes after {len(found)} found' if found else 'search for causes')
-        best = _find_best_cause(fit, rich_fit,
-                                [each for each in candidate_terms if each.cause not in names],
-                                found_terms, false_alarm_rate)
+        # what a scale factor error that is kept at 0 would explain is no evidence of a cause
+        data = whiten_regression(replace(fit, prior=np.array(fit.spans.treatment.prior)),
+                                 found_terms, rich_fit, use_max_random_walk=True)
+        best = _find_best_cause(fit.spans, data,
+                                [each for each in candidates if each.cause not in names],
+                                false_alarm_rate)
         if best is None:
             break
         found.append(best)
     found = [each for each in found if each.prediction_gain > 0.0]
-    extended = fit
-    while established_terms := [each.cause_term for each in found if each.is_established]:
-        extended = fit_spans(fit.spans, established_terms)
-        worst = max(established_terms, key=lambda each: _implausibility(extended, each))
+    while established := [each.cause_term for each in found if each.is_established]:
+        extended = fit_spans(fit.spans, established)
+        worst = max(established, key=lambda each: _implausibility(extended, each))
         if _implausibility(extended, worst) < 1.0:
             return extended, found
         found = [replace(each, is_established=each.is_established and each.cause_term != worst)
@@ -573,86 +550,71 @@ def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
     return float(added / np.abs(fit.spans.channels.rate).max()) / _MAX_RELATIVE_EFFECT
 
 
-def _find_best_cause(fit: SpanFit, rich_fit: SpanFit, open_terms: Sequence[CauseTerm],
-                     found_terms: Sequence[CauseTerm],
+def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[CauseTerm],
                      false_alarm_rate: float) -> FoundCause | None:
     """Return the best of the remaining causes, given those found; None if insignificant."""
-    # what a scale factor error that is kept at 0 would explain is no evidence of a cause
-    data = whiten_regression(replace(fit, prior=np.array(fit.spans.treatment.prior)), found_terms,
-                             rich_fit, use_max_random_walk=True)
-    widths = [fit.spans.cause_columns(each) for each in open_terms]
+    widths = [spans.cause_columns(each) for each in terms]
     columns = data.whiten_columns(np.column_stack(widths))
-    edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])
-    places = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:])]
-    chances = _term_evidences(data, columns, places, open_terms,
-                              np.ones(len(data.observed), dtype=bool))
+    ends = np.cumsum([each.shape[1] for each in widths]).tolist()
+    places = list(map(slice, [0, *ends], ends))
+    evidences = _term_evidences(data, columns, places, terms,
+                                np.ones(len(data.observed), dtype=bool))
     # single events are never established, and are not counted in the number of the others
-    lasting = sum(not each.is_single_event for each in open_terms)
-    corrected_chances = [chance * (len(open_terms) if each.is_single_event else lasting)
-                         for each, (chance, _, _) in zip(open_terms, chances)]
-    strongest = int(np.argmin(corrected_chances))
-    once = open_terms[strongest].is_single_event
-    level = false_alarm_rate if once else SUSPECTED_RATE_FACTOR * false_alarm_rate
-    if min(corrected_chances[strongest], 1.0) > level:
+    lasting = sum(not each.is_single_event for each in terms)
+    p_values = [min(evidence.chance * (len(terms) if each.is_single_event else lasting), 1.0)
+                for each, evidence in zip(terms, evidences)]
+    strongest = min(range(len(terms)), key=lambda place: (p_values[place], place))
+    level = false_alarm_rate * (1.0 if terms[strongest].is_single_event else SUSPECTED_RATE_FACTOR)
+    if p_values[strongest] > level:
         return None
-    best_of: dict[str, int] = {}
-    for other, each in enumerate(open_terms):
-        if each.cause not in best_of or chances[other][1] > chances[best_of[each.cause]][1]:
-            best_of[each.cause] = other
-    gain = chances[strongest][1]
-    least = gain - math.log(_MAX_LIKELIHOOD_RATIO)
-    equivalent_causes = {name: other for name, other in best_of.items()
-                         if chances[other][1] > least or other == strongest}
-    # the simplest of the equivalent causes: with the fewest values and fitted shapes
+    best_of = {terms[place].cause: place
+               for place in sorted(range(len(terms)), key=lambda place: evidences[place].gain)}
+    gain = evidences[strongest].gain
+    equivalent = {name: place for name, place in best_of.items() if place == strongest
+                  or gain - evidences[place].gain < math.log(_MAX_LIKELIHOOD_RATIO)}
 
-    def count_values(other: int) -> int:
-        effect = CATALOGUE.get(open_terms[other].cause)
-        return widths[other].shape[1] + sum(
-            each.default is None for each in getattr(effect, 'nonlinear_parameters', ()))
+    def complexity(place: int) -> tuple[int, float]:
+        """Return the number of values and fitted shapes, and the p-value."""
+        shapes = getattr(CATALOGUE.get(terms[place].cause), 'nonlinear_parameters', ())
+        return (widths[place].shape[1] + sum(each.default is None for each in shapes),
+                p_values[place])
 
-    place = min(equivalent_causes.values(),
-                key=lambda other: (count_values(other), corrected_chances[other]))
-    column, p_value = open_terms[place], min(corrected_chances[place], 1.0)
-    stretches = chances[place][2]
-    found = _cross_fit(data, columns, places, open_terms, equivalent_causes)
+    simplest = min(equivalent.values(), key=complexity)
+    folds = [_cross_fit(data, columns, places, terms, equivalent, sets)
+             for sets in _fold_sets(data.stretch_count)]
     # errors of a course are correlated over time, so that distant stretches must be predicted too
-    prediction_sigma, predicted, chosen = max(found) if fit.spans.is_fine else min(found)
+    sigmas, predicted, selected = max(folds) if spans.treatment.is_fine else min(folds)
     probability = {name: chance for name, chance in probabilities(
-        {name: gain - chances[other][1] for name, other in best_of.items()}).items()
-        if name in equivalent_causes}
-    established = (p_value < false_alarm_rate and prediction_sigma > MIN_PREDICTION_SIGMAS
-                   and chosen == 1.0 and not column.is_single_event and stretches >= MIN_STRETCHES)
-    return FoundCause(column, max(p_value, MIN_PROBABILITY), predicted, chosen, established,
-                      probability)
+        {name: gain - evidences[place].gain for name, place in best_of.items()}).items()
+        if name in equivalent}
+    established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
+                   and selected == 1.0 and not terms[simplest].is_single_event
+                   and evidences[simplest].stretches >= MIN_STRETCHES)
+    return FoundCause(terms[simplest], max(p_values[simplest], MIN_PROBABILITY), predicted,
+                      selected, established, probability)
 
 
 def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[slice],
-                    open_terms: Sequence[CauseTerm],
-                    rows: Mask) -> list[tuple[float, float, float]]:
-    """Return chance, gain in log-likelihood and effective stretches of each cause."""
+                    terms: Sequence[CauseTerm], rows: Mask) -> list[Evidence]:
+    """Return the evidence for each term in some of the rows."""
     base, _ = np.linalg.qr(data.design[rows])
     both = np.column_stack([columns, data.observed])[rows]
     both -= base @ (base.T @ both)
-    clusters = [each[rows] for each in (data.row_stretches, *data.row_sectors)]
-    sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
-    found = []
-    for place, each in zip(places, open_terms):
-        if each.is_positive and float(both[:, place.start] @ both[:, -1]) <= 0.0:
-            found.append((1.0, 0.0, 0.0))
-            continue
-        own = clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1]
-        found.append(_cluster_robust_evidence(both[:, place], both[:, -1], own,
-                                              1e-6 * sizes[place]))
-    return found
+    clusters = [each[rows] for each in data.clusters]
+    least = 1e-6 * (np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300)
+    return [_cluster_robust_evidence(
+        both[:, place], both[:, -1],
+        clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], least[place])
+        for place, each in zip(places, terms)]
 
 
 def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],
-                             min_sizes: Array) -> tuple[float, float, float]:
-    """Return chance, gain in log-likelihood and effective number by the worst clusters."""
+                             min_sizes: Array) -> Evidence:
+    """Return the least evidence by any of the clusterings."""
     information = x.T @ x
     size = np.sqrt(np.diag(information))
     if not (size > min_sizes).all():
-        return 1.0, 0.0, 0.0
+        return Evidence(1.0, 0.0, 0.0)
     # by the residual with the candidate: scores that contain the effect would overestimate scatter
     off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
     count, found = x.shape[1], []
@@ -665,43 +627,42 @@ def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArr
         scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
         max_variance_ratio = float(np.linalg.eigvalsh(root @ scatter @ root.T).max())
         statistic, freedom = square / max(max_variance_ratio, 1.0), max(effective - count, 1.0)
-        found.append((float(fisher.sf(statistic / count, count, freedom)), 0.5 * statistic,
-                      effective))
+        found.append(Evidence(float(fisher.sf(statistic / count, count, freedom)),
+                              0.5 * statistic, effective))
     return max(found)
 
 
+def _fold_sets(stretch_count: int) -> list[list[NDArray[np.intp]]]:
+    """Return two divisions of the stretches into five: every fifth one, and fifths of the log."""
+    # in the first, slow causes are also predicted by the bias wander of neighbouring stretches
+    numbers, folds = np.arange(stretch_count), min(FOLD_COUNT, stretch_count)
+    return [[numbers[fold::folds] for fold in range(folds)], np.array_split(numbers, folds)]
+
+
 def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice],
-               open_terms: Sequence[CauseTerm],
-               equivalent_causes: Mapping[str, int]) -> list[tuple[float, float, float]]:
+               terms: Sequence[CauseTerm], equivalent: Mapping[str, int],
+               folds: Sequence[NDArray[np.intp]]) -> tuple[float, float, float]:
     """
     Select and fit without each fold, and predict it.
 
     Returns
     -------
-    for folds of every fifth stretch, and for fifths of the log (in the first, slow causes are also
-    predicted by the bias wander of neighbouring stretches): gain in log-likelihood over its
-    standard deviation by the scatter of stretches, the gain, and the share of the folds in which
-    one of the equivalent causes was selected
+    gain in log-likelihood over its standard deviation by the scatter of stretches, the gain, and
+    the share of the folds in which one of the equivalent causes was selected
 
     """
-    numbers = np.arange(data.stretch_count)
-    folds = min(FOLD_COUNT, len(numbers))
-    found = []
-    for sets in ([numbers[fold::folds] for fold in range(folds)], np.array_split(numbers, folds)):
-        log_likelihood_gains: list[float] = []
-        same_choices = 0
-        for fold in sets:
-            held = np.isin(data.row_stretches, fold)
-            rest = ~held
-            evidences = _term_evidences(data, columns, places, open_terms, rest)
-            best = int(np.argmax([gain for _, gain, _ in evidences]))
-            same_choices += open_terms[best].cause in equivalent_causes
-            off = []
-            for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):
-                values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
-                off.append(data.observed[held] - design[held] @ values)
-            log_likelihood_gains += np.bincount(np.searchsorted(fold, data.row_stretches[held]),
-                                                0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
-        found.append((prediction_sigmas(np.array(log_likelihood_gains)),
-                      float(np.sum(log_likelihood_gains)), same_choices / folds))
-    return found
+    gains: list[float] = []
+    same_choices = 0
+    for fold in folds:
+        held = np.isin(data.clusters[0], fold)
+        rest = ~held
+        evidences = _term_evidences(data, columns, places, terms, rest)
+        best = int(np.argmax([each.gain for each in evidences]))
+        same_choices += terms[best].cause in equivalent
+        off = []
+        for design in (data.design, np.column_stack([data.design, columns[:, places[best]]])):
+            values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
+            off.append(data.observed[held] - design[held] @ values)
+        gains += np.bincount(np.searchsorted(fold, data.clusters[0][held]),
+                             0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
+    return prediction_sigmas(np.array(gains)), float(np.sum(gains)), same_choices / len(folds)

@@ -21,9 +21,10 @@ integrals of the most likely rate ``w`` given both (with a course, that of the g
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
 with the integrals ``J``. A point is the mean over some samples; the observations are the
-differences between points, so that a gap of the reference is a long span. The length of the spans
-and the components of the noise depend on the kind of the reference (`ReferenceTreatment`). The
-computing time is proportional to the number of spans.
+differences between points, so that a gap of the reference is a long span. A rest in a gap, as of
+a vehicle whose course is lost then, is one more observation: a turn by 0. What differs between the
+kinds of references is in `ReferenceTreatment`. The computing time is proportional to the number of
+spans.
 
 """
 
@@ -32,6 +33,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 from gyro_calibration.calibration.encoder import MAX_TIME_OFFSET
 from gyro_calibration.calibration.noise_grid import (
@@ -56,29 +58,20 @@ from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
-from scipy.ndimage import median_filter
+from scipy.ndimage import binary_erosion, median_filter
 from scipy.stats import t as student
 
 #: Names of the values that are always fitted.
 BASE_VALUES = ('scale_factor_error', 'bias', 'time_offset')
 #: Least effective number of stretches of an established value.
 MIN_STRETCHES = 3.0
-#: Largest standard deviation of an outlying point, relative to the others.
-_MAX_POINT_DEVIATION = 10.0
-#: Factor of the prior of a value that is not fitted.
-_FIXED_PRIOR_FACTOR = 1e-6
 #: Trial delays of a reference, s.
 _TRIAL_DELAYS = np.arange(-1.5, 1.501, 0.05)
-#: Largest share of noise in the column of a delay, and largest half-width of the means that reduce
-#: it, s.
-_MAX_RATE_NOISE_SHARE, _MAX_SMOOTHING_HALF_WIDTH = 0.05, 0.5
-#: Number of robust fits of values and outlying points.
-_ROBUST_PASSES = 2
-#: Sector of a shaft, rad, in which encoder readings are not independent.
-_SHAFT_SECTOR = 10.0 * DEGREE
-#: Shortest rest of a gyro while its course is lost, s, and largest ratio of its scatter to the
-#: smallest of the log.
-_MIN_REST_DURATION, _MAX_REST_SCATTER_RATIO = 3.0, 2.0
+#: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
+_FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
+#: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
+#: vibration.
+_MAX_VEHICLE_WALK = 5e-4
 
 
 @dataclass(frozen=True)
@@ -91,15 +84,10 @@ class ReferenceTreatment:
     min_span : least length, s
     max_spans : largest number of spans of a log
     prior : standard deviations of scale factor error, bias (rad/s) and delay (s)
-    walk_range : smallest and largest angle random walk, in units of `Spans.walk`
-    max_walk : largest angle random walk, rad/√s, as white noise may be vibration
-    cosine_count : number of cosines of the wandering bias
-    flicker_range, random_walk_range : smallest and largest bias instability and rate random walk,
-        rad/s and rad/s/√s; relative to the angle random walk if `is_relative`
-    is_relative : whether they are relative
+    walk_range : smallest and largest angle random walk, in units of `Spans.walk_bounds`
     stretch_duration : length of stretches whose scores are independent, s
-    errs_as_heading : whether the reference has errors of a heading, not of an integrated rate
-    averages_span : whether a point is the mean of a span
+    is_fine : whether its errors are small enough to show a random walk of the bias, and events
+    errs_as_heading : whether it has errors of a heading, not of an integrated rate
 
     """
 
@@ -107,48 +95,34 @@ class ReferenceTreatment:
     max_spans: int
     prior: tuple[float, float, float]
     walk_range: tuple[float, float]
-    max_walk: float
-    cosine_count: int
-    flicker_range: tuple[float, float]
-    random_walk_range: tuple[float, float] | None
-    is_relative: bool
     stretch_duration: float
+    is_fine: bool
     errs_as_heading: bool
-    averages_span: bool
 
 
-#: Data-sheet limits of gyros for vehicles: scale factor 1 %, bias 1 deg/s, angle random walk 1.7
-#: deg/√h, bias instability 40 deg/h; and delays of a course of 1 s.
-COURSE_TREATMENT = ReferenceTreatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 5e-4, 12,
-                                      (1e-6, 2e-4), None, False, 15.0, True, True)
-#: A reference with errors of an instrument; bias wander is relative to the white noise.
-HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), math.inf,
-                                       24, (3e-3, 0.5), (1e-4, 0.1), True, 5.0, True, True)
-#: An encoder on the host of the gyro; small delays, as a swing agrees again a period later.
-ENCODER_TREATMENT = replace(HEADING_TREATMENT,
-                            prior=(*HEADING_TREATMENT.prior[:2], MAX_TIME_OFFSET / 1.5))
-RATE_TREATMENT = replace(HEADING_TREATMENT, errs_as_heading=False, averages_span=False,
-                         cosine_count=60)
+#: Data-sheet limits of gyros for vehicles: scale factor 1 %, bias 1 deg/s; and delays of 1 s.
+COURSE_TREATMENT = ReferenceTreatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 15.0, False, True)
+#: A reference with errors of an instrument.
+HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0, True,
+                                       True)
+_TREATMENTS = {
+    'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False),
+    # on the host of the gyro: small delays, as a swing agrees again a period later
+    'encoder': replace(HEADING_TREATMENT,
+                       prior=(*HEADING_TREATMENT.prior[:2], MAX_TIME_OFFSET / 1.5)),
+    'motion_capture': HEADING_TREATMENT, 'gyro': HEADING_TREATMENT}
 
 
-@dataclass(frozen=True)
-class CauseTerm:
-    """
-    One cause as columns of the regression.
-
-    Attributes
-    ----------
-    cause : its name
-    shapes : of the effect
-    is_single_event : whether it is a single event
-    is_positive : whether its value is at least 0
-
-    """
+class CauseTerm(NamedTuple):
+    """One cause with the shapes of its effect, as columns of the regression."""
 
     cause: str
     shapes: tuple[float, ...] = ()
-    is_single_event: bool = False
-    is_positive: bool = False
+
+    @property
+    def is_single_event(self) -> bool:
+        """Tell whether it happens once, at its first shape."""
+        return self.cause in ('bias_step', 'reference_slip')
 
 
 @dataclass(frozen=True)
@@ -160,16 +134,16 @@ class Spans:
     ----------
     log : with output, time and reference heading
     channels : inputs of the effects; the rate is that of the gyro, as corrected so far
-    point_index : point of each known value of the reference
-    value_times : times of these values, s
+    value_times : times of the known values of the reference, s
+    point_index : point of each of them
     time, heading : of the points, s and rad, shape (n + 1,)
-    rests : begin and end row of each stretch at rest
+    rests : first and last row of each rest in a gap of the reference, shape (r, 2)
     treatment : of the kind of the reference
     walk_bounds : the angle random walk by the white noise of the samples, with that of a reference
         rate, and by the difference of gyro and reference over a second, the smaller first, rad/√s
     reference_noise_ratio : ratio of the noise of a reference rate to that of the gyro
-    delay : of the stamps of the gyro relative to the reference, s
     uses_code_changes : whether the points are changes of the code of an encoder
+    delay : of the stamps of the gyro relative to the reference, s
 
     """
 
@@ -179,17 +153,12 @@ class Spans:
     point_index: NDArray[np.intp]
     time: Array
     heading: Array
-    rests: tuple[tuple[int, int], ...]
+    rests: NDArray[np.intp]
     treatment: ReferenceTreatment
     walk_bounds: tuple[float, float]
-    reference_noise_ratio: float = 0.0
+    reference_noise_ratio: float
+    uses_code_changes: bool
     delay: float = 0.0
-    uses_code_changes: bool = False
-
-    @property
-    def is_fine(self) -> bool:
-        """Tell whether the errors of the reference are small enough to show lags and events."""
-        return self.treatment.is_relative
 
     @property
     def stretch_numbers(self) -> NDArray[np.intp]:
@@ -197,20 +166,20 @@ class Spans:
         middle = 0.5 * (self.time[1:] + self.time[:-1]) - self.time[0]
         count = max(int(np.ceil(middle[-1] / self.treatment.stretch_duration)), 1)
         of_spans = np.minimum(middle * count / (middle[-1] + 1e-9), count - 1).astype(np.intp)
-        return np.concatenate([of_spans, count + np.arange(len(self.rests))])
+        return np.append(of_spans, count + np.arange(len(self.rests)))
 
     @property
     def shaft_sectors(self) -> NDArray[np.intp]:
         """
-        Return the number of the sector and sense of the shaft of each observation, shape (n + r,).
+        Return the number of the sector of 10 deg and sense of the shaft, shape (n + r,).
 
         If a motion repeats synchronously with the samples, the errors of an encoder repeat too.
         Stretches in time would count them as independent.
 
         """
         middle = self.point_means(np.asarray(self.channels.heading))
-        cell = np.floor(0.5 * (middle[1:] + middle[:-1]) / _SHAFT_SECTOR)
-        keys = np.concatenate([2.0 * cell + (np.diff(middle) > 0.0), np.zeros(len(self.rests))])
+        sector = np.floor(0.5 * (middle[1:] + middle[:-1]) / (10.0 * DEGREE))
+        keys = np.append(2.0 * sector + (np.diff(middle) > 0.0), np.zeros(len(self.rests)))
         return np.unique(keys, return_inverse=True)[1].astype(np.intp)
 
     def point_means(self, values: Array) -> Array:
@@ -223,68 +192,48 @@ class Spans:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         assert self.log.time is not None
         whole = integrate_with_curvature(self.log.time, np.broadcast_to(rate, self.log.time.shape))
-        still = [whole[end] - whole[begin] for begin, end in self.rests]
-        return np.concatenate([np.diff(self.point_means(whole)), still])
+        return np.append(np.diff(self.point_means(whole)), np.diff(whole[self.rests])[:, 0])
 
     def span_changes(self, values: Array) -> Array:
         """Return the change of a signal over spans, 0 over rests, shape (n + r,)."""
-        return np.concatenate([np.diff(self.point_means(values)), np.zeros(len(self.rests))])
+        return np.append(np.diff(self.point_means(values)), np.zeros(len(self.rests)))
 
     @property
     def observed(self) -> Array:
         """Return the change of the reference less that of the integral of the output, (n + r,)."""
         assert self.log.output is not None
-        turned = np.concatenate([np.diff(self.heading), np.zeros(len(self.rests))])
+        turned = np.append(np.diff(self.heading), np.zeros(len(self.rests)))
         return turned - self.span_integrals(self.log.output)
 
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
         rate = np.asarray(self.channels.rate)
-        return np.column_stack(
-            [-self.span_integrals(rate), -self.span_integrals(np.ones_like(rate)),
-             np.concatenate([self._rate_changes(), np.zeros(len(self.rests))])])
+        return np.column_stack([-self.span_integrals(rate),
+                                -self.span_integrals(np.ones_like(rate)), self._rate_changes()])
 
     def _rate_changes(self) -> Array:
-        """
-        Return the change of the rate over spans, shape (n,), without much noise.
-
-        Noise in this column would bias the delay. So the rate is a mean over a time for which its
-        noise is a small share of the column.
-
-        """
-        assert self.log.time is not None and self.log.output is not None
-        turned = (np.asarray(self.channels.heading) if self.is_fine
-                  else integrate_with_curvature(self.log.time, self.log.output))
-        at, half = self.value_times + self.delay, float(np.median(np.diff(self.log.time)))
-        while True:
-            forth, back = (np.interp(at + way, self.log.time, turned) for way in (half, -half))
-            change = np.diff(np.bincount(self.point_index, (forth - back) / (2.0 * half))
-                             / np.bincount(self.point_index))
-            if (self.walk_bounds[0] ** 2 / half < _MAX_RATE_NOISE_SHARE * np.mean(change ** 2)
-                    or half > _MAX_SMOOTHING_HALF_WIDTH):
-                return np.asarray(change)
-            half *= 2.0
+        """Return the change of the rate, as a mean over two samples, shape (n + r,)."""
+        time, output = np.asarray(self.log.time), np.asarray(self.log.output)
+        turned = (np.asarray(self.channels.heading) if self.treatment.is_fine
+                  else integrate_with_curvature(time, output))
+        half = float(np.median(np.diff(time)))
+        forth, back = (np.interp(time + way, time, turned) for way in (half, -half))
+        return self.span_changes((forth - back) / (2.0 * half))
 
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
-        channels = self.channels
+        time, output, heading = map(np.asarray, (self.log.time, self.log.output,
+                                                 self.channels.heading))
         if cause.cause == 'reference_once_per_rev':
-            heading = np.asarray(channels.heading)
-            return np.column_stack(
-                [self.span_changes(np.sin(heading)), self.span_changes(np.cos(heading))])
+            return np.column_stack([self.span_changes(np.sin(heading)),
+                                    self.span_changes(np.cos(heading))])
         if cause.cause == 'reference_slip':
-            late = np.asarray(channels.time) >= cause.shapes[0]
-            return self.span_changes(late.astype(float))[:, None]
+            return self.span_changes((time >= cause.shapes[0]).astype(float))[:, None]
         if cause.cause == 'bandwidth':
             # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
-            assert self.log.time is not None and self.log.output is not None
-            return -self.span_changes(np.gradient(self.log.output, self.log.time))[:, None]
-        columns = CATALOGUE[cause.cause].columns(channels, *cause.shapes)
+            return -self.span_changes(np.gradient(output, time))[:, None]
+        columns = CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)
         return np.column_stack([-self.span_integrals(np.asarray(each)) for each in columns])
-
-    def point_rates(self) -> Array:
-        """Return the rate at the points, rad/s, shape (n + 1,)."""
-        return self.point_means(np.asarray(self.channels.rate))
 
     def with_corrected_rate(self, values: Array) -> Spans:
         """Return the spans with the rate corrected for scale factor error, bias and delay."""
@@ -295,7 +244,7 @@ class Spans:
         # the heading of the reference, between its points that of the gyro
         at = self.log.time - moved.delay
         heading_change: Array = self.heading - moved.point_means(turned)
-        if self.is_fine:
+        if self.treatment.is_fine:
             heading_change = self._difference_of_gyro(heading_change)
             steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
             rate = rate + (np.diff(heading_change) / np.diff(self.time))[steps]
@@ -321,6 +270,95 @@ class Spans:
         banded[1] = 1.0 + np.append(stiffness, 0.0) + np.append(0.0, stiffness)
         banded[0, 1:] = -stiffness
         return np.asarray(solveh_banded(banded, heading_change))
+
+    def bias_wander(self) -> tuple[Array, list[SharedNoise]]:
+        """Return the columns of a wandering bias, and the parts of its noise."""
+        least, most = self.walk_bounds
+        flicker, walk = ((low * least, high * most)
+                         for low, high in (_FLICKER_RANGE, _RANDOM_WALK_RANGE))
+        waves, parts = bias_wander_columns(self.time, flicker,
+                                           walk if self.treatment.is_fine else None)
+        assert self.log.time is not None
+        begin, end = self.time[0], self.time[-1]
+        omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
+        rest_times = np.clip(self.log.time[self.rests], begin, end)[:, :, None] - begin
+        rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
+        return np.concatenate([waves, rows]), parts
+
+
+def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
+    """
+    Divide a log with a reference into spans.
+
+    Parameters
+    ----------
+    log : with output, time and a reference
+    kind : of the reference
+    prior : standard deviations of (s, b) from `GyroModel.prior_deviations`, if the type of gyro is
+        known
+
+    """
+    assert log.time is not None and log.output is not None
+    treatment = _TREATMENTS.get(kind, COURSE_TREATMENT)
+    if prior is not None:
+        scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
+        treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))
+    time, output = log.time - log.time[0], bridge_gaps(log.output)
+    white = white_noise_deviation(log.output)
+    reference, noisier = log.reference_heading, 0.0
+    if reference is None:
+        assert log.reference_rate is not None
+        noisier = rate_noise_share(log)
+        white = math.hypot(white, white_noise_deviation(log.reference_rate))
+        reference = integrate_with_curvature(time, bridge_gaps(log.reference_rate))
+    log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
+    walks = [white * math.sqrt(float(np.median(np.diff(time))))]
+    if treatment.is_fine:
+        # vibration adds white noise without a random walk, and a filter reduces the white noise
+        difference = heading_difference(log)
+        walks.append(difference.total_walk)
+        if difference.is_significant:  # or a heading that was differentiated
+            treatment = replace(treatment, errs_as_heading=True)
+    else:
+        walks = [min(walks[0], _MAX_VEHICLE_WALK)]
+    at, by_code = time, kind == 'encoder' and encoder_step(reference) > 0.0
+    if by_code:
+        # between two samples with different codes the shaft was in the middle of both; a single
+        # code gives only a range, and its error at rest or at a reversal is systematic
+        at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
+        reference = np.append(np.where(np.diff(reference) != 0.0,
+                                       0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
+    known = np.flatnonzero(np.isfinite(reference))
+    stamps = at[known]
+    length = max(treatment.min_span, float(stamps[-1] - stamps[0]) / treatment.max_spans,
+                 2.0 * float(np.median(np.diff(time))))
+    # a gap begins a new point
+    number = np.floor((stamps - stamps[0]) / length + 1e-6)
+    place = np.cumsum(
+        (np.diff(number, prepend=number[0]) > 0.0) | (np.diff(stamps, prepend=stamps[0]) > length))
+    if not treatment.errs_as_heading:
+        # means of an integrated rate would not err independently
+        known = known[np.diff(place, prepend=-1) > 0]
+        place = np.arange(len(known))
+    count = np.bincount(place)
+    channels = replace(channels_from_log(log), rate=output, time=time,
+                       heading=integrate_trapezoidal(time, output))
+    return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
+                 np.bincount(place, reference[known]) / count,
+                 _find_rests(time, output, known), treatment,
+                 (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code)
+
+
+def _find_rests(time: Array, output: Array, known: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return first and last row of 3 s and more of a quiet gyro in gaps of the reference."""
+    second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
+    blocks = len(output) // second
+    scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
+    is_lost = np.bincount(known // second, minlength=blocks)[:blocks] == 0
+    is_still = (binary_erosion(is_lost, border_value=1)
+                & (scatter <= 2.0 * scatter.min(initial=math.inf) + 1e-12))
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], is_still, [0]]))).reshape(-1, 2)
+    return np.asarray(ends[ends[:, 1] - ends[:, 0] >= 3] * second - [0, 1], dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -351,9 +389,8 @@ class SpanFit:
 
     def half_width(self, value_index: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
-        freedom = self.freedom[value_index]
         deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
-        half = float(student.ppf(0.975, freedom)) * deviation
+        half = float(student.ppf(0.975, self.freedom[value_index])) * deviation
         prior = self.spans.treatment.prior
         return (min(half, NORMAL_QUANTILE_975 * prior[value_index]) if value_index < len(prior)
                 else half)
@@ -365,113 +402,14 @@ class SpanFit:
 
     def value_slice(self, cause: CauseTerm) -> slice:
         """Return the places of the values of a cause."""
-        start = len(BASE_VALUES)
-        for each in self.causes:
-            width = self.spans.cause_columns(each).shape[1]
-            if each == cause:
-                break
-            start += width
-        return slice(start, start + width)
+        widths = [self.spans.cause_columns(each).shape[1] for each in self.causes]
+        place = self.causes.index(cause)
+        start = len(BASE_VALUES) + sum(widths[:place])
+        return slice(start, start + widths[place])
 
     def noise_size(self, name: str) -> float:
         """Return the likeliest size of a part of the noise."""
         return float(self.fit.likeliest_sizes.get(name, 0.0))
-
-
-def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
-    """
-    Divide a log with a reference into spans.
-
-    Parameters
-    ----------
-    log : with output, time and a reference
-    kind : of the reference
-    prior : standard deviations of (s, b) from `GyroModel.prior_deviations`, if the type of gyro is
-        known
-
-    """
-    assert log.time is not None and log.output is not None
-    treatment = {
-        'rate_command': RATE_TREATMENT,
-        'encoder': ENCODER_TREATMENT,
-        'motion_capture': HEADING_TREATMENT,
-        'gyro': HEADING_TREATMENT
-    }.get(kind, COURSE_TREATMENT)
-    if prior is not None:
-        scale, bias, delay = treatment.prior
-        treatment = replace(treatment,
-                            prior=(min(scale, float(prior[0])), min(bias, float(prior[1])), delay))
-    time, output = log.time - log.time[0], bridge_gaps(log.output)
-    white = white_noise_deviation(log.output)
-    reference, noisier = log.reference_heading, 0.0
-    if reference is None:
-        assert log.reference_rate is not None
-        noisier = rate_noise_share(log)
-        white = math.hypot(white, white_noise_deviation(log.reference_rate))
-        reference = integrate_with_curvature(time, bridge_gaps(log.reference_rate))
-    log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
-    if (treatment.is_relative and not treatment.errs_as_heading
-            and heading_difference(log).is_significant):
-        treatment = replace(treatment, errs_as_heading=True)  # a heading that was differentiated
-    at, by_code = time, kind == 'encoder' and encoder_step(reference) > 0.0
-    if by_code:
-        # between two samples with different codes the shaft was in the middle of both; a single
-        # code gives only a range, and its error at rest or at a reversal is systematic
-        at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
-        reference = np.append(np.where(np.diff(reference) != 0.0,
-                                       0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
-    known = np.flatnonzero(np.isfinite(reference))
-    stamps = at[known]
-    length = max(treatment.min_span, float(stamps[-1] - stamps[0]) / treatment.max_spans,
-                 2.0 * float(np.median(np.diff(time))))
-    # a gap begins a new point
-    number = np.floor((stamps - stamps[0]) / length + 1e-6)
-    place = np.cumsum(
-        (np.diff(number, prepend=number[0]) > 0.0) | (np.diff(stamps, prepend=stamps[0]) > length))
-    if not treatment.averages_span:
-        known = known[np.diff(place, prepend=-1) > 0]
-        place = np.arange(len(known))
-    count = np.bincount(place)
-    channels = replace(channels_from_log(log), rate=output, time=time,
-                       heading=integrate_trapezoidal(time, output))
-    return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
-                 np.bincount(place, reference[known]) / count, _find_rests(time, output, known),
-                 treatment, _walk_bounds(log, white, treatment), noisier,
-                 uses_code_changes=by_code)
-
-
-def _walk_bounds(log: Log, white: float, treatment: ReferenceTreatment) -> tuple[float, float]:
-    """Return bounds of the angle random walk, except for a factor, rad/√s."""
-    assert log.time is not None
-    walk = white * math.sqrt(float(np.median(np.diff(log.time))))
-    # vibration adds white noise without a random walk, and a filter reduces the white noise
-    walks = walk, heading_difference(log).total_walk if treatment.is_relative else walk
-    least, most = (min(max(each, 1e-9), treatment.max_walk) for each in sorted(walks))
-    return least, most
-
-
-def _find_rests(time: Array, output: Array,
-                known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
-    """Return begin and end row of stretches without a course in which the gyro is quiet."""
-    edges = np.concatenate([[0], known, [len(time) - 1]])
-    second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
-    blocks = len(output) // second
-    if blocks < 8:
-        return ()
-    scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    quiet = _MAX_REST_SCATTER_RATIO * float(scatter.min()) + 1e-12
-    found = []
-    for begin, end in zip(edges[:-1], edges[1:]):
-        first, last = -(-int(begin) // second) + 1, int(end) // second - 1
-        run: list[int] = []
-        for block in [*range(first, last + 1), -1]:
-            if 0 <= block < blocks and scatter[block] <= quiet:
-                run.append(block)
-                continue
-            if len(run) >= _MIN_REST_DURATION:
-                found.append((run[0] * second, (run[-1] + 1) * second - 1))
-            run = []
-    return tuple(found)
 
 
 def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
@@ -494,7 +432,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     delayed = replace(spans, delay=spans.delay or min(
         _TRIAL_DELAYS[np.abs(_TRIAL_DELAYS) <= 1.5 * prior[2]].tolist(), key=disagreement))
     point_variances: Array = np.ones(len(spans.time))
-    for _ in range(_ROBUST_PASSES):
+    for _ in range(2):
         values = _robust_least_squares(design_matrix(delayed, causes), delayed.observed, free)[0]
         delayed = delayed.with_corrected_rate(values)
         values[2] = 0.0
@@ -504,8 +442,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     if fit.effective_stretches[0] >= MIN_STRETCHES:
         return fit
     delayed = delayed.with_corrected_rate(np.append(0.0, fit.fit.values[1:3]))
-    fit = _fit_with_noise(delayed, causes, point_variances,
-                          prior * [_FIXED_PRIOR_FACTOR, 1.0, 1.0])
+    fit = _fit_with_noise(delayed, causes, point_variances, prior * [1e-6, 1.0, 1.0])
     fit.covariance[0, 0] = prior[0] ** 2
     return fit
 
@@ -519,7 +456,7 @@ def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tupl
     """Return values by robust weighted least squares, and the residual."""
     left: Array = observed
     values: Array = np.zeros(columns.shape[1])
-    own = np.diag(np.where(prior < np.inf, 1.0 / prior, 0.0))
+    own = np.diag(1.0 / prior)
     for _ in range(5):
         size = robust_deviation(left) + 1e-12
         weight = 1.0 / np.maximum(np.abs(left) / (2.0 * size), 1.0) / size
@@ -531,33 +468,34 @@ def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tupl
 
 
 def _point_variances(left: Array) -> Array:
-    """Return the relative variance of each point, larger for outliers."""
+    """Return the relative variance of each point, larger for outliers, at most 100."""
     point = np.concatenate([[0.0], np.cumsum(left)])
     off = np.abs(point - median_filter(point, 9, mode='nearest'))
     # a monotonic drift is equal to its median
     by_steps = float(np.median(np.abs(np.diff(point, 2)))) / math.sqrt(6.0)
     size = 1.4826 * max(float(np.median(off)), by_steps) + 1e-9
-    return np.clip(off / (3.0 * size), 1.0, _MAX_POINT_DEVIATION) ** 2
+    return np.clip(off / (3.0 * size), 1.0, 10.0) ** 2
 
 
 def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: Array,
                     prior: Array) -> SpanFit:
-    """Fit by the restricted likelihood over a grid of noise, rests with the spans."""
-    assert spans.log.time is not None
+    """Fit by the restricted likelihood over a grid of noise."""
     columns, (least, most) = design_matrix(spans, causes), spans.walk_bounds
-    rest_durations = np.array(
-        [spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
     low, high = spans.treatment.walk_range
-    parts = [replace(part, diagonal=np.concatenate(
-        [part.diagonal, rest_durations if part.off_diagonal is None else 0.0 * rest_durations]),
-                     off_diagonal=None if part.off_diagonal is None
-                     else np.concatenate([part.off_diagonal, 0.0 * rest_durations]))
-             for part in heading_noise(spans.time, spans.point_rates(), point_variances,
-                                       angle_random_walk=(low * least, high * most))
-             if spans.treatment.errs_as_heading or part.name == 'angle_random_walk']
-    waves, shared = _wander_columns(spans)
+    walk, *errors = heading_noise(
+        spans.time, spans.point_means(np.asarray(spans.channels.rate)), point_variances,
+        angle_random_walk=(low * least, high * most))
+    assert spans.log.time is not None
+    durations = np.diff(spans.log.time[spans.rests])[:, 0]
+    parts = [replace(walk, diagonal=np.append(walk.diagonal, durations))]
+    if spans.treatment.errs_as_heading:
+        more = np.zeros(len(durations))
+        parts += [replace(part, diagonal=np.append(part.diagonal, more),
+                          off_diagonal=np.append(np.asarray(part.off_diagonal), more))
+                  for part in errors]
     deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
-    fit = fit_noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
+    fit = fit_noise_grid(spans.observed, columns, parts, *spans.bias_wander(),
+                         prior_deviation=deviation)
     values = fit.values.copy()
     values[2] += spans.delay
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
@@ -581,7 +519,7 @@ def _cluster_robust_covariance(data: WhitenedRegression,
     information of the stretches over the sum of its squares; and the degrees of freedom.
 
     """
-    count, stretch = len(fit.values), data.row_stretches
+    count, (stretch, *sectors) = len(fit.values), data.clusters
     values = np.linalg.lstsq(data.design, data.observed, rcond=None)[0]
     left = data.observed - data.design @ values
     influence = data.design @ np.linalg.pinv(data.design.T @ data.design)[:, :count]
@@ -592,7 +530,7 @@ def _cluster_robust_covariance(data: WhitenedRegression,
                            np.sum(scores ** 2, axis=1) * number / max(number - 1.0, 0.5))
     effective = _effective_clusters(stretch[inside], data.design[inside, :count])
     freedom = np.maximum(effective - 1.0, 1.0)
-    for cluster in data.row_sectors:
+    for cluster in sectors:
         rests_on = _effective_clusters(cluster[inside], influence[inside])
         scatter = _jackknife(data, cluster, inside)[:count]
         freedom = np.where(scatter > variances, np.maximum(rests_on - 1.0, 1.0), freedom)
@@ -621,55 +559,34 @@ def _effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
     return np.asarray(shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300))
 
 
-def _wander_columns(spans: Spans) -> tuple[Array, list[SharedNoise]]:
-    """Return the columns of a wandering bias over spans and rests, and their noise."""
-    assert spans.log.time is not None
-    treatment = spans.treatment
-    least, most = spans.walk_bounds if treatment.is_relative else (1.0, 1.0)
-    flicker, walk = (None if limits is None else (limits[0] * least, limits[1] * most)
-                     for limits in (treatment.flicker_range, treatment.random_walk_range))
-    waves, shared = bias_wander_columns(spans.time, flicker, walk, treatment.cosine_count)
-    begin, end = spans.time[0], spans.time[-1]
-    omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
-    rest_times = [np.clip(spans.log.time[list(rest)], begin, end) - begin for rest in spans.rests]
-    return np.vstack([waves, *(np.diff(np.sin(omega * each[:, None]), axis=0) / omega
-                               for each in rest_times)]), shared
-
-
-def wander_noise(spans: Spans) -> list[SharedNoise]:
-    """Return the parts of the noise of a bias that wanders."""
-    return _wander_columns(spans)[1]
-
-
 @dataclass(frozen=True)
 class WhitenedRegression:
     """
     A whitened regression, for which ordinary least squares is generalized least squares.
 
-    The priors of the values and of the wandering bias are rows after those of the observations.
-    Each of them is a separate stretch.
+    The m priors of the values and of the wandering bias are rows after those of the observations.
+    Each of them is a separate cluster.
 
     Attributes
     ----------
     observed : shape (n + r + m,)
     design : columns of scale factor error, bias, delay and causes, then those of the wander
-    row_stretches : of each row
-    row_sectors : of an encoder, the place of the shaft of each row
+    clusters : numbers of the stretch of each row, and, of an encoder, of the place of the shaft
     stretch_count : number of stretches of the log; those after them are priors
+    noise : that whitens
 
     """
 
     observed: Array
     design: Array
-    row_stretches: NDArray[np.intp]
-    row_sectors: tuple[NDArray[np.intp], ...]
+    clusters: tuple[NDArray[np.intp], ...]
     stretch_count: int
-    _fit: GridFit
+    noise: GridFit
 
     def whiten_columns(self, columns: Array) -> Array:
-        """Return more columns, shape (n + r, k), in units of the noise, shape (n + r + m, k)."""
+        """Return more columns, shape (n + r, k), in units of the noise, (n + r + m, k)."""
         more = len(self.observed) - len(columns)
-        return np.pad(self._fit.whiten(columns), ((0, more), (0, 0)))
+        return np.pad(self.noise.whiten(columns), ((0, more), (0, 0)))
 
 
 def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: SpanFit | None = None,
@@ -686,21 +603,22 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
         wander may pass for a cause otherwise
 
     """
-    spans, noise_fit = fit.spans, noise_fit or fit
-    waves, shared = _wander_columns(noise_fit.spans)
-    sizes = {part.name: noise_fit.fit.likeliest_sizes[part.name] for part in shared}
-    if use_max_random_walk and 'rate_random_walk' in sizes:
-        sizes['rate_random_walk'] = noise_fit.fit.sizes['rate_random_walk'][2]
-    variance = np.sum([sizes[part.name] ** 2 * part.variance for part in shared], axis=0)
+    spans, noise = fit.spans, (noise_fit or fit).fit
+    waves, shared = spans.bias_wander()
+    variance: Array = np.zeros(waves.shape[1])
+    for part in shared:
+        use_max = use_max_random_walk and part.name == 'rate_random_walk'
+        size = noise.sizes[part.name][2] if use_max else noise.likeliest_sizes[part.name]
+        variance += size ** 2 * part.variance
     columns = np.column_stack([design_matrix(spans, causes), waves])
     width = columns.shape[1] - waves.shape[1]
     prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
     prior[:3, :3] = np.diag(1.0 / fit.prior)
     prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
+    stretches = spans.stretch_numbers
     sectors = [spans.shaft_sectors] if spans.uses_code_changes else []
-    clusters = [np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
-                for each in (spans.stretch_numbers, *sectors)]
-    return WhitenedRegression(
-        np.append(noise_fit.fit.whiten(spans.observed), np.zeros(len(prior))),
-        np.concatenate([noise_fit.fit.whiten(columns), prior]), clusters[0], tuple(clusters[1:]),
-        int(spans.stretch_numbers.max()) + 1, noise_fit.fit)
+    clusters = tuple(np.concatenate([each, each.max() + 1 + np.arange(len(prior))])
+                     for each in (stretches, *sectors))
+    return WhitenedRegression(np.append(noise.whiten(spans.observed), np.zeros(len(prior))),
+                              np.concatenate([noise.whiten(columns), prior]), clusters,
+                              int(stretches.max()) + 1, noise)
