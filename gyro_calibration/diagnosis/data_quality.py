@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.course_over_ground import MIN_LOST_SHARE
-from gyro_calibration.calibration.dwells.samples import find_lost_reference, require_output
+from gyro_calibration.calibration.dwell_search import find_lost_reference, require_output
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.expected_output import (
     bridge_gaps,

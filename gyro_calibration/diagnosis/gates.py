@@ -25,7 +25,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwells.samples import (
+from gyro_calibration.calibration.dwell_search import (
     find_lost_reference,
     interpolate_reference,
     require_output,
