@@ -119,7 +119,7 @@ def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_sca
         [column for term in fit.terms for column in term.columns(channels_of(table))])
     error, freedom = table.output - table.rate, len(table) - len(CUBIC)
     values, (misfit,), *_ = np.linalg.lstsq(columns, error, rcond=None)
-    widened = student.ppf(0.975, freedom) / 1.959964
+    widened = student.ppf(0.975, freedom) / 1.96
     np.testing.assert_allclose([term.values[-1] for term in fit.terms], values, rtol=1e-9)
     covariance = np.linalg.inv(columns.T @ columns) * misfit / freedom * widened ** 2
     sizes = np.sqrt(np.diag(covariance))
@@ -166,7 +166,7 @@ def test_three_speeds_of_a_record_player_leave_one_degree_of_freedom():
     (scale, bias), covariance = np.polyfit(rate, output - rate, 1, cov=True)
     assert [term.values[0] for term in fit.terms] == pytest.approx([bias, scale])
     student_intervals = np.sqrt(np.diag(covariance))[::-1] * student.ppf(0.975, 1)
-    np.testing.assert_allclose(1.959964 * np.sqrt(np.diag(fit.model.covariance)),
+    np.testing.assert_allclose(1.96 * np.sqrt(np.diag(fit.model.covariance)),
                                student_intervals, rtol=1e-5)
 
 
