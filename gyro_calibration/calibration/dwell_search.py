@@ -166,10 +166,11 @@ def find_dwell_rows(log: Log, limits: SteadinessLimits) -> FoundDwells:
     share = sum(map(samples.duration, dwells)) / float(np.ptp(samples.time))
     if share < limits.min_dwell_share:
         raise DataRefused(
-            f'the reference is steady to {limits.max_rate_deviation / DEGREE:g} deg/s and straight '
-            f'to {limits.max_heading_deviation / DEGREE:g} deg, for {limits.min_duration:g} s at '
-            f'a time without the settling, in {100.0 * share:.0f} % of the log; hold each rate '
-            'for longer, or use the heading itself with --method likelihood')
+            f'the reference is steady to {limits.max_rate_deviation / DEGREE:g} deg/s and '
+            f'straight to {limits.max_heading_deviation / DEGREE:g} deg, for '
+            f'{limits.min_duration:g} s at a time without the settling, in {100.0 * share:.0f} % '
+            'of the log; hold each rate for longer, or use the heading itself with '
+            '--method likelihood')
     if share <= 0.25:
         remarks.append(f'only {100.0 * share:.0f} % of the time is in dwells; --method likelihood '
                        'uses all of it, where there is a heading')

@@ -247,8 +247,8 @@ def _average(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array,
         reference = samples.heading[rows]
         angle = integrate(samples.time[rows], samples.output[rows])
         rate[place], output[place] = (samples.slope(rows, each) for each in (reference, angle))
-        blur[place] = abs(samples.scale) * _encoder_deviation(reference, samples.step,
-                                                             durations[place])
+        blur[place] = abs(samples.scale) * _encoder_deviation(
+            reference, samples.step, durations[place])
         for variance, each in ((by_output, angle),
                                (by_error, angle - samples.scale * reference)):
             parts = np.array_split(np.arange(len(rows)), batches[place])

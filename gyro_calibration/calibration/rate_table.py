@@ -103,20 +103,20 @@ class Calibration:
     @cached_property
     def model(self) -> GyroModel:
         """Return effects with values, covariance and valid range; 1.96 deviations hold 95 %."""
-        outputs, temperatures = self.used.output, self.used.temperature
-        is_known = temperatures is not None
-        model = GyroModel(
-            self.terms, self.uncertainty.covariance() if self.dof else None,
-            (float(outputs.min()), float(outputs.max())),
-            (float(temperatures.min()), float(temperatures.max())) if is_known
-            else (-math.inf, math.inf), round(float(temperatures.mean()), 1) if is_known else 25.0)
+        output, temperature = self.used.output, self.used.temperature
+        model = GyroModel(self.terms, self.uncertainty.covariance() if self.dof else None,
+                          (float(output.min()), float(output.max())))
+        if temperature is not None:
+            model = replace(
+                model, temperature_range=(float(temperature.min()), float(temperature.max())),
+                reference_temperature=round(float(temperature.mean()), 1))
         if model.covariance is None:
             return model
         sweeps = self.uncertainty.sweep_scatter
         scatter = replace(self.scatter, sweep_bias=float(sweeps[0]), sweep_scale=float(sweeps[1]))
 
-        def columns(rate: Array, temperature: Array) -> Array:
-            channels = Channels(rate, rate, temperature)
+        def columns(rate: Array, warm: Array) -> Array:
+            channels = Channels(rate, rate, warm)
             return np.column_stack([row for term in self.terms
                                     for row in term.sensitivity(channels)])
 

@@ -322,7 +322,8 @@ def find_structure(fit: Calibration, false_alarm_rate: float,
     """
     curves = {name: columns
               for name, columns in _structure_curves(fit.used).items() if columns.shape[1]}
-    known, found, gains, curve_count = sensitivity_columns(fit.used, fit.terms), [], {}, len(curves)
+    known, curve_count = sensitivity_columns(fit.used, fit.terms), len(curves)
+    found, gains = [], {}
     while curves:
         tested = [_test_curve(name, fit, known, columns, by_model)
                   for name, columns in curves.items()]
@@ -455,8 +456,7 @@ def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]
         swapped = try_fit(fit, replace_effect(fit.effects, effect, other))
         rate = None if swapped is None else distinguishing_rate(fit, swapped)
         if rate is not None:
-            experiment = (f'add two dwells each way at {rate / DEGREE:.0f} deg/s, which separates '
-                          f'{effect.name} from {other.name}')
+            experiment = f'add two dwells each way at {rate / DEGREE:.0f} deg/s'
     return names, experiment if names else ''
 
 

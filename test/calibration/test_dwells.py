@@ -19,8 +19,8 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells,
     find_dwells,
     join_dwells,
+    shrink_variances,
 )
-from gyro_calibration.calibration.dwells import shrink_variances
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import constant_rate_motion
