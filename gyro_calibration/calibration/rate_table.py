@@ -337,19 +337,15 @@ def _iterate_gauss_newton(dwells: Dwells, terms: tuple[Term, ...],
         orthogonal, triangle, lengths = _factor_columns(dwells, terms, whitener)
         step = solve_triangular(
             triangle, orthogonal.T @ whitener.whiten(unexplained_error(dwells, terms))) / lengths
-        terms = _apply_step(terms, step)
+        changes, new_terms = iter(step.tolist()), []
+        for term in terms:
+            for place in term.fitted_indices:
+                term = _replace_value(term, place, term.values[place] + next(changes))
+            new_terms.append(term)
+        terms = tuple(new_terms)
         if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
             break
     return terms
-
-
-def _apply_step(terms: Sequence[Term], step: Array) -> tuple[Term, ...]:
-    changes, new_terms = iter(step.tolist()), []
-    for term in terms:
-        for place in term.fitted_indices:
-            term = _replace_value(term, place, term.values[place] + next(changes))
-        new_terms.append(term)
-    return tuple(new_terms)
 
 
 def _factor_columns(dwells: Dwells, terms: Sequence[Term],

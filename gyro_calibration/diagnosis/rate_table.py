@@ -325,29 +325,28 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
 
 _AVERAGED_REASON = 'a dwell is a mean at a constant rate; record samples with their time'
 _NO_TIME_REASON = 'a table without time does not show what changes with time; record a log in time'
+#: Cause, or the variable along which it shows -> why a table does not show it.
 _UNTESTABLE_REASONS = {
-    **dict.fromkeys(('bandwidth', 'time_offset', 'clock_rate', 'reference_slip'),
-                    'at constant rates a delay has no effect; record fast reversals with their '
-                    'time'),
-    **dict.fromkeys(('bias_temperature_rate', 'thermal_lag', 'thermal_hysteresis', 'warm_up',
-                     'rate_ramp', 'bias_step'), _NO_TIME_REASON),
-    **dict.fromkeys(('interference_tone', 'quantization', 'dead_zone', 'saturation',
-                     'stuck_samples', 'dropped_samples', 'angle_random_walk', 'bias_instability',
-                     'rate_random_walk'), _AVERAGED_REASON),
-    **dict.fromkeys(('heading_sensitivity', 'reference_once_per_rev', 'reference_quantization'),
-                    'whole turns average over all headings; record reference_heading_deg in time'),
-    **dict.fromkeys(('acceleration_sensitivity', 'vibration_rectification'),
+    'dead_zone': _AVERAGED_REASON, 'saturation': _AVERAGED_REASON,
+    'reference_scale':
+        'only a second reference separates the scale of the first from that of the gyro',
+    'rate_change':
+        'at constant rates a delay has no effect; record fast reversals with their time',
+    'temperature_rate': _NO_TIME_REASON, 'time': _NO_TIME_REASON,
+    'frequency': _AVERAGED_REASON, 'output': _AVERAGED_REASON,
+    'heading':
+        'whole turns average over all headings; record reference_heading_deg in time',
+    **dict.fromkeys(('specific_force', 'vibration'),
                     'only rates and temperatures of a table are evaluated; record '
                     'acceleration_mps2 in several poses, with time'),
-    'supply_sensitivity':
-        'only rates and temperatures of a table are evaluated; record supply_v with time',
-    'reference_scale':
-        'only a second reference separates the scale of the first from that of the gyro'}
+    'supply': 'only rates and temperatures of a table are evaluated; record supply_v with time'}
 
 
 def _untestable_causes(dwells: Dwells) -> dict[str, str]:
     """Return the causes that the table cannot show, with the reasons."""
-    found = {name: _UNTESTABLE_REASONS[name] for name in CAUSES if name in _UNTESTABLE_REASONS}
+    found = {name: _UNTESTABLE_REASONS.get(name) or _UNTESTABLE_REASONS[cause.along]
+             for name, cause in CAUSES.items()
+             if name not in {*STATIC_EFFECTS, 'outliers', 'unit_error'}}
     thermal = [name for name, effect in STATIC_EFFECTS.items() if 'temperature' in effect.inputs]
     if dwells.temperature is None:
         return {**found, **dict.fromkeys(
