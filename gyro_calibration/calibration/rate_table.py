@@ -39,21 +39,6 @@ from scipy.linalg import solve_triangular
 MAX_CONDITION_NUMBER = 1e3
 
 
-class EffectsUnidentifiable(DataRefused):
-    """
-    Some effects look alike in these data.
-
-    Attributes
-    ----------
-    effects : the names of those that look alike
-
-    """
-
-    def __init__(self, message: str, effects: Sequence[str]):
-        super().__init__(message)
-        self.effects = tuple(effects)
-
-
 @dataclass(frozen=True)
 class Calibration:
     """
@@ -230,8 +215,7 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
 
     Raises
     ------
-    EffectsUnidentifiable : some of the effects look alike in these dwells
-    DataRefused : too few dwells
+    DataRefused : some of the effects look alike in these dwells, or there are too few dwells
 
     """
     _refuse_unobservable(dwells, effects)
@@ -249,10 +233,12 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     terms = tuple(
         Term(effect, tuple(conventions.get(parameter.name, parameter.default or 0.0)
                            for parameter in effect.parameters)) for effect in effects)
-    _refuse_too_few_dwells(dwells, terms)
     scatter = scatter or estimate_scatter(dwells)
     used = select_dwells(dwells, scatter.inliers)
-    _refuse_too_few_dwells(used, terms)
+    values = sum(len(term.fitted_indices) for term in terms)
+    if len(used) < values:
+        raise DataRefused(f'{len(used)} dwells do not determine {values} values; '
+                          'add dwells, or fit fewer effects')
     whitener = Whitener(used, scatter)
     terms = _iterate_gauss_newton(used, _search_shapes(used, terms), whitener)
     orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
@@ -375,29 +361,21 @@ def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener) 
 
 # refusals
 
-def _refuse_too_few_dwells(dwells: Dwells, terms: Sequence[Term]) -> None:
-    values = sum(len(term.fitted_indices) for term in terms)
-    if len(dwells) < values:
-        raise DataRefused(f'{len(dwells)} dwells do not determine {values} values; '
-                          'add dwells, or fit fewer effects')
-
-
 def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
     thermal = [effect.name for effect in effects if 'temperature' in effect.inputs]
     if not thermal:
         return
     unseen = f'{", ".join(thermal)} cannot be seen'
     if dwells.temperature is None:
-        raise EffectsUnidentifiable(
-            f'{unseen}: the log holds no temperature; record temperature_degc too', thermal)
+        raise DataRefused(f'{unseen}: the log holds no temperature; record temperature_degc too')
     spread = float(np.ptp(dwells.temperature))
     if spread < MIN_TEMPERATURE_SPREAD:
-        raise EffectsUnidentifiable(
+        raise DataRefused(
             f'{unseen}: the temperature varies by {spread:.2g} K, wanted at least '
-            f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature', thermal)
+            f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature')
 
 
-def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> EffectsUnidentifiable:
+def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> DataRefused:
     """Return the refusal with the effects whose columns nearly cancel, and their remedies."""
     direction = np.abs(np.linalg.svd(triangle)[2][-1])
     owners = [term.effect for term in terms for _ in term.fitted_indices]
@@ -406,12 +384,12 @@ def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> EffectsUnid
              > 0.1 * direction.max()]
     names = [effect.name for effect in alike]
     if len(names) == 1:
-        return EffectsUnidentifiable(
-            f'{names[0]} cannot be determined from these dwells; {alike[0].experiment}', names)
+        return DataRefused(
+            f'{names[0]} cannot be determined from these dwells; {alike[0].experiment}')
     advice = '; '.join(dict.fromkeys(effect.experiment for effect in alike[::-1]
                                      if effect.experiment))
-    return EffectsUnidentifiable(f'{", ".join(names)} look alike in these dwells and cannot be '
-                                 f'distinguished; {advice}, or leave one out', names)
+    return DataRefused(f'{", ".join(names)} look alike in these dwells and cannot be '
+                       f'distinguished; {advice}, or leave one out')
 
 
 # bins of errors
