@@ -19,8 +19,9 @@ they are as large as random errors, over longer times they cancel and do not acc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
+from typing import NamedTuple
 
 from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import BandedNoise, fit_noise_grid, GridFit
@@ -32,32 +33,18 @@ from scipy.special import chdtr
 
 #: Number of windows of a run in the second fit of the bias.
 _WINDOW_COUNT = 16
-#: Probability of that second fit where the noise is a random walk of the heading.
-_FALSE_ALARM_RATE = 1e-3
-
 #: Duration, s, and net turn, rad, of the drive for which the precision of a calibration is judged.
 DRIVE_DURATION, DRIVE_ANGLE = 300.0, 2.0 * math.pi
 
 
-@dataclass(frozen=True)
-class _WindowMeans:
-    """
-    Means over windows of equal length, shape (n,) each, and the repeatable error.
+class _WindowMeans(NamedTuple):
+    """Means over windows of equal length, and the deviation of the error within them."""
 
-    Attributes
-    ----------
-    duration : of a window, s
-    time, heading : means of times, s, and reference headings, rad
-    heading_error : mean heading error of the gyro against the reference, rad
-    repeatable_error : standard deviation of that error about its means within the windows, rad
-
-    """
-
-    duration: float
+    duration: float  # of a window, s
     time: Array
-    heading: Array
-    heading_error: Array
-    repeatable_error: float
+    heading: Array  # of the reference, rad
+    heading_error: Array  # of the gyro against the reference, rad
+    repeatable_error: float  # standard deviation of that about its means, rad
 
 
 def refit_bias_by_windows(fit: ScaleBiasFit, time: Array, rate: Array,
@@ -85,8 +72,9 @@ def refit_bias_by_windows(fit: ScaleBiasFit, time: Array, rate: Array,
         return fit
     walk, reference_deviation = fit.angle_random_walk, max(windows.repeatable_error, 1e-12)
     random_walk_fit = _fit_windows(windows, (walk, walk), (1e-15, 1e-15))
-    if not chdtr(_WINDOW_COUNT - 2, np.sum(random_walk_fit.whiten(random_walk_fit.residual) **
-                                           2)) < _FALSE_ALARM_RATE:
+    misfit = np.sum(random_walk_fit.whiten(random_walk_fit.residual) ** 2)
+    # a random walk of the heading is refitted once in a thousand runs
+    if not chdtr(_WINDOW_COUNT - 2, misfit) < 1e-3:
         return fit
     repeatable_fit = _fit_windows(windows, (1e-3 * walk, walk),
                                   (1e-3 * reference_deviation, reference_deviation))

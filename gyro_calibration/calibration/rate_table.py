@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
@@ -30,28 +30,13 @@ from gyro_calibration.calibration.scatter import (
 )
 from gyro_calibration.calibration.tolerance import estimate_tolerance
 from gyro_calibration.logs.log import Array, DataRefused, Mask
-from gyro_calibration.model.effects import Channels, Effect, Parameter
+from gyro_calibration.model.effects import Channels, Effect
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 from scipy.linalg import solve_triangular
 
 #: Beyond this condition number of the columns, each of length one, the effects are not separable.
 MAX_CONDITION_NUMBER = 1e3
-
-
-class EffectsUnidentifiable(DataRefused):
-    """
-    Some effects look alike in these data.
-
-    Attributes
-    ----------
-    effects : the names of those that look alike
-
-    """
-
-    def __init__(self, message: str, effects: Sequence[str]):
-        super().__init__(message)
-        self.effects = tuple(effects)
 
 
 @dataclass(frozen=True)
@@ -90,51 +75,84 @@ class Calibration:
         return tuple(term.effect for term in self.terms)
 
     @cached_property
+    def used(self) -> Dwells:
+        """Return the dwells that were fitted."""
+        return select_dwells(self.dwells, self.scatter.inliers)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Return the distribution of the fitted values, of more dwells than there are values."""
+        return Uncertainty.from_fit(self.used, self.scatter,
+                                    *_linearize_output(self.used, self.terms))
+
+    @cached_property
     def model(self) -> GyroModel:
         """Return effects with values, covariance and valid range; 1.96 deviations hold 95 %."""
-        used = select_dwells(self.dwells, self.scatter.inliers)
-        if not self.dof:
-            return _build_model(used, self.terms, None)
-        uncertainty = self._uncertainty(*_linearize_output(used, self.terms))
-        covariance, sweeps = uncertainty.covariance(), uncertainty.sweep_scatter.tolist()
-        scatter = replace(self.scatter, sweep_bias=sweeps[0], sweep_scale=sweeps[1])
+        output, temperature = self.used.output, self.used.temperature
+        model = GyroModel(self.terms, self.uncertainty.covariance() if self.dof else None,
+                          (float(output.min()), float(output.max())))
+        if temperature is not None:
+            model = replace(
+                model, temperature_range=(float(temperature.min()), float(temperature.max())),
+                reference_temperature=round(float(temperature.mean()), 1))
+        if model.covariance is None:
+            return model
+        sweeps = self.uncertainty.sweep_scatter
+        scatter = replace(self.scatter, sweep_bias=float(sweeps[0]), sweep_scale=float(sweeps[1]))
 
-        def columns(rate: Array, temperature: Array) -> Array:
-            channels = Channels(rate, rate, temperature)
+        def columns(rate: Array, warm: Array) -> Array:
+            channels = Channels(rate, rate, warm)
             return np.column_stack([row for term in self.terms
                                     for row in term.sensitivity(channels)])
 
-        tolerance = estimate_tolerance(used, Whitener(used, scatter), uncertainty.sweep_scatter,
-                                       columns, covariance)
-        return replace(_build_model(used, self.terms, covariance), tolerance=tolerance)
+        return replace(model, tolerance=estimate_tolerance(
+            self.used, Whitener(self.used, scatter), sweeps, columns, model.covariance))
+
+    def last_index(self, effect: Effect) -> int:
+        """Return the index of the last value of an effect among all fitted values."""
+        owners = [term.effect for term in self.terms for _ in term.fitted_indices]
+        return len(owners) - 1 - owners[::-1].index(effect)
 
     def effect_deviation(self, effect: Effect) -> float:
         """Return the standard deviation of the last value of an effect."""
-        owners = [term.effect for term in self.terms for _ in term.fitted_indices]
         assert self.model.covariance is not None
-        place = len(owners) - 1 - owners[::-1].index(effect)
-        return math.sqrt(float(self.model.covariance[place, place]))
+        return math.sqrt(float(np.diag(self.model.covariance)[self.last_index(effect)]))
 
-    def p_value(self, effect: Effect) -> float:
-        """Return the two-sided p-value of an effect."""
-        used = select_dwells(self.dwells, self.scatter.inliers)
-        term = next(each for each in self.terms if each.effect is effect)
-        # The whole effect, not its derivative by a shape, which vanishes near zero for a sine.
-        error = np.broadcast_to(term.error(channels_of(used)), len(used))
-        others = np.column_stack([np.empty((len(used), 0)), *(
-            sensitivity_columns(used, [each]) for each in self.terms if each is not term)])
-        left = error - others @ np.linalg.lstsq(others, error, rcond=None)[0]
+    def p_value(self, effect: Effect, change: Array | None = None,
+                by_model: Array | None = None) -> float:
+        """
+        Return the two-sided p-value of an effect.
+
+        Parameters
+        ----------
+        effect : of the fit
+        change : of the error of each fitted dwell, rad/s, shape (n,), that is put to the test;
+            None for the whole effect
+        by_model : errors of the dwells by those of a given model's values, rad/s, shape (n, k)
+
+        """
+        others = [each for each in self.terms if each.effect is not effect]
+        if change is None:
+            # the whole effect, not its derivative by a shape, which vanishes near zero for a sine
+            change = sum(term.error(channels_of(self.used)) for term in self.terms
+                         if term.effect is effect) + np.zeros(len(self.used))
+        columns = sensitivity_columns(self.used, others)
+        left = change - columns @ np.linalg.lstsq(columns, change, rcond=None)[0]
         # a sine may have its zeros at the rates of all dwells
-        if not self.dof or np.linalg.norm(left) <= 1e-9 * np.linalg.norm(error):
+        if not self.dof or np.linalg.norm(left) <= 1e-9 * np.linalg.norm(change):
             return 1.0
-        below = float(
-            self._uncertainty(np.column_stack([others, error]),
-                              self.residual[self.scatter.inliers]).probability_below(-1.0)[-1])
+        columns = np.column_stack([columns, change])
+        uncertainty = Uncertainty.from_fit(self.used, self.scatter, columns,
+                                           self.residual[self.scatter.inliers])
+        share = 1.0  # of the deviation of the last value that is due to the dwells
+        if by_model is not None:
+            whitener = Whitener(self.used, self.scatter)
+            inverse = np.linalg.pinv(
+                whitener.whiten(columns / np.linalg.norm(columns, axis=0)))[-1]
+            other = inverse @ whitener.whiten(by_model)
+            share = math.sqrt(inverse @ inverse / (inverse @ inverse + other @ other))
+        below = float(uncertainty.probability_below(-share)[-1])
         return 2.0 * min(below, 1.0 - below)
-
-    def _uncertainty(self, columns: Array, residual: Array) -> Uncertainty:
-        return Uncertainty.from_fit(select_dwells(self.dwells, self.scatter.inliers), self.scatter,
-                                    columns, residual)
 
     @property
     def min_non_monotonic_rate(self) -> float | None:
@@ -151,7 +169,7 @@ class Calibration:
     @property
     def uncorrected_rms(self) -> float:
         """Return the root mean square of output less rate of what was fitted, rad/s."""
-        return rms((self.dwells.output - self.dwells.rate)[self.scatter.inliers])
+        return rms(self.used.output - self.used.rate)
 
     @property
     def residual_rms(self) -> float:
@@ -165,7 +183,7 @@ class Calibration:
 
     def cross_validation_misfit(self) -> float:
         """Return the mean over left-out sweeps of the mean squared error, in dwell variances."""
-        parts = cross_validation_parts(select_dwells(self.dwells, self.scatter.inliers))
+        parts = cross_validation_parts(self.used)
         squares = (self.left_out_residual / self.deviation)[self.scatter.inliers] ** 2
         return float(np.mean(sum_by_part(squares, parts) / np.bincount(parts)))
 
@@ -179,8 +197,8 @@ def channels_of(dwells: Dwells) -> Channels:
 
 # the fit
 
-def fit_effects(dwells: Dwells, effects: Sequence[Effect],
-                scatter: Scatter | None = None) -> Calibration:
+def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | None = None,
+                reference_temperature: float | None = None) -> Calibration:
     """
     Fit effects to dwells by generalised least squares, solved by QR.
 
@@ -193,38 +211,44 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect],
     dwells : of a rate table or a log
     effects : each once
     scatter : of the dwells, if it is known already
+    reference_temperature : that temperatures count from, degC; default: the mean
 
     Raises
     ------
-    EffectsUnidentifiable : some of the effects look alike in these dwells
-    DataRefused : too few dwells
+    DataRefused : some of the effects look alike in these dwells, or there are too few dwells
 
     """
     _refuse_unobservable(dwells, effects)
-    terms = tuple(
-        Term(effect, tuple(_start_value(parameter, dwells) for parameter in effect.parameters))
-        for effect in effects)
-    _refuse_too_few_dwells(dwells, terms)
-    scatter = scatter or estimate_scatter(dwells)
-    used = select_dwells(dwells, scatter.inliers)
-    _refuse_too_few_dwells(used, terms)
-    whitener = Whitener(used, scatter)
-    return _assemble_calibration(
-        dwells, _iterate_gauss_newton(used, _search_shapes(used, terms), whitener), scatter,
-        whitener)
-
-
-def _start_value(parameter: Parameter, dwells: Dwells) -> float:
-    """Return a start value; conventions, such as the reference temperature, are final."""
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
+    if reference_temperature is None:
+        reference_temperature = round(float(temperature.mean()), 1)
+    # conventions are final; shapes and coefficients are fitted
     conventions = {
-        'reference_temperature': round(float(temperature.mean()), 1),
+        'reference_temperature': reference_temperature,
         'output_centre': 0.5 * float(dwells.output.max() + dwells.output.min()),
         'output_scale': 0.5 * float(np.ptp(dwells.output)) or 1.0,
         'temperature_centre': 0.5 * float(temperature.max() + temperature.min()),
         'temperature_scale': 0.5 * float(np.ptp(temperature)) or 1.0,
     }
-    return conventions.get(parameter.name, parameter.default or 0.0)
+    terms = tuple(
+        Term(effect, tuple(conventions.get(parameter.name, parameter.default or 0.0)
+                           for parameter in effect.parameters)) for effect in effects)
+    scatter = scatter or estimate_scatter(dwells)
+    used = select_dwells(dwells, scatter.inliers)
+    values = sum(len(term.fitted_indices) for term in terms)
+    if len(used) < values:
+        raise DataRefused(f'{len(used)} dwells do not determine {values} values; '
+                          'add dwells, or fit fewer effects')
+    whitener = Whitener(used, scatter)
+    terms = _iterate_gauss_newton(used, _search_shapes(used, terms), whitener)
+    orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
+    whitened = whitener.whiten(unexplained_error(used, terms))
+    left_out, deviation = np.full((2, len(dwells)), np.nan)
+    left_out[scatter.inliers] = _left_out_residuals(orthogonal, whitened, whitener)
+    deviation[scatter.inliers] = whitener.deviation
+    return Calibration(terms, dwells, scatter, unexplained_error(dwells, terms), left_out,
+                       deviation, float(np.linalg.cond(triangle)), len(used) - len(lengths),
+                       float(whitened @ whitened))
 
 
 def unexplained_error(dwells: Dwells, terms: Sequence[Term]) -> Array:
@@ -236,7 +260,8 @@ def unexplained_error(dwells: Dwells, terms: Sequence[Term]) -> Array:
 def sensitivity_columns(dwells: Dwells, terms: Sequence[Term]) -> Array:
     """Return the derivatives of the error by each fitted value, shape (n, m)."""
     channels = channels_of(dwells)
-    return np.column_stack([row for term in terms for row in term.sensitivity(channels)])
+    return np.column_stack([np.empty((len(dwells), 0)), *(
+        row + np.zeros(len(dwells)) for term in terms for row in term.sensitivity(channels))])
 
 
 def _linearize_output(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
@@ -298,19 +323,15 @@ def _iterate_gauss_newton(dwells: Dwells, terms: tuple[Term, ...],
         orthogonal, triangle, lengths = _factor_columns(dwells, terms, whitener)
         step = solve_triangular(
             triangle, orthogonal.T @ whitener.whiten(unexplained_error(dwells, terms))) / lengths
-        terms = _apply_step(terms, step)
+        changes, new_terms = iter(step.tolist()), []
+        for term in terms:
+            for place in term.fitted_indices:
+                term = _replace_value(term, place, term.values[place] + next(changes))
+            new_terms.append(term)
+        terms = tuple(new_terms)
         if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
             break
     return terms
-
-
-def _apply_step(terms: Sequence[Term], step: Array) -> tuple[Term, ...]:
-    changes, new_terms = iter(step.tolist()), []
-    for term in terms:
-        for place in term.fitted_indices:
-            term = _replace_value(term, place, term.values[place] + next(changes))
-        new_terms.append(term)
-    return tuple(new_terms)
 
 
 def _factor_columns(dwells: Dwells, terms: Sequence[Term],
@@ -322,21 +343,6 @@ def _factor_columns(dwells: Dwells, terms: Sequence[Term],
     if not np.linalg.cond(triangle) < MAX_CONDITION_NUMBER:
         raise _unidentifiable_error(terms, triangle)
     return orthogonal, triangle, lengths
-
-
-# the result
-
-def _assemble_calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter,
-                          whitener: Whitener) -> Calibration:
-    used = select_dwells(dwells, scatter.inliers)
-    orthogonal, triangle, lengths = _factor_columns(used, terms, whitener)
-    whitened = whitener.whiten(unexplained_error(used, terms))
-    left_out, deviation = np.full(len(dwells), np.nan), np.full(len(dwells), np.nan)
-    left_out[scatter.inliers], deviation[scatter.inliers] = (
-        _left_out_residuals(orthogonal, whitened, whitener), whitener.deviation)
-    return Calibration(terms, dwells, scatter, unexplained_error(dwells, terms), left_out,
-                       deviation, float(np.linalg.cond(triangle)),
-                       len(used) - len(lengths), float(whitened @ whitened))
 
 
 def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
@@ -353,23 +359,7 @@ def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener) 
     return np.where(is_sole_source[parts], math.inf, whitener.restore(left_out))
 
 
-def _build_model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) -> GyroModel:
-    outputs, temperatures = dwells.output, dwells.temperature
-    middle = 25.0 if temperatures is None else round(float(temperatures.mean()), 1)
-    temperature_range = ((-math.inf, math.inf) if temperatures is None
-                         else (float(temperatures.min()), float(temperatures.max())))
-    return GyroModel(terms, covariance, (float(outputs.min()), float(outputs.max())),
-                     temperature_range, middle)
-
-
 # refusals
-
-def _refuse_too_few_dwells(dwells: Dwells, terms: Sequence[Term]) -> None:
-    values = sum(len(term.fitted_indices) for term in terms)
-    if len(dwells) < values:
-        raise DataRefused(f'{len(dwells)} dwells do not determine {values} values; '
-                          'add dwells, or fit fewer effects')
-
 
 def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
     thermal = [effect.name for effect in effects if 'temperature' in effect.inputs]
@@ -377,16 +367,15 @@ def _refuse_unobservable(dwells: Dwells, effects: Sequence[Effect]) -> None:
         return
     unseen = f'{", ".join(thermal)} cannot be seen'
     if dwells.temperature is None:
-        raise EffectsUnidentifiable(
-            f'{unseen}: the log holds no temperature; record temperature_degc too', thermal)
+        raise DataRefused(f'{unseen}: the log holds no temperature; record temperature_degc too')
     spread = float(np.ptp(dwells.temperature))
     if spread < MIN_TEMPERATURE_SPREAD:
-        raise EffectsUnidentifiable(
+        raise DataRefused(
             f'{unseen}: the temperature varies by {spread:.2g} K, wanted at least '
-            f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature', thermal)
+            f'{MIN_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature')
 
 
-def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> EffectsUnidentifiable:
+def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> DataRefused:
     """Return the refusal with the effects whose columns nearly cancel, and their remedies."""
     direction = np.abs(np.linalg.svd(triangle)[2][-1])
     owners = [term.effect for term in terms for _ in term.fitted_indices]
@@ -395,12 +384,12 @@ def _unidentifiable_error(terms: Sequence[Term], triangle: Array) -> EffectsUnid
              > 0.1 * direction.max()]
     names = [effect.name for effect in alike]
     if len(names) == 1:
-        return EffectsUnidentifiable(
-            f'{names[0]} cannot be determined from these dwells; {alike[0].experiment}', names)
+        return DataRefused(
+            f'{names[0]} cannot be determined from these dwells; {alike[0].experiment}')
     advice = '; '.join(dict.fromkeys(effect.experiment for effect in alike[::-1]
                                      if effect.experiment))
-    return EffectsUnidentifiable(f'{", ".join(names)} look alike in these dwells and cannot be '
-                                 f'distinguished; {advice}, or leave one out', names)
+    return DataRefused(f'{", ".join(names)} look alike in these dwells and cannot be '
+                       f'distinguished; {advice}, or leave one out')
 
 
 # bins of errors
@@ -431,19 +420,20 @@ class Bin:
 
 def bin_errors(fit: Calibration, values: Array, max_bins: int = 8) -> list[Bin]:
     """Return the errors over one quantity, shape (n,), in non-empty bins of equal width."""
+    dwells, found = fit.dwells, []
+    for low, high, within in equal_bins(values, max_bins):
+        chosen = within & fit.scatter.inliers
+        if chosen.any():
+            part, residual = select_dwells(dwells, chosen), fit.residual[chosen]
+            found.append(Bin(low, high, len(part), float((part.output - part.rate).mean()),
+                             float(residual.mean()), fit.scatter.mean_deviation(part),
+                             rms(residual)))
+    return found
+
+
+def equal_bins(values: Array, max_bins: int) -> Iterator[tuple[float, float, Mask]]:
+    """Give the ends of bins of equal width, at most one for each value, and what they hold."""
     edges = np.linspace(values.min(), values.max(), min(max_bins, len(np.unique(values))) + 1)
     place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
-    chosen = [(place == number) & fit.scatter.inliers for number in range(len(edges) - 1)]
-    return [_summarize_bin(fit, float(low), float(high), part)
-            for low, high, part in zip(edges, edges[1:], chosen) if part.any()]
-
-
-def _summarize_bin(fit: Calibration, low: float, high: float, chosen: Mask) -> Bin:
-    part, residual = select_dwells(fit.dwells, chosen), fit.residual[chosen]
-    # Errors common to a sweep do not average out within it.
-    sweeps = np.unique(part.sweep, return_inverse=True)[1]
-    variance = (np.sum(fit.deviation[chosen] ** 2)
-                + np.sum(sum_by_part(fit.scatter.sweep_columns(part), sweeps) ** 2))
-    before = float((part.output - part.rate).mean())
-    return Bin(low, high, len(part), before, float(residual.mean()),
-               math.sqrt(float(variance)) / len(part), rms(residual))
+    for number, (low, high) in enumerate(zip(edges.tolist(), edges[1:].tolist())):
+        yield low, high, place == number

@@ -25,12 +25,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from gyro_calibration.calibration.dwells import Dwells, Numbers, select_dwells
 from gyro_calibration.calibration.likelihood import robust_residual
-from gyro_calibration.logs.log import Array, DataRefused, Mask
+from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
@@ -40,8 +40,6 @@ OUTLIER_THRESHOLD = 6.0
 MIN_TEMPERATURE_SPREAD = 1.0
 #: With fewer, errors common to the dwells of a sweep are not distinguishable from random errors.
 MIN_SWEEPS = 4
-#: Largest number of blocks of dwells that replace sweeps where there are fewer sweeps.
-_MAX_BLOCKS = 60
 #: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
 _MIN_DWELLS = 12
 
@@ -80,6 +78,14 @@ class Scatter:
         return np.column_stack([np.full(len(dwells), self.sweep_bias),
                                 self.sweep_scale * dwells.rate])
 
+    def mean_deviation(self, dwells: Dwells, sign: Array | float = 1.0) -> float:
+        """Return the standard deviation of the mean error of some dwells, rad/s."""
+        # errors common to a sweep do not average out within it
+        shared = sum_by_part(self.sweep_columns(dwells) * np.broadcast_to(
+            sign, len(dwells))[:, None], np.unique(dwells.sweep, return_inverse=True)[1])
+        return math.sqrt(float(np.sum(self.deviation(dwells) ** 2) + np.sum(shared ** 2))) / len(
+            dwells)
+
 
 def _own_deviation(dwells: Dwells) -> Array:
     """Return the deviations of the dwells, rad/s; an unknown one is the rms of the others."""
@@ -99,12 +105,12 @@ def cross_validation_parts(dwells: Dwells) -> Numbers:
 
     It is the sweep, since errors that its dwells have in common do not predict other sweeps. Fewer
     than four sweeps do not determine a model without one of them, nor do two temperatures the
-    slope between them: then parts are blocks of time, or the dwells.
+    slope between them: then parts are 60 blocks of time, or the dwells.
 
     """
     parts = np.unique(dwells.sweep, return_inverse=True)[1]
     return (parts if parts.max() + 1 >= MIN_SWEEPS
-            else np.arange(len(dwells)) * min(len(dwells), _MAX_BLOCKS) // len(dwells))
+            else np.arange(len(dwells)) * min(len(dwells), 60) // len(dwells))
 
 
 def sum_by_part(values: Array, parts: Numbers) -> Array:
@@ -159,9 +165,8 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
     units = np.array([size, relative, size, relative])[:_count_scatter_terms(used)]
 
     def scatter(logarithms: Array) -> Scatter:
-        return Scatter(  # type: ignore[misc]
-            *np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(),
-            inliers=kept)
+        return Scatter(*np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(),
+                       inliers=kept)  # type: ignore[misc]
 
     # a simplex would collapse onto a bound
     best = minimize(
@@ -219,59 +224,48 @@ def _restricted_log_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
                                columns: Array) -> float:
     """Return the restricted log-likelihood of the scatter, up to a constant."""
     deviation = scatter.deviation(dwells)
-    sums = _SweepProducts.from_dwells(dwells, deviation, np.column_stack([columns, error]))
-    (gram,), (of_sweeps,) = sums.marginalized(
-        np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
-    factor = np.linalg.cholesky(gram[:-1, :-1])
-    explained = solve_triangular(factor, gram[:-1, -1], lower=True)
-    log_determinant = (float(of_sweeps) + 2.0 * float(np.log(deviation).sum())
-                       + 2.0 * float(np.log(np.diag(factor)).sum()))
-    return -0.5 * (log_determinant + float(gram[-1, -1] - explained @ explained))
+    fit = _fit_values(dwells, deviation, columns, error,
+                      np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
+    return -0.5 * float(fit.log_determinant[0] + 2.0 * np.log(deviation).sum() + fit.misfit[0])
 
 
-@dataclass(frozen=True)
-class _SweepProducts:
+class _Fits(NamedTuple):
     """
-    The sums of products of columns in the likelihood, for any scatter of sweeps.
+    Values by generalised least squares, for each of k scatters of sweeps.
 
     Attributes
     ----------
-    gram : products of the columns, shape (m, m)
-    inner : products of what each sweep shares, shape (sweeps, 2, 2)
-    outer : products of that and the columns, shape (sweeps, 2, m)
+    log_determinant : of the covariance, in that of the dwells, times the Gram matrix, shape (k,)
+    misfit : sum of the squared whitened residuals, shape (k,)
+    values : shape (k, m)
+    inverse : of the Gram matrix of the whitened columns, shape (k, m, m)
 
     """
 
-    gram: Array
-    inner: Array
-    outer: Array
+    log_determinant: Array
+    misfit: Array
+    values: Array
+    inverse: Array
 
-    @classmethod
-    def from_dwells(cls, dwells: Dwells, deviation: Array, columns: Array) -> _SweepProducts:
-        """Sum over each sweep."""
-        columns = columns / deviation[:, None]
-        shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
-        inner, outer = (sum_by_part(shared[:, :, None] * each[:, None, :],
-                                    cross_validation_parts(dwells)) for each in (shared, columns))
-        return cls(columns.T @ columns, inner, outer)
 
-    def marginalized(self, sizes: Array) -> tuple[Array, Array]:
-        """
-        Return products of the whitened columns, and log-determinant of the sweeps (Woodbury).
-
-        Parameters
-        ----------
-        sizes : of the scatter of sweeps' bias and scale, shape (k, 2)
-
-        Returns
-        -------
-        arrays of shape (k, m, m) and (k,)
-
-        """
-        inner = np.eye(2) + sizes[:, None, :, None] * self.inner * sizes[:, None, None, :]
-        outer = sizes[:, None, :, None] * self.outer
-        taken = np.einsum('ksij,ksil->kjl', outer, np.linalg.solve(inner, outer), optimize=True)
-        return self.gram - taken, np.linalg.slogdet(inner)[1].sum(axis=1)
+def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
+                sizes: Array) -> _Fits:
+    """Fit columns (n, m) to an error (n,), for scatters of sweeps' bias and scale (k, 2)."""
+    columns = np.column_stack([columns, error]) / deviation[:, None]
+    shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
+    inner, outer = (sum_by_part(shared[:, :, None] * each[:, None, :],
+                                cross_validation_parts(dwells)) for each in (shared, columns))
+    # Woodbury: the covariance is diagonal plus two shared columns for each sweep
+    inner = np.eye(2) + sizes[:, None, :, None] * inner * sizes[:, None, None, :]
+    outer = sizes[:, None, :, None] * outer
+    gram = columns.T @ columns - np.einsum('ksij,ksil->kjl', outer,
+                                           np.linalg.solve(inner, outer), optimize=True)
+    inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
+    values = np.einsum('kij,kj->ki', inverse, right)
+    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right),
+                        1e-12 * (columns[:, -1] @ columns[:, -1])) + 1e-200
+    return _Fits(np.linalg.slogdet(inner)[1].sum(axis=1) - np.linalg.slogdet(inverse)[1],
+                 misfit, values, inverse)
 
 
 # uncertainty of the values
@@ -319,17 +313,28 @@ class Uncertainty:
         error : residual of the fitted values, rad/s, shape (n,)
 
         """
-        lengths = np.linalg.norm(columns, axis=0)
-        deviation = scatter.deviation(dwells)
-        sums = _SweepProducts.from_dwells(dwells, deviation,
-                                          np.column_stack([columns / lengths, error]))
-        dof = len(dwells) - len(lengths)
-        # scatters of sweep bias and scale as large as a dwell's; zeros for few sweeps
-        units = (np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
-                 * (_count_scatter_terms(dwells) == 4))
-        weights, offsets, covariances, sweep_scatter = _average_over_scatter(sums, dof, units)
-        return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), dof,
-                   sweep_scatter)
+        lengths, deviation = np.linalg.norm(columns, axis=0), scatter.deviation(dwells)
+        dof, units = len(dwells) - len(lengths), np.array(
+            [rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
+        axes, priors = zip(*(_scatter_grid(size / unit) if _count_scatter_terms(dwells) == 4
+                             else (np.zeros(1), np.ones(1)) for size, unit in zip(
+                                 (scatter.sweep_bias, scatter.sweep_scale), units)))
+        sizes = [units * np.column_stack([np.full(len(axes[1]), bias), axes[1]])
+                 for bias in axes[0]]  # in turn, for the memory
+        fits = [_fit_values(dwells, deviation, columns / lengths, error, each) for each in sizes]
+        log_determinant, misfit = (np.concatenate([fit[place] for fit in fits])
+                                   for place in (0, 1))
+        logarithm = -0.5 * (log_determinant + dof * np.log(misfit))
+        weights = np.exp(logarithm - logarithm.max()) * np.outer(*priors).ravel()
+        likely = weights > 1e-4 * weights.sum()
+        weights = weights[likely] / weights[likely].sum()
+        offsets, inverses = (np.concatenate([fit[place] for fit in fits])[likely]
+                             for place in (2, 3))
+        size = misfit[likely] / dof
+        squares = np.concatenate(sizes)[likely] ** 2 * size[:, None]
+        return cls(weights, offsets / lengths,
+                   inverses * size[:, None, None] / np.outer(lengths, lengths), dof,
+                   np.sqrt(weights @ squares))
 
     @property
     def deviations(self) -> Array:
@@ -341,79 +346,27 @@ class Uncertainty:
         return np.asarray(
             self.weights @ student.cdf((change - self.offsets) / self.deviations, self.dof))
 
-    def covariance(self) -> Array:
-        """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""
+    def half_width(self, probability: float) -> Array:
+        """Return half of the intervals about the fitted values of a probability, shape (m,)."""
         low = np.zeros(self.offsets.shape[1])
-        high = (2.0 * student.ppf(0.975, self.dof)
+        high = (2.0 * student.ppf(0.5 + 0.5 * probability, self.dof)
                 * (self.deviations + np.abs(self.offsets)).max(axis=0))
         for _ in range(25):
             half = 0.5 * (low + high)
-            narrow = self.probability_below(half) - self.probability_below(-half) < 0.95
+            narrow = self.probability_below(half) - self.probability_below(-half) < probability
             low, high = np.where(narrow, half, low), np.where(narrow, high, half)
+        return high
+
+    def covariance(self) -> Array:
+        """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""
         covariance = np.tensordot(self.weights, self.covariances, axes=1)
-        widening = high / 1.959964 / np.sqrt(np.diag(covariance))
+        widening = self.half_width(0.95) / NORMAL_QUANTILE_975 / np.sqrt(np.diag(covariance))
         return covariance * np.outer(widening, widening)
 
 
-def _average_over_scatter(sums: _SweepProducts, dof: int,
-                          units: Array) -> tuple[Array, Array, Array, Array]:
-    """
-    Return weights of possible scatters of sweeps, offsets of the values and their covariances.
-
-    The shapes are (k,), (k, m) and (k, m, m). The last one, of shape (2,), is the root mean square
-    of the scatters.
-
-    """
-    has_sweep_scatter = bool(units.any())
-    axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)]) if has_sweep_scatter
-            else np.zeros(1)] * 2
-    for _ in range(2 if has_sweep_scatter else 1):
-        found = [_evaluate_scatter(sums, dof,
-                                   units * np.column_stack([np.full(len(axes[1]), bias), axes[1]]))
-                 for bias in axes[0]]
-        logarithm = np.array([each[0] for each in found])
-        weights = (np.exp(logarithm - logarithm.max())
-                   * np.outer(*(_scatter_prior(axis) for axis in axes)))
-        weights /= weights.sum()
-        axes = [_refine_axis(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
-    likely = weights.ravel() > 1e-4
-    values, covariances, squares = (np.concatenate([each[place] for each in found])[likely]
-                                    for place in (1, 2, 3))
-    probability = weights.ravel()[likely] / weights.ravel()[likely].sum()
-    return probability, values, covariances, np.sqrt(probability @ squares)
-
-
-def _evaluate_scatter(sums: _SweepProducts, dof: int,
-                      sizes: Array) -> tuple[Array, Array, Array, Array]:
-    """
-    Return log-likelihoods of sweep scatters, shape (k, 2), with values and covariances.
-
-    Last come the squares of the scatters, in which the sizes are parts of what dwells show.
-
-    """
-    gram, log_determinant = sums.marginalized(sizes)
-    inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
-    values = np.einsum('kij,kj->ki', inverse, right)
-    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right),
-                        1e-12 * sums.gram[-1, -1]) + 1e-200
-    logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + dof * np.log(misfit))
-    size = misfit / dof
-    return logarithm, values, inverse * size[:, None, None], sizes ** 2 * size[:, None]
-
-
-def _scatter_prior(sizes: Array) -> Array:
-    """Return the prior of each size: one half at 0, a half Cauchy above."""
-    if len(sizes) == 1:
-        return np.ones(1)
-    return np.concatenate(
-        [[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2) * math.log(sizes[2] / sizes[1])])
-
-
-def _refine_axis(sizes: Array, weights: Array) -> Array:
-    """Return 0 and sizes spaced about as finely as the likely ones above 0."""
-    if len(sizes) == 1:
-        return sizes
-    logarithms, probability = np.log(sizes[1:]), weights[1:] / max(weights[1:].sum(), 1e-300)
-    middle = float(probability @ logarithms)
-    spread = max(math.sqrt(float(probability @ (logarithms - middle) ** 2)), 0.3)
-    return np.concatenate([[0.0], np.exp(middle + spread * np.linspace(-3.0, 3.0, 13))])
+def _scatter_grid(size: float) -> tuple[Array, Array]:
+    """Return possible sizes of a scatter, in that of dwells, about the likely one; and prior."""
+    logarithms = np.linspace(-3.0, 3.0, 25)
+    sizes = max(size, 0.1) * np.exp(logarithms)
+    prior = sizes / (math.pi * (1.0 + sizes ** 2)) * (logarithms[1] - logarithms[0])
+    return np.append(0.0, sizes), np.append(0.5, prior)

@@ -21,7 +21,7 @@ follows from a larger fit, with normal priors for the values that the dwells do 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import math
 
 from gyro_calibration.calibration.dwells import Dwells
@@ -37,12 +37,9 @@ import numpy as np
 BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, NONLINEARITY_DEVIATION = (
     Prior().coefficient, 3e-4, 2e-3)
 
-#: dwells at rates, rad/s, and temperatures, degC -> change of the output for each value, (n, m)
-ColumnFunction = Callable[[Array, Array], Array]
-
 
 def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
-                       columns: ColumnFunction, covariance: Array) -> Tolerance:
+                       columns: Callable[[Array, Array], Array], covariance: Array) -> Tolerance:
     """
     Return the error of a rate that the covariance of the values does not contain.
 
@@ -55,25 +52,29 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
     dwells : that were fitted
     whitener : of their scatter
     sweep_scatter : scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,)
-    columns : of the values
+    columns : of rates, rad/s, and temperatures, degC: change of the output for each value, (n, m)
     covariance : of the values, shape (m, m)
 
     """
     fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
-    has_temperature = dwells.temperature is not None
-    temperature = (np.asarray(dwells.temperature) if has_temperature else np.zeros(len(dwells)))
+    temperature = (np.zeros(len(dwells)) if dwells.temperature is None
+                   else np.asarray(dwells.temperature))
     low, high = float(temperature.min()), float(temperature.max())
     middle = 0.5 * (low + high)
     half_width = max(0.5 * (high - low), 0.5 * MIN_TEMPERATURE_SPREAD)
-
-    first = 0 if has_temperature else 4
+    curve = 0.5 / Prior().correlation_length  # a slope changes by its own size over this length
+    unfitted_deviations = [
+        BIAS_SLOPE_DEVIATION, BIAS_SLOPE_DEVIATION * curve, SCALE_SLOPE_DEVIATION * fastest,
+        SCALE_SLOPE_DEVIATION * fastest * curve, *[NONLINEARITY_DEVIATION * fastest] * 2]
+    first = 4 if dwells.temperature is None else 0
 
     def extended_columns(rate: Array, warm: Array) -> Array:
-        return np.column_stack([columns(rate, warm),
-                                _unfitted_columns(rate / fastest, warm - middle)[:, first:]])
+        """Return the columns of the values, slopes and curves over temperature, and powers."""
+        w, t = rate / fastest, warm - middle
+        unfitted = np.column_stack([t, t ** 2, t * w, t ** 2 * w, w ** 2, w ** 3])
+        return np.column_stack([columns(rate, warm), unfitted[:, first:]])
 
-    prior_deviation = np.array(
-        [*[math.inf] * len(covariance), *_unfitted_deviations(fastest)[first:]])
+    prior_deviation = np.array([*[math.inf] * len(covariance), *unfitted_deviations[first:]])
     white = whitener.whiten(extended_columns(dwells.rate, temperature))
     lengths = np.linalg.norm(white, axis=0)
     lengths = np.where(lengths > 0.0, lengths, 1.0)
@@ -95,17 +96,3 @@ def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
                      math.sqrt(at_rest) / half_width,
                      math.sqrt(max(turning - at_rest, 0.0)) / half_width / fastest,
                      math.sqrt(faster) / (0.5 * fastest))
-
-
-def _unfitted_columns(relative_rate: Array, temperature_offset: Array) -> Array:
-    """Return slopes and curves over temperature, and powers of the rate, shape (n, 6)."""
-    return np.column_stack(
-        [temperature_offset, temperature_offset ** 2, temperature_offset * relative_rate,
-         temperature_offset ** 2 * relative_rate, relative_rate ** 2, relative_rate ** 3])
-
-
-def _unfitted_deviations(fastest: float) -> Sequence[float]:
-    """Return the standard deviations of the coefficients of `_unfitted_columns`."""
-    curve = 0.5 / Prior().correlation_length  # a slope changes by its own size over this length
-    return (BIAS_SLOPE_DEVIATION, BIAS_SLOPE_DEVIATION * curve, SCALE_SLOPE_DEVIATION * fastest,
-            SCALE_SLOPE_DEVIATION * fastest * curve, *[NONLINEARITY_DEVIATION * fastest] * 2)

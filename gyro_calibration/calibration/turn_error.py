@@ -21,12 +21,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
-from gyro_calibration.calibration.dwells import Dwells, Numbers, select_dwells
+from gyro_calibration.calibration.dwell_search import Numbers
+from gyro_calibration.calibration.dwells import Dwells, select_dwells
 from gyro_calibration.calibration.rate_table import Calibration, fit_effects
 from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.calibration.self_calibration import refuse_scale
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.compensation import compensate
 import numpy as np
 
@@ -95,11 +97,12 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
     refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
     rests, remark = _find_rests(dwells)
-    nearest = [_find_nearest_rest(dwells, place, rests)
-               for place in np.flatnonzero(wanted).tolist()]
-    # eq. 1 and 2, and eq. 13, 15 and 16
-    static, modelled = (_error_per_turn(dwells, error, wanted, nearest)
-                        for error in (dwells.output - dwells.rate, rate - dwells.rate))
+    nearest = _find_nearest(dwells, turns, rests)
+    static, modelled = (
+        # eq. 1 and 2, eq. 13 to 16: the integral over a turn of errors of a rate, less the bias
+        (error[wanted] - [weights @ error[rows] for rows, weights in nearest])
+        * 2.0 * math.pi / np.abs(turns.rate)
+        for error in (dwells.output - dwells.rate, rate - dwells.rate))
     remarks = [remark]
     if lost:
         remarks.append(f'{lost} turns are left out: the other sweeps do not determine the model')
@@ -107,68 +110,44 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
                       tuple(remarks))
 
 
-def _error_per_turn(dwells: Dwells, error: Array, is_turn: Mask,
-                    nearest: list[_SweepRest]) -> Array:
-    """Return the integral over a turn of errors of a rate, less those at rest, rad (eq. 14)."""
-    bias = np.array([rest.weights @ error[rest.dwells] for rest in nearest])
-    return (error[is_turn] - bias) * 2.0 * math.pi / np.abs(dwells.rate[is_turn])
+#: Number of a sweep -> the dwells that determine its static bias, and their weights.
+Rests = dict[int, tuple[Numbers, Array]]
 
 
-# static bias
-
-@dataclass(frozen=True)
-class _SweepRest:
-    """The dwells of a sweep that determine the static bias, and their weights, shape (k,)."""
-
-    sweep: int
-    temperature: float
-    dwells: Numbers
-    weights: Array
-
-
-def _find_rests(dwells: Dwells) -> tuple[list[_SweepRest], str]:
-    """Return the rests of the sweeps, or where there is none the slowest turns both ways."""
-    numbers = np.unique(dwells.sweep)
-    for find, words in ((_find_standstill, 'the static bias is from the rest of each sweep'),
-                        (_find_slowest_turns, 'no rest; the static bias is the error between the '
-                         'slowest turns both ways of each sweep')):
-        found = [rest for number in numbers if (rest := find(dwells, int(number))) is not None]
-        if found:
-            others = len(numbers) - len(found)
-            more = (f'; {others} of {len(numbers)} sweeps have none and take that of the nearest '
-                    'temperature' if others else '')
-            return found, words + more
-    raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that nothing '
-                      'shows the static bias; record a rest before each sweep')
+def _find_rests(dwells: Dwells) -> tuple[Rests, str]:
+    """Return the rests of the sweeps (eq. 1), or if there is none the slowest turns both ways."""
+    speed, at_rest, between = np.abs(dwells.rate), Rests(), Rests()
+    sweeps = np.unique(dwells.sweep).tolist()
+    for number in sweeps:
+        rows = np.flatnonzero(dwells.sweep == number)
+        rests = rows[speed[rows] <= MAX_REST_RATE]
+        if len(rests):
+            at_rest[number] = rests, np.full(len(rests), 1.0 / len(rests))
+        ways = [rows[way * dwells.rate[rows] > 0.0] for way in (1.0, -1.0)]
+        if all(map(len, ways)):
+            slowest = np.array([each[np.argmin(speed[each])] for each in ways])
+            between[number] = slowest, speed[slowest[::-1]] / speed[slowest].sum()
+    if not at_rest and not between:
+        raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that '
+                          'nothing shows the static bias; record a rest before each sweep')
+    found, remark = at_rest or between, (
+        'the static bias is from the rest of each sweep' if at_rest else
+        'no rest; the static bias is the error between the slowest turns both ways of each sweep')
+    if others := len(sweeps) - len(found):
+        remark += (f'; {others} of {len(sweeps)} sweeps have none and take that of the nearest '
+                   'temperature')
+    return found, remark
 
 
-def _find_standstill(dwells: Dwells, number: int) -> _SweepRest | None:
-    """Return the rests of a sweep (eq. 1)."""
-    rows = np.flatnonzero((dwells.sweep == number) & (np.abs(dwells.rate) <= MAX_REST_RATE))
-    return _make_sweep_rest(dwells, number, rows, np.full(len(rows), 1.0)) if len(rows) else None
-
-
-def _find_slowest_turns(dwells: Dwells, number: int) -> _SweepRest | None:
-    """Return the slowest turn each way of a sweep; the bias is interpolated between them."""
-    ways = [np.flatnonzero((dwells.sweep == number) & (way * dwells.rate > 0.0))
-            for way in (1.0, -1.0)]
-    if not all(map(len, ways)):
-        return None
-    rows = np.array([rows[np.argmin(np.abs(dwells.rate[rows]))] for rows in ways])
-    return _make_sweep_rest(dwells, number, rows, np.abs(dwells.rate[rows[::-1]]))
-
-
-def _make_sweep_rest(dwells: Dwells, number: int, rows: Numbers, weights: Array) -> _SweepRest:
-    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[rows].mean())
-    return _SweepRest(number, temperature, rows, weights / weights.sum())
-
-
-def _find_nearest_rest(dwells: Dwells, index: int, rests: list[_SweepRest]) -> _SweepRest:
-    """Return the rest of a dwell's sweep, or else the nearest in temperature, then in order."""
-    sweep = int(dwells.sweep[index])
-    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[index])
-    return min(rests, key=lambda rest: (rest.sweep != sweep, abs(rest.temperature - temperature),
-                                        abs(rest.sweep - sweep)))
+def _find_nearest(dwells: Dwells, turns: Dwells,
+                  rests: Rests) -> list[tuple[Numbers, Array]]:
+    """Return the rest of each turn's sweep, or else the nearest in temperature, then in order."""
+    degc, at = ((np.zeros(len(each)) if each.temperature is None else each.temperature)
+                for each in (dwells, turns))
+    of_rest = {number: float(degc[rows].mean()) for number, (rows, _) in rests.items()}
+    return [rests[min(rests, key=lambda number: (
+        number != sweep, abs(of_rest[number] - temperature), abs(number - sweep)))]
+        for sweep, temperature in zip(turns.sweep.tolist(), at.tolist())]
 
 
 # rates by a model
@@ -197,15 +176,13 @@ def predict_left_out_rates(calibration: Calibration) -> Array:
     return rates
 
 
-@dataclass(frozen=True)
-class ErrorSummary:
-    """Root mean square and largest absolute value of errors, rad per turn, and their count."""
+class ErrorSummary(NamedTuple):
+    """Root mean square and largest absolute value of errors, rad per turn."""
 
     rms: float
     largest: float
-    count: int
 
 
 def summarize_errors(errors: Array) -> ErrorSummary:
     """Return how large some errors are, shape (n,) with n above 0."""
-    return ErrorSummary(rms(errors), float(np.abs(errors).max()), len(errors))
+    return ErrorSummary(rms(errors), float(np.abs(errors).max()))

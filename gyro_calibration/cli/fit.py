@@ -19,12 +19,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwells import (
-    extract_dwells,
-    format_list,
-    join_dwells,
-    select_dwells,
-)
+from gyro_calibration.calibration.dwell_search import format_list
+from gyro_calibration.calibration.dwells import extract_dwells, join_dwells
 from gyro_calibration.calibration.encoder import (
     calibrate_encoder,
     EncoderCalibration,
@@ -151,7 +147,7 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         plots.draw_residuals(given.picture, fit)
     if given.surface:
         plots.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range,
-                                 select_dwells(table, fit.scatter.inliers))
+                                 fit.used)
     matrix = next((polynomial_to_matrix(term.effect, term.values).tolist() for term in model.terms
                    if term.effect.name == POLYNOMIAL), None)
     lines = list(dwell_lines(model, selection))
@@ -233,40 +229,24 @@ def _dwell_data(selection: Selection) -> dict[str, Any]:
     fit = selection.calibration
     table, scatter = fit.dwells, fit.scatter
     return {
-        'dwells': len(table),
-        'sweeps': len(np.unique(table.sweep)),
+        'dwells': len(table), 'sweeps': len(np.unique(table.sweep)),
         'outlying': [table.location[row] for row in np.flatnonzero(~scatter.inliers)],
-        'condition': fit.condition_number,
-        'folded_beyond_rad_s': fit.min_non_monotonic_rate,
-        'rms_before_rad_s': fit.uncorrected_rms,
-        'rms_residual_rad_s': fit.residual_rms,
+        'condition': fit.condition_number, 'folded_beyond_rad_s': fit.min_non_monotonic_rate,
+        'rms_before_rad_s': fit.uncorrected_rms, 'rms_residual_rad_s': fit.residual_rms,
         'rms_left_out_rad_s': fit.left_out_rms,
-        'scatter': {
-            'dwell_rad_s': scatter.dwell_bias,
-            'dwell_scale': scatter.dwell_scale,
-            'sweep_bias_rad_s': scatter.sweep_bias,
-            'sweep_scale': scatter.sweep_scale
-        },
-        'choices': [{
-            'effect': choice.effect,
-            'taken': choice.taken,
-            'left_out_without_rad_s': choice.error_without,
-            'left_out_with_rad_s': choice.error_with,
-            'chance': choice.p_value,
-            'reason': choice.reason
-        } for choice in selection.choices],
-        'look_alikes': [{
-            'taken': pair.taken,
-            'other': pair.other,
-            'sigmas': pair.sigmas,
-            'parted': pair.is_distinguishable,
-            'parting_rate_rad_s': pair.distinguishing_rate,
-            'reason': pair.reason
-        } for pair in selection.confounders],
+        'scatter': {'dwell_rad_s': scatter.dwell_bias, 'dwell_scale': scatter.dwell_scale,
+                    'sweep_bias_rad_s': scatter.sweep_bias, 'sweep_scale': scatter.sweep_scale},
+        'choices': [{'effect': choice.effect, 'taken': choice.taken,
+                     'left_out_without_rad_s': choice.error_without,
+                     'left_out_with_rad_s': choice.error_with, 'chance': choice.p_value,
+                     'reason': choice.reason} for choice in selection.choices],
+        'look_alikes': [{'taken': pair.taken, 'other': pair.other, 'sigmas': pair.sigmas,
+                         'parted': pair.is_distinguishable,
+                         'parting_rate_rad_s': pair.distinguishing_rate,
+                         'reason': pair.reason} for pair in selection.confounders],
         'by_rate': [_bin_data(part, 'rad_s') for part in bin_errors(fit, table.rate)],
         'by_temperature': [] if table.temperature is None else
-        [_bin_data(part, 'degc') for part in bin_errors(fit, table.temperature)],
-    }
+        [_bin_data(part, 'degc') for part in bin_errors(fit, table.temperature)]}
 
 
 def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
@@ -280,8 +260,21 @@ def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
 def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
     """Give the result of a fit to dwells, its accuracy, and the reasons for its effects."""
     fit = selection.calibration
-    yield from (*_dwell_count_lines(fit), '', *_value_lines(model), '', *_quality_lines(fit), '',
-                *_bin_lines(fit), *_choice_lines(selection))
+    yield from _dwell_count_lines(fit)
+    yield from ('', *_value_lines(model), '', *_quality_lines(fit), '')
+    for name, unit, factor, values in (('rate', 'deg/s', 1 / DEGREE, fit.dwells.rate),
+                                       ('temperature', 'degC', 1.0, fit.dwells.temperature)):
+        if values is None or np.ptp(values) == 0.0:
+            continue
+        yield (f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} '
+               f'{"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s')
+        for part in bin_errors(fit, values):
+            yield (f'{f"{part.low * factor:.1f} to {part.high * factor:.1f}":22s} '
+                   f'{part.count:6d} {part.uncorrected / DEGREE:18.4f} '
+                   f'{part.residual / DEGREE:10.4f} {part.deviation / DEGREE:8.4f} '
+                   f'{part.rms / DEGREE:8.4f}')
+        yield ''
+    yield from _choice_lines(selection)
 
 
 def heading_lines(model: GyroModel, found: EncoderCalibration,
@@ -364,25 +357,6 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
     if not fit.dof:
         yield wrap_line('There are as many values as dwells, so their standard deviations are '
                         'unknown: add dwells.')
-
-
-def _bin_lines(fit: Calibration) -> Iterator[str]:
-    """Give the tables of residuals by rate and by temperature."""
-    table = fit.dwells
-    for name, unit, factor, values in (('rate', 'deg/s', 1 / DEGREE, table.rate),
-                                       ('temperature', 'degC', 1.0, table.temperature)):
-        if values is None or np.ptp(values) == 0.0:
-            continue
-        yield (f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} '
-               f'{"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s')
-        for part in bin_errors(fit, values):
-            place = f'{part.low * factor:.1f} to {part.high * factor:.1f}'
-            before, residual, deviation, rms = (
-                value / DEGREE
-                for value in (part.uncorrected, part.residual, part.deviation, part.rms))
-            yield (f'{place:22s} {part.count:6d} {before:18.4f} {residual:10.4f} '
-                   f'{deviation:8.4f} {rms:8.4f}')
-        yield ''
 
 
 def _choice_lines(selection: Selection) -> Iterator[str]:

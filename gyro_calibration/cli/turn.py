@@ -19,7 +19,9 @@ import io
 import math
 from typing import Any, TypeAlias
 
-from gyro_calibration.calibration.dwells import Dwells, extract_dwells, format_list, select_dwells
+from gyro_calibration.calibration.dwell_search import format_list
+from gyro_calibration.calibration.dwells import Dwells, extract_dwells, select_dwells
+from gyro_calibration.calibration.rate_table import equal_bins
 from gyro_calibration.calibration.scatter import find_inliers
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.calibration.turn_error import (
@@ -144,38 +146,22 @@ def _describe_fit_data(model: GyroModel, log: str) -> str:
 # bins
 
 def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
-    """Return limits of 1, 2, 5, 10, ... deg/s each way, rad/s, and which errors lie between."""
+    """Return limits of 1, 2, 4, ... times the slowest rate each way, and what lies between."""
     speed = np.abs(errors.rate)
-    steps = DEGREE * np.array([factor * 10.0 ** power
-                               for power in range(-3, 5) for factor in (1, 2, 5)])
     # A step just below the fastest turn would make a nearly empty bin.
-    edges = np.concatenate(
-        [[slowest], steps[(steps > 1.01 * slowest) & (steps < speed.max() / 1.2)], [speed.max()]])
-    number = _bin_numbers(edges, speed)
-    bins = [(-high, -low, (number == place) & (errors.rate < 0.0))
-            for place, (low, high) in enumerate(zip(edges, edges[1:]))][::-1]
-    bins += [(low, high, (number == place) & (errors.rate > 0.0))
+    doublings = max(1, math.floor(math.log2(1.6 * speed.max() / slowest)))
+    edges = [*(slowest * 2.0 ** number for number in range(doublings)), float(speed.max())]
+    places = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, doublings - 1)
+    both = [*((-high, -low, (places == place) & (errors.rate < 0.0))
+              for place, (low, high) in enumerate(zip(edges, edges[1:])))][::-1]
+    both += [(low, high, (places == place) & (errors.rate > 0.0))
              for place, (low, high) in enumerate(zip(edges, edges[1:]))]
-    return [each for each in bins if each[2].any()]
+    return [each for each in both if each[2].any()]
 
 
 def _temperature_bins(errors: TurnErrors) -> Bins:
-    """Return limits of a round width, degC, of at most 8 bins, and which errors lie in them."""
-    if errors.temperature is None:
-        return []
-    low, high = float(errors.temperature.min()), float(errors.temperature.max())
-    widths = [factor * 10.0 ** power for power in range(4) for factor in (1, 2, 5)]
-    width = next((width for width in widths if high - low <= 7 * width), widths[-1])
-    edges = np.arange(math.floor(low / width), math.floor(high / width) + 2) * width
-    number = _bin_numbers(edges, errors.temperature)
-    bins = [(low, high, number == place)
-            for place, (low, high) in enumerate(zip(edges, edges[1:]))]
-    return [each for each in bins if each[2].any()]
-
-
-def _bin_numbers(edges: Array, values: Array) -> Any:
-    """Return the number of the bin of each value; the last bin holds its upper edge too."""
-    return np.minimum(np.searchsorted(edges, values, side='right') - 1, len(edges) - 2)
+    return [] if errors.temperature is None else [
+        each for each in equal_bins(errors.temperature, 8) if each[2].any()]
 
 
 # the answer

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.course_over_ground import MIN_LOST_SHARE
-from gyro_calibration.calibration.dwells.samples import find_lost_reference
+from gyro_calibration.calibration.dwell_search import find_lost_reference
 from gyro_calibration.diagnosis.findings import Reference
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import find_codes, robust_deviation, white_noise_deviation

@@ -16,30 +16,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwells import (
-    Dwells,
-    dwells_from_table,
-    format_list,
-    select_dwells,
-)
-from gyro_calibration.calibration.rate_table import (
-    Calibration,
-    channels_of,
-    fit_effects,
-    sensitivity_columns,
-)
+from gyro_calibration.calibration.dwell_search import format_list
+from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
+from gyro_calibration.calibration.rate_table import Calibration, equal_bins, sensitivity_columns
 from gyro_calibration.calibration.scatter import (
     cross_validation_parts,
     MIN_SWEEPS,
     MIN_TEMPERATURE_SPREAD,
-    rms,
     Scatter,
-    sum_by_part,
     surface_dof,
-    Uncertainty,
     Whitener,
 )
-from gyro_calibration.calibration.selection import fit_supported_effects, replace_effect
+from gyro_calibration.calibration.selection import replace_effect, try_fit
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding
 from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
 from gyro_calibration.diagnosis.dwell_fit import (
@@ -50,12 +38,9 @@ from gyro_calibration.diagnosis.dwell_fit import (
     name_causes,
     NamedCauses,
     NUISANCE_EFFECTS,
-    RATE,
     significance_level,
     simulate_output,
     simulation_under_test,
-    SINGLE_RATES,
-    try_fit,
     value_change,
     visible_terms,
 )
@@ -75,7 +60,7 @@ from gyro_calibration.diagnosis.findings import (
 from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.diagnosis.steps import OnProgress
 from gyro_calibration.diagnosis.words import format_amount
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     CUBIC_NONLINEARITY,
     Effect,
@@ -83,18 +68,12 @@ from gyro_calibration.model.effects import (
     SINE_RESPONSE,
     STATIC_EFFECTS,
 )
-from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.optimize import brentq
 from scipy.stats import norm
 from scipy.stats import t as student
 
-#: Shares of the false-alarm rate: for structure without a name, and for outlying dwells; the rest
-#: is for causes.
-_STRUCTURE_ALARM_SHARE, _OUTLIER_ALARM_SHARE = 0.2, 0.05
-#: Probability that an effect of the minimum detectable size is found.
-_DETECTION_POWER = 0.95
 _METHOD_TEXT = (
     'The rates and temperatures of the dwells were simulated, and the difference of measured and '
     'simulated outputs was compared with the effects of rate and temperature. The scatter of '
@@ -103,15 +82,9 @@ _METHOD_TEXT = (
     'without any cause, {share:.2g} % give an alarm. Then curves over rate, temperature and the '
     'order of the dwells were tested on the residual. The reduction of the error was measured on '
     'held-out sweeps; intervals are of 95 %.')
-#: Largest number of groups of sweeps that are left out in turn, for the computing time.
-_MAX_GROUPS = 8
-#: Largest number of bins of a curve, and least number of dwells in each.
-_MAX_BINS, _MIN_DWELLS_PER_BIN = 40, 4
-#: Shares of the search and of the cross-validation in the computing time, measured on a table of
-#: 700 dwells.
-_SEARCH_TIME_SHARE, _VALIDATION_TIME_SHARE = 0.22, 0.75
-#: Largest ratio of unexplained structure along its variable to what a named cause explains.
-_MAX_UNEXPLAINED_RATIO = 0.1
+#: Share of the search in the computing time, measured on a table of 700 dwells; the findings take
+#: the last 3 %.
+_SEARCH_TIME_SHARE = 0.22
 
 
 def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rate: float = 0.01,
@@ -143,13 +116,12 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
     named, structures, withdrawn = _conclude_causes(dwells, model, false_alarm_rate)
     gain = (_cross_validated_gain(dwells, model, false_alarm_rate, withdrawn, on_progress)
             if named.causes else None)
-    on_progress(_SEARCH_TIME_SHARE + _VALIDATION_TIME_SHARE, 'findings')
+    on_progress(0.97, 'findings')
     before = simulation_under_test(dwells, model, named)
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
     after = assemble_model(dwells, model, named.fit) if offered else before
-    strengths = {effect: _misfit_reduction(named, effect) for effect in named.causes}
-    strongest_first = sorted(named.causes, key=lambda each: -strengths[each])
-    outliers = _outlier_findings(dwells, named.fit, _OUTLIER_ALARM_SHARE * false_alarm_rate)
+    strongest_first = sorted(named.causes, key=lambda each: -_misfit_reduction(named, each))
+    outliers = _outlier_findings(dwells, named.fit, 0.05 * false_alarm_rate)
     findings = add_remedies([*record.findings, *outliers, *(
         _cause_finding(named, effect) for effect in strongest_first)], {}, after)
     if after is not before:
@@ -167,37 +139,34 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
 
 # the steps
 
-
-#: Causes, structure without a name, and the names that were withdrawn.
-Conclusion = tuple[NamedCauses, tuple[Unexplained, ...], frozenset[str]]
-
-
 def _conclude_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-                     withdrawn: frozenset[str] = frozenset()) -> Conclusion:
-    """Name causes, and withdraw names along a variable with much unexplained structure."""
-    named = name_causes(dwells, model, false_alarm_rate, withdrawn)
-    structures, gains = find_structure(named.fit, _STRUCTURE_ALARM_SHARE * false_alarm_rate,
-                                       model_uncertainty(named.fit, named.model))
-    if withdrawn:
-        return named, structures, withdrawn
-    withdrawn = frozenset(
-        effect.name for effect in named.causes if effect not in NUISANCE_EFFECTS
-        and max((gain for name, gain in gains.items()
-                 if CAUSES[effect.name].along in name.split('_times_')), default=0.0)
-        > _MAX_UNEXPLAINED_RATIO * _misfit_reduction(named, effect))
-    return (_conclude_causes(dwells, model, false_alarm_rate, withdrawn) if withdrawn
-            else (named, structures, withdrawn))
+                     ) -> tuple[NamedCauses, tuple[Unexplained, ...], frozenset[str]]:
+    """Return causes, structure without a name, and names that were withdrawn."""
+    withdrawn: frozenset[str] = frozenset()
+    while True:
+        named = name_causes(dwells, model, false_alarm_rate, withdrawn)
+        structures, gains = find_structure(named.fit, 0.2 * false_alarm_rate,
+                                           model_uncertainty(named.fit, named.model))
+        # structure along the variable of a cause, above a tenth of what that explains
+        doubtful = [effect.name for effect in named.causes if effect not in NUISANCE_EFFECTS
+                    and max((gain for name, gain in gains.items()
+                             if CAUSES[effect.name].along in name.split('_times_')), default=0.0)
+                    > 0.1 * _misfit_reduction(named, effect)]
+        if withdrawn or not doubtful:
+            return named, structures, withdrawn
+        withdrawn = frozenset(doubtful)
 
 
 def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
                           withdrawn: frozenset[str], on_progress: OnProgress) -> Gain | None:
     """Return the gain on sweeps left out of selection and fit in turn; None if not possible."""
     parts = cross_validation_parts(dwells)
-    groups = parts * min(_MAX_GROUPS, parts.max() + 1) // (parts.max() + 1)
+    count = min(8, int(parts.max()) + 1)  # of groups of sweeps, for the computing time
+    groups = parts * count // (parts.max() + 1)
     errors = {name: np.full(len(dwells), np.nan) for name in ('given', 'plain', 'extended')}
-    for number in range(groups.max() + 1):
-        on_progress(_SEARCH_TIME_SHARE + _VALIDATION_TIME_SHARE * number / (groups.max() + 1),
-                    f'cross-validation, part {number + 1} of {groups.max() + 1}')
+    for number in range(count):
+        on_progress(_SEARCH_TIME_SHARE + (0.97 - _SEARCH_TIME_SHARE) * number / count,
+                    f'cross-validation, part {number + 1} of {count}')
         hidden = groups == number
         rest, left_out = select_dwells(dwells, ~hidden), select_dwells(dwells, hidden)
         try:
@@ -216,7 +185,7 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
     # the heading error of a turn over the window at the rate of a dwell
     squares = {name: np.outer(np.bincount(part_numbers, error[known] ** 2),
                               [1.0, HEADING_WINDOW ** 2]) for name, error in errors.items()}
-    return gain_from_squares(f'{what} left out, each of {groups.max() + 1} groups in turn',
+    return gain_from_squares(f'{what} left out, each of {count} groups in turn',
                              squares, np.outer(np.bincount(part_numbers), [1, 1]),
                              'plain' if model is None else 'given', HEADING_WINDOW)
 
@@ -241,34 +210,34 @@ def _outlier_findings(dwells: Dwells, fit: Calibration, level: float) -> Iterato
             'outliers', {'outliers': Estimate.from_half_width(float(len(outlying)), 0.0, '1')},
             chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
             evidence=f'{len(outlying)} of {len(dwells)} dwells are up to '
-            f'{sigmas.max():.0f} sigma from the others: {places}', along=RATE)
+            f'{sigmas.max():.0f} sigma from the others: {places}', along='rate')
 
 
 # findings
 
 def _misfit_reduction(named: NamedCauses, effect: Effect) -> float:
     """Return the reduction of the sum of squares by a cause."""
-    if effect not in NUISANCE_EFFECTS:
-        rest = _fit_without(named.change_fit, named.change_effect(effect))
-        return math.inf if rest is None else rest.misfit - named.change_fit.misfit
-    _, (deviation, *_) = _term_with_deviations(named.fit, effect)
-    return (value_change(named.fit, named.model, effect) / deviation) ** 2
+    if effect in NUISANCE_EFFECTS:
+        change = value_change(named.fit, named.model, effect)
+        return (change / named.fit.effect_deviation(effect)) ** 2
+    rest = _fit_without(named, effect)
+    return math.inf if rest is None else rest.misfit - named.change_fit.misfit
 
 
-def _fit_without(fit: Calibration, effect: Effect) -> Calibration | None:
-    """Fit all but one effect."""
-    return try_fit(fit, [each for each in fit.effects if each is not effect])
+def _fit_without(named: NamedCauses, effect: Effect) -> Calibration | None:
+    fit, change = named.change_fit, named.change_effect(effect)
+    return try_fit(fit, [each for each in fit.effects if each is not change])
 
 
 def _cause_finding(named: NamedCauses, effect: Effect) -> Finding:
     others, separate_by = find_alternatives(named.fit, effect)
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
-    term, deviations = _term_with_deviations(named.fit, effect)
-    own, parameters = _model_values(named, effect), effect.parameters
+    own = _model_values(named, effect)
     # what is added to the model's values
-    estimates = {parameters[place].name: Estimate.from_half_width(
-        term.values[place] - own[place], NORMAL_QUANTILE_975 * deviation, parameters[place].unit)
-        for place, deviation in zip(term.fitted_indices, deviations)}
+    estimates = {parameter.name: Estimate.from_half_width(
+        value - own[effect.parameters.index(parameter)], NORMAL_QUANTILE_975 * deviation,
+        parameter.unit) for name, parameter, value, deviation in named.fit.model.estimates()
+        if name == effect.name}
     return make_finding(effect.name, estimates, named.p_value(effect), others,
                         minimum_detectable=_minimum_detectable(named, effect),
                         separate_by=separate_by, evidence=_evidence_sentence(named, effect),
@@ -281,50 +250,29 @@ def _model_values(named: NamedCauses, effect: Effect) -> tuple[float, ...]:
                 (0.0,) * len(effect.parameters))
 
 
-def _term_with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[float]]:
-    """Return the term of an effect, and the standard deviations of its fitted values."""
-    owners = [each for each in fit.terms for _ in each.fitted_indices]
-    term = next(each for each in fit.terms if each.effect is effect)
-    covariance = fit.model.covariance
-    deviations = (np.full(len(owners), math.nan) if covariance is None
-                  else np.sqrt(np.diag(covariance)))
-    return term, [float(deviation)
-                  for owner, deviation in zip(owners, deviations) if owner is term]
-
-
 def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
     """Return the minimum detectable size of an effect, in the unit of its first value."""
-    change = named.change_effect(effect)
+    fit, change = named.change_fit, named.change_effect(effect)
     level = significance_level(named.false_alarm_rate, effect in NUISANCE_EFFECTS)
     if effect in NUISANCE_EFFECTS:
         return _detectable_size(named.fit, effect, level)
     if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):
-        return _detectable_size(named.change_fit, change, level)
+        return _detectable_size(fit, change, level)
     # A small sine response equals -k² w³ / 6.
-    cubic = try_fit(named.change_fit,
-                    replace_effect(named.change_fit.effects, change, CUBIC_NONLINEARITY))
+    cubic = try_fit(fit, replace_effect(fit.effects, change, CUBIC_NONLINEARITY))
     if cubic is None:
         return None
-    size = _detectable_size(cubic, CUBIC_NONLINEARITY, level)
-    own = _model_values(named, SINE_RESPONSE)[0]
+    size, own = (_detectable_size(cubic, CUBIC_NONLINEARITY, level),
+                 _model_values(named, SINE_RESPONSE)[0])
     return size if effect is CUBIC_NONLINEARITY else math.sqrt(own ** 2 + 6.0 * size) - own
 
 
 def _detectable_size(fit: Calibration, effect: Effect, level: float) -> float:
     """Return the size of a value that is found with a probability of 95 %."""
-    used = select_dwells(fit.dwells, fit.scatter.inliers)
-    place = [term.effect for term in fit.terms for _ in term.fitted_indices].index(effect)
-    uncertain = Uncertainty.from_fit(used, fit.scatter, sensitivity_columns(used, fit.terms),
-                                     fit.residual[fit.scatter.inliers])
-    deviation = math.sqrt(
-        float(np.tensordot(uncertain.weights, uncertain.covariances, axes=1)[place, place]))
-
-    def excess(sigmas: float) -> float:
-        outside = (uncertain.probability_below(-sigmas * deviation)[place]
-                   + 1.0 - uncertain.probability_below(sigmas * deviation)[place])
-        return float(outside) - level
-
-    return deviation * (float(brentq(excess, 0.1, 1e3)) + float(norm.ppf(_DETECTION_POWER)))
+    place, uncertainty = fit.last_index(effect), fit.uncertainty
+    variance = np.tensordot(uncertainty.weights, uncertainty.covariances, axes=1)[place, place]
+    return float(uncertainty.half_width(1.0 - level)[place]
+                 + norm.ppf(0.95) * math.sqrt(variance))
 
 
 def _evidence_sentence(named: NamedCauses, effect: Effect) -> str:
@@ -334,7 +282,7 @@ def _evidence_sentence(named: NamedCauses, effect: Effect) -> str:
         change = format_amount(value_change(named.fit, named.model, effect), parameter.unit,
                                parameter.name)
         return f'it differs from that of the model by {change}; {sigmas}'
-    rest = _fit_without(named.change_fit, named.change_effect(effect))
+    rest = _fit_without(named, effect)
     if rest is None:
         return ''
     return (f'without it, left-out sweeps are predicted to {rest.left_out_rms / DEGREE:.3g} '
@@ -347,7 +295,7 @@ def _evidence_sentence(named: NamedCauses, effect: Effect) -> str:
 def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
              structures: Sequence[Unexplained], withdrawn: frozenset[str], gain: Gain | None,
              offered: bool) -> Iterator[str]:
-    fit = named.fit
+    scatter = named.fit.scatter
     if withdrawn:
         yield (f'Not named: {", ".join(sorted(withdrawn))}: along the same '
                'variable, much structure is left without a name.')
@@ -356,20 +304,15 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
                'simulation; it is not offered.')
     if gain is not None:
         yield (f'Heading errors are the errors of dwells integrated over {HEADING_WINDOW:g} s.')
-    if any(each.along == SINGLE_RATES for each in structures):
+    if any(each.along == 'single_rates' for each in structures):
         yield ('Errors that repeat at single rates may belong to the table, or to the position '
                'within a sweep if all sweeps have the same order.')
-    scatter = fit.scatter
     yield (f'Dwells scatter by {scatter.dwell_bias / DEGREE:.2g} deg/s and '
            f'{100.0 * scatter.dwell_scale:.2g} % of the rate, sweeps by '
            f'{scatter.sweep_bias / DEGREE:.2g} deg/s in bias and '
            f'{100.0 * scatter.sweep_scale:.2g} % in scale factor.')
-    if model is not None:
-        yield from _model_remarks(dwells, model, fit)
-
-
-def _model_remarks(dwells: Dwells, model: GyroModel, fit: Calibration) -> Iterator[str]:
-    """Give remarks on untested effects of a model, and on a replacement of its polynomial."""
+    if model is None:
+        return
     known = visible_terms(model)
     unseen = [term.effect.name for term in model.terms if term not in known]
     if unseen:
@@ -379,55 +322,34 @@ def _model_remarks(dwells: Dwells, model: GyroModel, fit: Calibration) -> Iterat
             and dwells.temperature is None):
         yield ('The table holds no temperature; the model is simulated at '
                f'{model.reference_temperature:g} degC.')
-    if any('output' in term.effect.inputs for term in known):
-        yield from _polynomial_remarks(dwells, known)
-
-
-def _polynomial_remarks(dwells: Dwells, known: list[Term]) -> Iterator[str]:
-    named, _ = fit_supported_effects(dwells)
-    try:
-        polynomial = fit_effects(dwells, [term.effect for term in known
-                                          if 'output' in term.effect.inputs], named.scatter)
-    except DataRefused:
-        return
-    effects = ', '.join(effect.name for effect in named.effects)
-    # Effects of the rate leave an error of the output, a polynomial of the output one of the rate.
-    of_rate = rms((named.left_out_residual
-                   / named.model.output_slope(channels_of(dwells)))[named.scatter.inliers])
-    count, of_polynomial = (sum(len(term.fitted_indices) for term in fit.terms)
-                            for fit in (named, polynomial))
-    yield (f'{effects} alone, {count} values, predict the rates of left-out sweeps to '
-           f'{of_rate / DEGREE:.3g} deg/s; a polynomial of the orders that the model has, '
-           f'{of_polynomial} values, to {polynomial.left_out_rms / DEGREE:.3g} deg/s.')
 
 
 # what cannot be shown
 
 _AVERAGED_REASON = 'a dwell is a mean at a constant rate; record samples with their time'
 _NO_TIME_REASON = 'a table without time does not show what changes with time; record a log in time'
+#: Cause, or the variable along which it shows -> why a table does not show it.
 _UNTESTABLE_REASONS = {
-    **dict.fromkeys(('bandwidth', 'time_offset', 'clock_rate', 'reference_slip'),
-                    'at constant rates a delay has no effect; record fast reversals with their '
-                    'time'),
-    **dict.fromkeys(('bias_temperature_rate', 'thermal_lag', 'thermal_hysteresis', 'warm_up',
-                     'rate_ramp', 'bias_step'), _NO_TIME_REASON),
-    **dict.fromkeys(('interference_tone', 'quantization', 'dead_zone', 'saturation',
-                     'stuck_samples', 'dropped_samples', 'angle_random_walk', 'bias_instability',
-                     'rate_random_walk'), _AVERAGED_REASON),
-    **dict.fromkeys(('heading_sensitivity', 'reference_once_per_rev', 'reference_quantization'),
-                    'whole turns average over all headings; record reference_heading_deg in time'),
-    **dict.fromkeys(('acceleration_sensitivity', 'vibration_rectification'),
+    'dead_zone': _AVERAGED_REASON, 'saturation': _AVERAGED_REASON,
+    'reference_scale':
+        'only a second reference separates the scale of the first from that of the gyro',
+    'rate_change':
+        'at constant rates a delay has no effect; record fast reversals with their time',
+    'temperature_rate': _NO_TIME_REASON, 'time': _NO_TIME_REASON,
+    'frequency': _AVERAGED_REASON, 'output': _AVERAGED_REASON,
+    'heading':
+        'whole turns average over all headings; record reference_heading_deg in time',
+    **dict.fromkeys(('specific_force', 'vibration'),
                     'only rates and temperatures of a table are evaluated; record '
                     'acceleration_mps2 in several poses, with time'),
-    'supply_sensitivity':
-        'only rates and temperatures of a table are evaluated; record supply_v with time',
-    'reference_scale':
-        'only a second reference separates the scale of the first from that of the gyro'}
+    'supply': 'only rates and temperatures of a table are evaluated; record supply_v with time'}
 
 
 def _untestable_causes(dwells: Dwells) -> dict[str, str]:
     """Return the causes that the table cannot show, with the reasons."""
-    found = {name: _UNTESTABLE_REASONS[name] for name in CAUSES if name in _UNTESTABLE_REASONS}
+    found = {name: _UNTESTABLE_REASONS.get(name) or _UNTESTABLE_REASONS[cause.along]
+             for name, cause in CAUSES.items()
+             if name not in {*STATIC_EFFECTS, 'outliers', 'unit_error'}}
     thermal = [name for name, effect in STATIC_EFFECTS.items() if 'temperature' in effect.inputs]
     if dwells.temperature is None:
         return {**found, **dict.fromkeys(
@@ -445,40 +367,25 @@ def error_curves(dwells: Dwells, scatter: Scatter, before: GyroModel,
                  after: GyroModel) -> tuple[Curve, ...]:
     """Return the errors of dwells, without outliers, along rate, temperature and their order."""
     used = select_dwells(dwells, scatter.inliers)
-    senses, ones = np.sign(used.rate), np.ones(len(used))
-    found = [_error_curve('rate', 'rad/s', used.rate, ones, used, scatter, before, after),
-             _error_curve('order_of_dwells', '', np.arange(1.0, len(used) + 1.0), ones, used,
-                          scatter, before, after)]
+    ones = np.ones(len(used))
+    variables = [('rate', 'rad/s', used.rate, ones),
+                 ('order_of_dwells', '', np.arange(1.0, len(used) + 1.0), ones)]
     if used.temperature is not None and np.ptp(used.temperature) > 0.0:
-        found.append(_error_curve('temperature', 'degC', used.temperature, ones, used, scatter,
-                                  before, after))
         # A scale factor that changes with temperature averages out over turns both ways, unless
         # errors count in the sense of the turn.
-        found.append(_error_curve('temperature_while_turning', 'degC', used.temperature, senses,
-                                  used, scatter, before, after))
+        variables += [('temperature', 'degC', used.temperature, ones),
+                      ('temperature_while_turning', 'degC', used.temperature, np.sign(used.rate))]
+    outputs = [simulate_output(model, used) for model in (before, after)]
+    errors = np.array([used.output - outputs[0], used.output - outputs[1],
+                       outputs[0] - used.rate])
+    found = []
+    for along, unit, values, sign in variables:
+        masks = [within & (sign != 0.0) for _, _, within in equal_bins(
+            values, max(1, min(40, len(values) // 4)))]
+        masks = [mask for mask in masks if mask.any()]
+        at, *means = (np.array([float(each[mask].mean()) for mask in masks])
+                      for each in (values, *sign * errors))
+        deviation = np.array([scatter.mean_deviation(select_dwells(used, mask), sign[mask])
+                              for mask in masks])
+        found.append(Curve(along, unit, at, means[0], means[1], deviation, means[2]))
     return tuple(found)
-
-
-def _error_curve(along: str, unit: str, values: Array, sign: Array, dwells: Dwells,
-                 scatter: Scatter, before: GyroModel, after: GyroModel) -> Curve:
-    outputs = [simulate_output(model, dwells) for model in (before, after)]
-    errors = [sign * (dwells.output - outputs[0]), sign * (dwells.output - outputs[1]),
-              sign * (outputs[0] - dwells.rate)]
-    # of equal width, those that hold something
-    count = max(1, min(_MAX_BINS, len(np.unique(values)), len(values) // _MIN_DWELLS_PER_BIN))
-    edges = np.linspace(values.min(), values.max(), count + 1)
-    place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, count - 1)
-    bins = [chosen for number in range(count)
-            if (chosen := (place == number) & (sign != 0.0)).any()]
-    at, *means = (np.array([float(each[chosen].mean()) for chosen in bins])
-                  for each in (values, *errors))
-    deviation = np.array([_mean_error_deviation(dwells, scatter, sign, chosen) for chosen in bins])
-    return Curve(along, unit, at, means[0], means[1], deviation, means[2])
-
-
-def _mean_error_deviation(dwells: Dwells, scatter: Scatter, sign: Array, chosen: Mask) -> float:
-    """Return the standard deviation of the mean error of dwells; a sweep shares a part of it."""
-    part = select_dwells(dwells, chosen)
-    shared = sum_by_part(sign[chosen, None] * scatter.sweep_columns(part),
-                         np.unique(part.sweep, return_inverse=True)[1])
-    return math.sqrt(float(np.sum(scatter.deviation(part) ** 2) + np.sum(shared ** 2))) / len(part)

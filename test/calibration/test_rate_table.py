@@ -17,7 +17,6 @@ from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, selec
 from gyro_calibration.calibration.rate_table import (
     bin_errors,
     channels_of,
-    EffectsUnidentifiable,
     fit_effects,
 )
 from gyro_calibration.calibration.scatter import (
@@ -119,7 +118,7 @@ def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_sca
         [column for term in fit.terms for column in term.columns(channels_of(table))])
     error, freedom = table.output - table.rate, len(table) - len(CUBIC)
     values, (misfit,), *_ = np.linalg.lstsq(columns, error, rcond=None)
-    widened = student.ppf(0.975, freedom) / 1.959964
+    widened = student.ppf(0.975, freedom) / 1.96
     np.testing.assert_allclose([term.values[-1] for term in fit.terms], values, rtol=1e-9)
     covariance = np.linalg.inv(columns.T @ columns) * misfit / freedom * widened ** 2
     sizes = np.sqrt(np.diag(covariance))
@@ -166,7 +165,7 @@ def test_three_speeds_of_a_record_player_leave_one_degree_of_freedom():
     (scale, bias), covariance = np.polyfit(rate, output - rate, 1, cov=True)
     assert [term.values[0] for term in fit.terms] == pytest.approx([bias, scale])
     student_intervals = np.sqrt(np.diag(covariance))[::-1] * student.ppf(0.975, 1)
-    np.testing.assert_allclose(1.959964 * np.sqrt(np.diag(fit.model.covariance)),
+    np.testing.assert_allclose(1.96 * np.sqrt(np.diag(fit.model.covariance)),
                                student_intervals, rtol=1e-5)
 
 
@@ -291,27 +290,25 @@ def test_rates_beyond_the_top_of_a_sine_are_reported():
 def test_a_symmetric_swing_at_one_speed_cannot_part_asymmetry_from_bias():
     table = dwells(np.tile([0.5, -0.5], 10),
                    0.01 + 1e-4 * np.random.default_rng(0).standard_normal(20))
-    with pytest.raises(EffectsUnidentifiable,
-                       match='many speeds, slow ones and rest too') as refused:
+    with pytest.raises(DataRefused, match='^bias, scale_factor_asymmetry look alike .* '
+                       'many speeds, slow ones and rest too'):
         fit_effects(table, (BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY))
-    assert set(refused.value.effects) == {'bias', 'scale_factor_asymmetry'}
 
 
 @pytest.mark.parametrize('temperature, said',
                          [(None, 'no temperature; record'), (np.full(20, 25.0), 'varies by 0 K')])
 def test_one_temperature_gives_no_slope_over_temperature(temperature, said):
     table = dwells(np.linspace(-1.0, 1.0, 20), 0.01, temperature)
-    with pytest.raises(EffectsUnidentifiable, match=said) as refused:
+    with pytest.raises(DataRefused, match=f'^bias_temperature cannot be seen: .*{said}'):
         fit_effects(table, (BIAS, BIAS_TEMPERATURE))
-    assert refused.value.effects == ('bias_temperature',)
 
 
 def test_two_temperatures_give_no_curve_over_temperature():
     table = dwells(np.tile(np.linspace(-1.0, 1.0, 10), 2), 0.01, np.repeat([20.0, 40.0], 10))
-    with pytest.raises(EffectsUnidentifiable, match='three temperatures') as refused:
+    with pytest.raises(DataRefused,
+                       match='^bias, .*bias_temperature_quadratic look alike.*three temperatures'):
         fit_effects(table,
                     (BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC))
-    assert {'bias', 'bias_temperature_quadratic'} <= set(refused.value.effects)
 
 
 def test_a_polynomial_over_the_output_alone_needs_no_temperature():
@@ -323,7 +320,7 @@ def test_a_polynomial_over_the_output_alone_needs_no_temperature():
 
 
 def test_a_polynomial_of_too_high_an_order_is_refused_in_a_whole_sentence():
-    with pytest.raises(EffectsUnidentifiable, match=r'cannot be determined from these dwells; \w'):
+    with pytest.raises(DataRefused, match=r'cannot be determined from these dwells; \w'):
         fit_effects(dwells(np.repeat([-1.0, 0.0, 1.0], 8), 0.0),
                     [rate_temperature_polynomial(4, 0)])
 

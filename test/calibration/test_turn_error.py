@@ -70,11 +70,6 @@ def test_the_static_bias_after_the_model_is_that_of_the_compensated_rest():
     assert errors.modelled / DEGREE == pytest.approx([0.01 * 36.0, -0.01 * 18.0])
 
 
-def test_a_bias_changes_nothing_since_a_rest_shows_it():
-    later = replace(HAND, output=HAND.output + 0.7 * DEGREE)
-    assert static(later) == pytest.approx(static(HAND))
-
-
 def test_slow_turns_are_left_out_and_a_rest_is_no_turn():
     found = table([0.0, 4.9, -4.9, 5.1, -60.0], [0.0] * 5)
     assert compute_turn_errors(found, found.output).rate / DEGREE == pytest.approx([5.1, -60.0])
@@ -342,11 +337,6 @@ def test_a_picture_without_matplotlib_is_refused_before_anything_is_computed(
     monkeypatch.setitem(sys.modules, 'matplotlib', None)
     code, text, error = run(tmp_path / 'missing.csv', '--picture', 'turn.png')
     assert code == 2 and not text and 'needs matplotlib' in error
-
-
-def test_everything_but_the_picture_works_without_matplotlib(run, log, model, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    assert run(log, '--model', model)[0] == 0
 
 
 def test_the_picture_is_written(run, log, model, tmp_path):
