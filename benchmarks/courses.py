@@ -35,6 +35,7 @@ from pathlib import Path
 import sys
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.diagnosis.spans import fit_spans, lay_out_spans
 from gyro_calibration.logs.log import Array, DataRefused, Log, read_log, select_rows
 import numpy as np
 
@@ -143,7 +144,7 @@ RATE, FIXES = 100, 10  # Hz, of the gyro and of the course
 
 def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, float]:
     """
-    Return a drive of four minutes, and the bias and scale of its gyro.
+    Return a drive of four minutes, and the mean bias and the scale of its gyro.
 
     A car in town (little turning, stops, bursts of bad fixes, bias near zero) or a small quick one
     (turns all the time, a consumer gyro, another delay each drive).
@@ -185,27 +186,35 @@ def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, f
     walk = np.cumsum(generator.standard_normal(count)) * 0.0004 * DEGREE / math.sqrt(RATE)
     output = scale * rate + bias + walk + generator.standard_normal(
         count) * 0.01 * DEGREE * math.sqrt(RATE)
-    return Log(time=time, output=output, reference_heading=seen), bias, scale
+    return Log(time=time, output=output, reference_heading=seen), bias + walk.mean(), scale
 
 
 def held(drives: int) -> Iterator[str]:
-    """Give the share of intervals that hold the truth, and the share of refusals."""
+    """Give for `fit` and `diagnose` the errors, and the share of intervals that hold the truth."""
     for town in (False, True):
-        hits, refused = [], 0
+        errors: dict[str, list[Array]] = {'fit': [], 'diagnose': []}
+        refused = 0
         for seed in range(drives):
             log, bias, scale = simulated(np.random.default_rng([seed, town]), town)
+            truth = np.array([scale - 1.0, bias])
+            spans = fit_spans(lay_out_spans(log))
+            errors['diagnose'].append(np.array(
+                [spans.values[:2] - truth, [spans.half_width(place) for place in range(2)]]))
             try:
                 fit = calibrate_encoder(log).fit
             except DataRefused:
                 refused += 1
                 continue
-            off = np.array([fit.scale_factor_error + 1.0 - scale, fit.bias - bias]) / np.sqrt(
-                np.diag(fit.covariance))
-            hits.append(np.abs(off) < 1.96)
-        share = np.mean(hits, axis=0) if hits else np.full(2, math.nan)
-        yield (f'{"town" if town else "small car"}: {refused} of {drives} refused; 95 % intervals '
-               'hold the scale factor error in '
-               f'{share[0]:.2f}, the bias in {share[1]:.2f}')
+            errors['fit'].append(np.array([[fit.scale_factor_error, fit.bias] - truth,
+                                           1.96 * np.sqrt(np.diag(fit.covariance))]))
+        for name, found in errors.items():
+            off, half_width = np.moveaxis(np.array(found), 1, 0)
+            share = np.mean(np.abs(off) < half_width, axis=0)
+            rms = np.sqrt(np.mean(off ** 2, axis=0))
+            yield (f'{"town" if town else "small car"}, {name}: '
+                   f'{refused if name == "fit" else 0} of {drives} refused; 95 % intervals hold '
+                   f's in {share[0]:.2f}, b in {share[1]:.2f}; rms error of s '
+                   f'{100.0 * rms[0]:.3f} %, of b {rms[1] / DEGREE:.4f} deg/s')
 
 
 def main(arguments: list[str]) -> None:

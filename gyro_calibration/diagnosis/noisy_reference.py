@@ -200,11 +200,13 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
             continue
         value, variance = float(fit.values[place]), float(fit.covariance[place, place])
         if name == 'bias' and model is not None:
-            # the mean bias of a log differs from that of the model by bias wander
+            # the mean bias of a log differs from that of the model by bias wander; beside a
+            # course, the variance contains that of the log
             duration = float(fit.spans.time[-1] - fit.spans.time[0])
+            shown = [_gyro_noise(fit)] if fit.spans.treatment.is_fine else []
             variance += max(2.0 / math.pi * each.bias_instability ** 2
                             + each.rate_random_walk ** 2 * duration / 3.0
-                            for each in (_gyro_noise(fit), model.noise))
+                            for each in (*shown, model.noise))
         deviation = math.sqrt(variance)
         effective, freedom = float(fit.effective_stretches[place]), float(fit.freedom[place])
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
@@ -312,7 +314,7 @@ def _gyro_noise(fit: SpanFit) -> Noise:
     return Noise(fit.noise_size('angle_random_walk'),
                  **{part.name: fit.noise_size(part.name)
                     if fit.fit.sizes[part.name][1] > 1.01 * part.size_range[0] else 0.0
-                    for part in fit.spans.bias_wander()[1]})
+                    for part in fit.spans.bias_wander()[1] if part.name != 'smoothing'})
 
 
 # gain

@@ -36,11 +36,13 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.encoder import MAX_TIME_OFFSET
+from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns,
     fit_noise_grid,
     GridFit,
     heading_noise,
+    HierarchicalPrior,
     SharedNoise,
 )
 from gyro_calibration.diagnosis.expected_output import (
@@ -70,8 +72,8 @@ _TRIAL_DELAYS = np.arange(-1.5, 1.501, 0.05)
 #: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
-#: vibration.
-_MAX_VEHICLE_WALK = 5e-4
+#: vibration. Its rate random walk, rad/s/√s.
+_MAX_VEHICLE_WALK, _VEHICLE_RANDOM_WALK_RANGE = 5e-4, (1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class ReferenceTreatment:
 
 
 #: Data-sheet limits of gyros for vehicles: scale factor 1 %, bias 1 deg/s; and delays of 1 s.
-COURSE_TREATMENT = ReferenceTreatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 15.0, False, True)
+COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 15.0, False, True)
 #: A reference with errors of an instrument.
 HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0, True,
                                        True)
@@ -276,14 +278,29 @@ class Spans:
         least, most = self.walk_bounds
         flicker, walk = ((low * least, high * most)
                          for low, high in (_FLICKER_RANGE, _RANDOM_WALK_RANGE))
-        waves, parts = bias_wander_columns(self.time, flicker,
-                                           walk if self.treatment.is_fine else None)
+        waves, parts = (bias_wander_columns(self.time, flicker, walk) if self.treatment.is_fine
+                        else bias_wander_columns(self.time, None, _VEHICLE_RANDOM_WALK_RANGE, 8))
         assert self.log.time is not None
         begin, end = self.time[0], self.time[-1]
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
         rest_times = np.clip(self.log.time[self.rests], begin, end)[:, :, None] - begin
         rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
-        return np.concatenate([waves, rows]), parts
+        waves = np.concatenate([waves, rows])
+        if self.treatment.is_fine:
+            return waves, parts
+        # a smoothed course errs in proportion to the acceleration, by less than this, s²
+        smoothing = SharedNoise('smoothing', np.append(np.zeros(waves.shape[1]), 1.0), (0.1, 0.1))
+        return (np.column_stack([waves, self._acceleration_changes()]),
+                [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
+                 smoothing])
+
+    def _acceleration_changes(self) -> Array:
+        """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
+        assert self.log.time is not None and self.log.output is not None
+        turned, half = integrate_with_curvature(self.log.time, self.log.output), 0.5
+        after, now, before = (np.interp(self.log.time + shift, self.log.time, turned)
+                              for shift in (half, 0.0, -half))
+        return self.span_changes((after - 2.0 * now + before) / half ** 2)
 
 
 def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
@@ -423,21 +440,36 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     prior = np.array(spans.treatment.prior)
     free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
+    count = len(spans.time) - 1
+
     def disagreement(delay: float) -> float:
         """Return the robust difference of gyro and reference at a delay, rad."""
         moved = replace(spans, delay=delay)
+        if not spans.treatment.is_fine:
+            line = np.column_stack([np.ones(count + 1), spans.time])
+            error = np.append(0.0, np.cumsum(moved.observed[:count]))
+            return float(np.mean(np.abs(robust_residual(line, error, 3))))
         left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
-        return float(np.mean(np.minimum(np.abs(left[:len(spans.time) - 1]), 10.0 * DEGREE)))
+        return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
 
     delayed = replace(spans, delay=spans.delay or min(
         _TRIAL_DELAYS[np.abs(_TRIAL_DELAYS) <= 1.5 * prior[2]].tolist(), key=disagreement))
-    point_variances: Array = np.ones(len(spans.time))
+    point_variances: Array = np.ones(count + 1)
     for _ in range(2):
-        values = _robust_least_squares(design_matrix(delayed, causes), delayed.observed, free)[0]
+        design = design_matrix(delayed, causes)
+        if spans.treatment.is_fine:
+            values = _robust_least_squares(design, delayed.observed, free)[0]
+        else:
+            values, error = _fit_headings(design[:count], delayed.observed[:count],
+                                          point_variances, free)
+            point_variances = _burst_variances(delayed.time, error)
         delayed = delayed.with_corrected_rate(values)
-        values[2] = 0.0
-        left = delayed.observed - design_matrix(delayed, causes) @ values
-        point_variances = _point_variances(left[:len(spans.time) - 1])
+        if spans.treatment.is_fine:
+            values[2] = 0.0
+            left = delayed.observed - design_matrix(delayed, causes) @ values
+            point_variances = _point_variances(left[:count])
+    if len(spans.rests):
+        delayed = _drop_contradicted_rests(delayed, causes, point_variances, prior)
     fit = _fit_with_noise(delayed, causes, point_variances, prior)
     if fit.effective_stretches[0] >= MIN_STRETCHES:
         return fit
@@ -467,6 +499,47 @@ def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tupl
     return values, left
 
 
+def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm], point_variances: Array,
+                             prior: Array) -> Spans:
+    """Return the spans without rests whose rate is not the bias that the course shows."""
+    assert spans.log.output is not None
+    by_course = _fit_with_noise(replace(spans, rests=spans.rests[:0]), causes, point_variances,
+                                prior)
+    rates = np.array([spans.log.output[first:last].mean() for first, last in spans.rests])
+    agree = np.abs(rates - by_course.values[1]) < by_course.half_width(1)
+    return replace(spans, rests=spans.rests[agree])
+
+
+def _fit_headings(design: Array, observed: Array, point_variances: Array,
+                  prior: Array) -> tuple[Array, Array]:
+    """Return values by weighted least squares of the headings, and the error of each point."""
+    columns = np.pad(np.cumsum(design, axis=0), ((1, 0), (0, 0)))
+    columns = np.column_stack([columns, np.ones(len(columns))])
+    error = heading = np.append(0.0, np.cumsum(observed))
+    own = np.diag(np.append(1.0 / prior, 0.0))
+    for _ in range(3):
+        weight = 1.0 / np.sqrt(point_variances) / (robust_deviation(error) + 1e-9)
+        values = np.linalg.lstsq(
+            np.vstack([columns * weight[:, None], own]),
+            np.append(heading * weight, np.zeros(len(own))), rcond=None)[0]
+        error = heading - columns @ values
+    return values[:-1], error
+
+
+def _burst_variances(time: Array, error: Array) -> Array:
+    """
+    Return the relative variance of each point of a course by the errors within 2.5 s.
+
+    A course errs in bursts of seconds. The few errors of a burst hardly determine its variance: it
+    is that of Student's distribution with four degrees of freedom.
+
+    """
+    is_near = np.abs(time[:, None] - time) <= 2.5
+    squares, count = is_near @ error ** 2, is_near.sum(axis=1)
+    usual = max(float(np.median(squares / count)), 1e-12)
+    return np.asarray((4.0 + squares / usual) / (4.0 + count))
+
+
 def _point_variances(left: Array) -> Array:
     """Return the relative variance of each point, larger for outliers, at most 100."""
     point = np.concatenate([[0.0], np.cumsum(left)])
@@ -494,8 +567,18 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: 
                           off_diagonal=np.append(np.asarray(part.off_diagonal), more))
                   for part in errors]
     deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
-    fit = fit_noise_grid(spans.observed, columns, parts, *spans.bias_wander(),
-                         prior_deviation=deviation)
+    waves, shared = spans.bias_wander()
+    if spans.treatment.is_fine:
+        fit = fit_noise_grid(spans.observed, columns, parts, waves, shared,
+                             prior_deviation=deviation)
+    else:
+        # what a drive of minutes does not determine is drawn to 0, and the mean bias of the drive
+        # is not that of the gyro
+        sizes = [HierarchicalPrior(name, place, (1e-2 * size, size))
+                 for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2].tolist()))]
+        fit = fit_noise_grid(spans.observed, columns, parts, waves, shared,
+                             prior_deviation=deviation, wandering_value=1,
+                             hierarchical_priors=sizes)
     values = fit.values.copy()
     values[2] += spans.delay
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
