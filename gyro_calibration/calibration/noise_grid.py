@@ -248,10 +248,10 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
         BandedNoise(
             'angle_random_walk', interval, None, angle_random_walk
             or (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
-        BandedNoise('reference', *_difference_covariance(points),
+        BandedNoise('reference', *difference_covariance(points),
                     (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
         BandedNoise(
-            'motion', *_difference_covariance(points * rate ** 2),
+            'motion', *difference_covariance(points * rate ** 2),
             (1e-3 * typical_reference_noise / rate_rms, 1e1 * typical_reference_noise / rate_rms)),
     ]
     if with_angle_noise:
@@ -261,7 +261,7 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
     return parts
 
 
-def _difference_covariance(variance: Array) -> tuple[Array, Array]:
+def difference_covariance(variance: Array) -> tuple[Array, Array]:
     """Return variances of differences between points, and covariances with the one before."""
     return variance[1:] + variance[:-1], -variance[:-1]
 
