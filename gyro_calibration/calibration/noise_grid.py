@@ -359,7 +359,10 @@ class _Regression:
         log_determinant = np.linalg.slogdet(normal)[1] - 2.0 * np.log(scale).sum(axis=1)
         inverse = inverse * scale[:, :, None] * scale[:, None, :]
         values = inverse @ gram[:, -1]
-        squares = self.observed @ weighted[:, -1] - values @ gram[:, -1]
+        # not by the difference of two sums, of which rounding leaves nothing
+        residual = self.observed[:, None] - self.columns @ values.T
+        squares = ((residual * covariance.solve(residual)).sum(axis=0)
+                   + (precisions * values**2).sum(axis=1))
         proper = np.log(np.where(precisions > 0.0, precisions, 1.0)).sum(axis=1)
         return (-0.5 * (covariance.log_determinant + log_determinant - proper + squares), values,
                 inverse)

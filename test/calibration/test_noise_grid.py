@@ -103,6 +103,16 @@ def test_a_size_far_from_the_points_of_the_first_grid_is_found():
         assert found.size('size') == pytest.approx(size * white.std(ddof=1), rel=0.02)
 
 
+def test_noise_far_below_a_signal_of_columns_that_are_much_alike_is_found():
+    time, generator = np.linspace(0.0, 1.0, 40), np.random.default_rng(7)
+    columns = np.column_stack([time**power for power in range(2, 12)])
+    white = 1e-5 * generator.standard_normal(40)
+    found = fit_noise_grid(white + columns @ generator.standard_normal(10), np.ones((40, 1)),
+                           [BandedNoise('size', np.ones(40), None, (1e-7, 1e-2))], columns,
+                           [SharedNoise('shared', np.ones(10), (1e-3, 10.0))])
+    assert 0.6e-5 < found.size('size') < 1.7e-5
+
+
 def test_noise_of_the_reference_does_not_make_the_scale_smaller():
     """A third of the variance of its increments is noise, which biases plain least squares."""
     errors = []
