@@ -171,8 +171,8 @@ def calibrate_encoder(log: Log, method: str | None = None,
         tuple(_list_remarks(fit.scale_factor_error, method, technology)))
 
 
-def _fit_encoder(time: Array, output: Array, motion: Motion, method: str, technology: str) -> tuple[
-        ScaleBiasFit, dict[str, tuple[float, float]]]:
+def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
+                 technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
     limits = RunLimits(max_time_offset=MAX_TIME_OFFSET)
     _refuse_one_speed(motion, limits)
