@@ -172,7 +172,7 @@ def fit_course(time: Array, rate: Array, motion: Motion, technology: str = 'mems
     _refuse_other_motion(spans)
     point_variance: Array = np.ones(len(spans.time))
     for _ in range(2):
-        point_variance = _burst_variance(spans, _point_errors(spans, point_variance))
+        point_variance = burst_variance(spans.time, _point_errors(spans, point_variance))
     found = _regress_course(spans, point_variance, technology)
     scale, scaled_bias, late = found.values[:3]
     jacobian = np.array([[-1.0 / scale**2, 0.0], [-scaled_bias / scale**2, 1.0 / scale]])
@@ -241,12 +241,19 @@ def _point_errors(spans: _Spans, point_variance: Array) -> Array:
     return error - columns / scale @ values
 
 
-def _burst_variance(spans: _Spans, error: Array) -> Array:
-    """Return the variance of each point relative to the usual one, by the errors around it."""
-    around = np.abs(spans.time[:, None] - spans.time) <= 0.5 * BURST_DURATION
+def burst_variance(time: Array, error: Array) -> Array:
+    """
+    Return the variance of each point of a course relative to the usual one.
+
+    Parameters
+    ----------
+    time, error : of the points, s and rad, shape (n,)
+
+    """
+    around = np.abs(time[:, None] - time) <= 0.5 * BURST_DURATION
     squares, count = around @ error**2, around.sum(axis=1)
     usual = max(float(np.median(squares / count)), 1e-12)
-    return (STUDENT_DOF + squares / usual) / (STUDENT_DOF + count)
+    return np.asarray((STUDENT_DOF + squares / usual) / (STUDENT_DOF + count))
 
 
 def _refuse_other_motion(spans: _Spans) -> None:

@@ -35,6 +35,12 @@ from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
+from gyro_calibration.calibration.course_over_ground import (
+    burst_variance,
+    COSINE_COUNT,
+    RANDOM_WALK_RANGE,
+    SMOOTHING_DEVIATION,
+)
 from gyro_calibration.calibration.encoder import MAX_TIME_OFFSET
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.calibration.noise_grid import (
@@ -72,8 +78,8 @@ _TRIAL_DELAYS = np.arange(-1.5, 1.501, 0.05)
 #: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
-#: vibration. Its rate random walk, rad/s/√s.
-_MAX_VEHICLE_WALK, _VEHICLE_RANDOM_WALK_RANGE = 5e-4, (1e-7, 1e-4)
+#: vibration.
+_MAX_VEHICLE_WALK = 5e-4
 
 
 @dataclass(frozen=True)
@@ -279,7 +285,7 @@ class Spans:
         flicker, walk = ((low * least, high * most)
                          for low, high in (_FLICKER_RANGE, _RANDOM_WALK_RANGE))
         waves, parts = (bias_wander_columns(self.time, flicker, walk) if self.treatment.is_fine
-                        else bias_wander_columns(self.time, None, _VEHICLE_RANDOM_WALK_RANGE, 8))
+                        else bias_wander_columns(self.time, None, RANDOM_WALK_RANGE, COSINE_COUNT))
         assert self.log.time is not None
         begin, end = self.time[0], self.time[-1]
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
@@ -289,7 +295,8 @@ class Spans:
         if self.treatment.is_fine:
             return waves, parts
         # a smoothed course errs in proportion to the acceleration, by less than this, s²
-        smoothing = SharedNoise('smoothing', np.append(np.zeros(waves.shape[1]), 1.0), (0.1, 0.1))
+        smoothing = SharedNoise('smoothing', np.append(np.zeros(waves.shape[1]), 1.0),
+                                (SMOOTHING_DEVIATION, SMOOTHING_DEVIATION))
         return (np.column_stack([waves, self._acceleration_changes()]),
                 [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
                  smoothing])
@@ -462,7 +469,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
         else:
             values, error = _fit_headings(design[:count], delayed.observed[:count],
                                           point_variances, free)
-            point_variances = _burst_variances(delayed.time, error)
+            point_variances = burst_variance(delayed.time, error)
         delayed = delayed.with_corrected_rate(values)
         if spans.treatment.is_fine:
             values[2] = 0.0
@@ -524,20 +531,6 @@ def _fit_headings(design: Array, observed: Array, point_variances: Array,
             np.append(heading * weight, np.zeros(len(own))), rcond=None)[0]
         error = heading - columns @ values
     return values[:-1], error
-
-
-def _burst_variances(time: Array, error: Array) -> Array:
-    """
-    Return the relative variance of each point of a course by the errors within 2.5 s.
-
-    A course errs in bursts of seconds. The few errors of a burst hardly determine its variance: it
-    is that of Student's distribution with four degrees of freedom.
-
-    """
-    is_near = np.abs(time[:, None] - time) <= 2.5
-    squares, count = is_near @ error ** 2, is_near.sum(axis=1)
-    usual = max(float(np.median(squares / count)), 1e-12)
-    return np.asarray((4.0 + squares / usual) / (4.0 + count))
 
 
 def _point_variances(left: Array) -> Array:
