@@ -35,7 +35,7 @@ from pathlib import Path
 import sys
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.diagnosis.spans import fit_spans, lay_out_spans
+from gyro_calibration.calibration.heading_regression import fit_spans, lay_out_spans
 from gyro_calibration.logs.log import Array, DataRefused, Log, read_log, select_rows
 import numpy as np
 

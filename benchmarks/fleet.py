@@ -31,7 +31,6 @@ from typing import Any
 
 from fleet_tasks import calibrate
 from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_calibrate
-from gyro_calibration.diagnosis.expected_output import bridge_gaps
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.fleet.pooling import (
     DRIVES,
@@ -53,6 +52,7 @@ from gyro_calibration.fleet.work import fit_slow_effects, LogTask, process_log
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, read_log, select_rows
+from gyro_calibration.logs.quality import bridge_gaps
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import motion_from_rates
 import numpy as np

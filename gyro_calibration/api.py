@@ -33,13 +33,13 @@ from gyro_calibration.allan import (
     fit_noise,
     NoiseFit,
 )
-from gyro_calibration.calibration.course_over_ground import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.dwells import extract_dwells, join_dwells
 from gyro_calibration.calibration.encoder import (
     calibrate_encoder,
     EncoderCalibration,
     is_continuous_motion,
 )
+from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.selection import select_effects, Selection

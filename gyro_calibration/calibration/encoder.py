@@ -31,15 +31,14 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.course_over_ground import (
-    COSINE_COUNT,
     fit_course,
     is_course,
+    is_noisy,
     MAX_ROUNDING_STEP,
-    TECHNOLOGY_PRIORS,
-    WHITE_NOISE_RANGE,
 )
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
+from gyro_calibration.calibration.heading_regression import MAX_ENCODER_OFFSET, TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import fit_likelihood, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise,
@@ -62,8 +61,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-#: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
-MAX_TIME_OFFSET = 0.25
+#: The gyro's white noise that is possible, rad/√s, and cosines for the wander of its bias.
+_WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
 MIN_DWELLS = 3
 
@@ -135,7 +134,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         samples without a number count as lost
     method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the
         encoder's rate on the gyro; None for 'course' where the reference is one, else 'likelihood'
-    technology : of the gyro, one of `course_over_ground.TECHNOLOGY_PRIORS`; with 'course' its
+    technology : of the gyro, one of `heading_regression.TECHNOLOGY_PRIORS`; with 'course' its
         prior decides what a drive leaves open
 
     Raises
@@ -144,13 +143,13 @@ def calibrate_encoder(log: Log, method: str | None = None,
 
     """
     time, output, motion = _extract_motion(log)
-    method = method or ('course' if log.reference_heading is not None
-                        and is_course(time, output, motion) else 'likelihood')
     _refuse_length(motion)
+    method = method or ('course' if log.reference_heading is not None
+                        and (is_course(log) or is_noisy(log)) else 'likelihood')
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
-        fit = fit_course(time, output, motion, technology)
+        fit = fit_course(log, technology)
     else:
         fit, bounds = _fit_encoder(time, output, motion, method, technology)
     model = GyroModel(
@@ -174,11 +173,11 @@ def calibrate_encoder(log: Log, method: str | None = None,
 def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
-    limits = RunLimits(max_time_offset=MAX_TIME_OFFSET)
+    limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET)
     _refuse_one_speed(motion, limits)
     refuse_dead(output)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
-    fit = (fit_likelihood(time, output, motion, MAX_TIME_OFFSET, lag_deviation=2e-4)
+    fit = (fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=2e-4)
            if method == 'likelihood' else _fit_by_rate(time, output, motion))
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
     corrected = (output - fit.bias) / (1.0 + fit.scale_factor_error)
@@ -326,7 +325,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     between = (durations[1:] + durations[:-1]) / 6.0
     # means over pieces of a random walk
     walk = BandedNoise('angle_random_walk', np.maximum(spacing - between, between),
-                       durations[:-1] / 6.0, WHITE_NOISE_RANGE)
+                       durations[:-1] / 6.0, _WHITE_NOISE_RANGE)
     # a file has headings to 1e-6 rad
     rounding = max(quantization_step(motion.heading), 1e-6) / math.sqrt(
         12.0 * len(piece) / len(known))
@@ -335,7 +334,7 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     largest = max(TECHNOLOGY_PRIORS[technology][1], 3.0 * abs(bias))
     found = fit_noise_grid(
         moved, spacing[:, None], [walk, repeated],
-        *bias_wander_columns(middle, cosine_count=COSINE_COUNT), prior_mean=np.array([-bias]),
+        *bias_wander_columns(middle, cosine_count=_COSINE_COUNT), prior_mean=np.array([-bias]),
         prior_deviation=np.array([largest]),
         hierarchical_priors=(HierarchicalPrior('bias', 0, (0.1 * largest, largest)),))
     white, steady = TridiagonalMatrix(walk.diagonal, durations[:-1] / 6.0).whiten(

@@ -48,6 +48,14 @@ bias_instability   rad/s      gyro, flicker of the two-sided spectrum B²/ω
 rate_random_walk   rad/s/√s   gyro, random walk of the two-sided spectrum K²/ω²
 =================  =========  ==================================================================
 
+Errors of a reference that last longer than a span are autoregressive, with a correlation ``φ_k``
+between the points of span ``k``. The differences of observations and columns ::
+
+    y_k - c_k y_(k-1),    c_k = φ_(k-1) (1 - φ_k) / (1 - φ_(k-1)),    c_1 = 0
+
+have tridiagonal covariances again (Cochrane and Orcutt 1949), and as their matrix has the
+determinant 1, likelihoods of different correlations can be compared (`carried_shares`).
+
 Example, for headings of a gyro's integral and of a reference, rad, at the same times, s::
 
     increments = np.diff(integral)
@@ -63,7 +71,7 @@ Example, for headings of a gyro's integral and of a reference, rad, at the same 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 import math
 
@@ -181,6 +189,7 @@ class GridFit:
     influence: Array
     unobservable_variance: float
     _noise: TridiagonalMatrix
+    _carried: Array | None = None
 
     @property
     def deviations(self) -> Array:
@@ -193,7 +202,7 @@ class GridFit:
 
     def whiten(self, columns: Array) -> Array:
         """Return columns, shape (n,) or (n, k), with independent banded noise of variance 1."""
-        return self._noise.whiten(columns)
+        return self._noise.whiten(_quasi_differences(columns, self._carried))
 
     def solve(self, columns: Array) -> Array:
         """Return the inverse of the covariance of the likeliest banded noise, times columns."""
@@ -225,7 +234,8 @@ class TridiagonalMatrix:
 def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
                   with_angle_noise: bool = False,
                   typical_reference_noise: float = math.radians(1.0),
-                  angle_random_walk: tuple[float, float] | None = None) -> list[BandedNoise]:
+                  angle_random_walk: tuple[float, float] | None = None,
+                  correlation: Array | None = None) -> list[BandedNoise]:
     """
     Return the parts of the noise of increments between headings.
 
@@ -240,18 +250,24 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
         10 times it are possible
     angle_random_walk : smallest and largest N that is possible, rad/√s, where a log at rest, a
         data sheet or the differences between samples bound it; equal ends where it is known
+    correlation : of the errors of the reference at both ends of each span, shape (n,); the parts
+        are then those of the differences by `carried_shares`. None where they are independent
 
     """
     points = np.ones(len(time)) if point_variance is None else point_variance
     interval, rate_rms = np.diff(time), math.sqrt(float(np.mean(rate**2))) + 1e-12
+    walk, walk_covariance = interval, None
+    if correlation is not None:
+        carried, before = carried_shares(correlation), np.append(0.0, interval[:-1])
+        walk, walk_covariance = interval + carried ** 2 * before, -carried * before
     parts = [
         BandedNoise(
-            'angle_random_walk', interval, None, angle_random_walk
+            'angle_random_walk', walk, walk_covariance, angle_random_walk
             or (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
-        BandedNoise('reference', *difference_covariance(points),
+        BandedNoise('reference', *difference_covariance(points, correlation),
                     (1e-4 * typical_reference_noise, 1e1 * typical_reference_noise)),
         BandedNoise(
-            'motion', *difference_covariance(points * rate ** 2),
+            'motion', *difference_covariance(points * rate ** 2, correlation),
             (1e-3 * typical_reference_noise / rate_rms, 1e1 * typical_reference_noise / rate_rms)),
     ]
     if with_angle_noise:
@@ -261,9 +277,29 @@ def heading_noise(time: Array, rate: Array, point_variance: Array | None = None,
     return parts
 
 
-def difference_covariance(variance: Array) -> tuple[Array, Array]:
+def difference_covariance(variance: Array,
+                          correlation: Array | None = None) -> tuple[Array, Array]:
     """Return variances of differences between points, and covariances with the one before."""
-    return variance[1:] + variance[:-1], -variance[:-1]
+    if correlation is None:
+        return variance[1:] + variance[:-1], -variance[:-1]
+    # of the innovations e of h_k = φ_k h_(k-1) + e_k: y_k - c_k y_(k-1) = e_k - ratio_k e_(k-1)
+    innovation = (1.0 - correlation ** 2) * variance[1:]
+    ratio = (1.0 - correlation) / np.append(1.0, 1.0 - correlation[:-1])
+    before = ratio * np.append(variance[0], innovation[:-1])
+    return innovation + ratio * before, -before
+
+
+def carried_shares(correlation: Array) -> Array:
+    """Return the share of the observation before that is subtracted from each, shape (n,)."""
+    ratio = (1.0 - correlation[1:]) / (1.0 - correlation[:-1])
+    return np.append(0.0, correlation[:-1] * ratio)
+
+
+def _quasi_differences(columns: Array, carried: Array | None) -> Array:
+    """Return columns, shape (n,) or (n, k), less a share of the row before."""
+    if carried is None:
+        return columns
+    return np.concatenate([columns[:1], columns[1:] - (carried[1:] * columns[:-1].T).T])
 
 
 def bias_wander_columns(time: Array, bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
@@ -372,7 +408,8 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
                    shared_columns: Array | None = None, shared: Sequence[SharedNoise] = (),
                    prior_mean: Array | None = None, prior_deviation: Array | None = None,
                    noisy_column: int | None = None, wandering_value: int | None = None,
-                   hierarchical_priors: Sequence[HierarchicalPrior] = ()) -> GridFit:
+                   hierarchical_priors: Sequence[HierarchicalPrior] = (),
+                   carried: Array | None = None) -> GridFit:
     """
     Estimate values by a likelihood over a grid of the sizes of the noise.
 
@@ -391,6 +428,8 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     hierarchical_priors : values with a prior of unknown size
     wandering_value : number of the value whose variance holds what the shared noise has
         `unobservable_variance`; None where there is none
+    carried : share of the observation before that is subtracted from each, shape (n,); None where
+        the errors of the observations are not autoregressive
 
     Raises
     ------
@@ -404,8 +443,9 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
     mean = np.zeros(count) if prior_mean is None else prior_mean
     precision = np.zeros(count) if prior_deviation is None else 1.0 / np.square(prior_deviation)
     together = columns if shared_columns is None else np.column_stack([columns, shared_columns])
-    regression = _Regression(observed - columns @ mean, together, count, precision, banded, shared,
-                             hierarchical_priors)
+    regression = _Regression(_quasi_differences(observed - columns @ mean, carried),
+                             _quasi_differences(together, carried), count, precision, banded,
+                             shared, hierarchical_priors)
     axes = [_initial_axis(part.size_range) for part in regression.parts]
     for remaining in reversed(range(GRID_PASSES)):
         grid = _evaluate_grid(regression, axes)
@@ -418,8 +458,8 @@ def fit_noise_grid(observed: Array, columns: Array, banded: Sequence[BandedNoise
         [part.unobservable_variance for part in shared])
     if wandering_value is not None:
         grid.covariance[:, wandering_value, wandering_value] += unobservable_variance
-    return _average_grid(regression, grid, weights, mean, noisy_column,
-                         float(weights @ unobservable_variance))
+    return replace(_average_grid(regression, grid, weights, mean, noisy_column,
+                                 float(weights @ unobservable_variance)), _carried=carried)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from gyro_calibration.calibration.course_over_ground import TECHNOLOGY_PRIORS
+from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio

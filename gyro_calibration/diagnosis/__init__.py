@@ -19,9 +19,8 @@ repeated and outlying samples, codes and limits), `replay` (of a log, and the sp
 noise), `candidates` (columns of causes, and of what has no name), `regression` (of logs on causes,
 under every noise), `search` (for causes, and their confirmation), `words` (numbers and findings
 for people), `residuals` (their noise and curves), `extended_model` (and its gain on what was held
-out), `spans` (of heading, as a regression, where the reference limits what is known),
-`noisy_reference` (the diagnosis of such a log), `pipeline` (of a diagnosis, in order), `dwell_fit`
-(of a model and causes to a rate table), `rate_table` (the diagnosis of a rate table), `charts` (in
-pages), `report` (the page).
+out), `noisy_reference` (where the reference limits what is known), `pipeline` (of a diagnosis, in
+order), `dwell_fit` (of a model and causes to a rate table), `rate_table` (the diagnosis of a rate
+table), `charts` (in pages), `report` (the page).
 
 """

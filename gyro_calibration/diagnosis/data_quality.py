@@ -29,11 +29,10 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwell_search import require_output
+from gyro_calibration.calibration.reference_noise import encoder_step
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.expected_output import (
-    bridge_gaps,
     compare_output,
-    encoder_step,
     fit_line,
     identify_unit_factor,
     is_implausible_factor,
@@ -46,6 +45,7 @@ from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import resample_reference, select_reference
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
+    bridge_gaps,
     find_codes,
     find_runs,
     QuantizationCodes,

@@ -23,15 +23,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.course_over_ground import MIN_LOST_SHARE
+from gyro_calibration.calibration.course_over_ground import is_course
 from gyro_calibration.calibration.dwell_search import find_lost_reference
+from gyro_calibration.calibration.reference_noise import (
+    encoder_step,
+    heading_difference,
+    rate_noise_share,
+    step_evenness,
+)
 from gyro_calibration.diagnosis.findings import Reference
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
-from gyro_calibration.logs.quality import find_codes, robust_deviation, white_noise_deviation
+from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.logs.quality import bridge_gaps, robust_deviation, white_noise_deviation
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
-from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
@@ -158,27 +163,6 @@ def compare_output(output: Array, expected: Array | None) -> OutputComparison:
     return OutputComparison(whole, expected, noise, max(noise, scatter))
 
 
-def bridge_gaps(values: Array) -> Array:
-    """Return values with nan interpolated linearly."""
-    known = np.isfinite(values)
-    if known.all():
-        return values
-    places = np.arange(len(values))
-    return np.interp(places, places[known], values[known])
-
-
-def integrate_trapezoidal(time: Array, rate: Array) -> Array:
-    """Return the integral of a rate, from 0 on, shape (n,)."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
-
-
-def integrate_with_curvature(time: Array, rate: Array) -> Array:
-    """Return the integral of a rate, corrected for its curvature between samples, shape (n,)."""
-    slope = np.gradient(rate, time)
-    step = float(np.median(np.diff(time)))
-    return integrate_trapezoidal(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
-
-
 def reference_rate(log: Log) -> Array | None:
     """Return the reference rate, rad/s, nan in gaps; None without a reference."""
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
@@ -253,50 +237,18 @@ def _fit_robust_line(rate: Array, output: Array) -> LineFit | None:
 
 # the kind of the reference
 
-#: Least share of the changes of an encoder heading that are not collinear with the two before; in
-#: a calculated motion, rates are constant or change evenly.
-_MIN_IRREGULAR_SHARE = 0.1
 REFERENCE_KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro',
                    'rest')
-#: Span over which the errors of gyro and reference are compared, s, and least ratio of the errors
-#: of a course to the noise of the gyro, also for a course that is straight between fixes (measured
-#: in drives: 4.6 to 920, all below 8 on straight lines between fixes; simulated odometry with
-#: noise up to 0.02 deg: up to 5).
-_COMPARISON_SPAN, _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 1.0, 8.0, 2.0
 #: Largest noise of an exact reference rate as a share of that of the gyro: it adds 1e-4 to the
-#: variance, which logs of up to 2e8 samples do not show. Largest error of an exact reference
-#: heading as a share of the difference of the headings over a second: a fifth of its variance.
-_MAX_RATE_NOISE_SHARE, _MAX_HEADING_ERROR_SHARE = 0.01, 0.25
+#: variance, which logs of up to 2e8 samples do not show.
+_MAX_RATE_NOISE_SHARE = 0.01
 #: Largest ratio of the error of an encoder heading to its rounding error. The treatment of exact
 #: references takes rounding for white noise; but it is constant at rest, and jumps by up to a step
 #: when the motion resumes. Largest step, rad, at which this causes no false slips (bench: 0.0055
 #: deg, 50 Hz).
 _MAX_ROUNDING_RATIO, _FINE_ENCODER_STEP = 1.5, 0.01 * DEGREE
-#: Largest `_evenness` of a motion for which an encoder is taken as exact.
+#: Largest `step_evenness` of a motion for which an encoder is taken as exact.
 _MAX_EVENNESS = 0.5
-#: Largest number of tones, and the probability of each in noise alone.
-_MAX_TONES, _TONE_CHANCE = 10, 1e-6
-#: Numerical error of a heading, rad.
-_NUMERICAL_ERROR = 1e-9
-#: Neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
-#: random walk, and of -0.5 for its integral, which is as smooth as a motion.
-_WHITE_CORRELATION_RATIO = -0.5
-#: Noise of a reference rate that is not white is detected from so many standard deviations on, in
-#: this quietest share of the log, in blocks of so many samples.
-_DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
-#: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
-#: straight between fixes.
-_MAX_STRAIGHT_RATIO = 0.1
-
-
-def encoder_step(heading: Array) -> float:
-    """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
-    known = heading[np.isfinite(heading)]
-    step = find_codes(known).step
-    change = np.diff(known)
-    changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
-                          for each in (change, np.diff(change, 2)))
-    return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
 
 
 def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
@@ -308,24 +260,13 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
     heading = log.reference_heading
     if heading is None or not np.isfinite(heading).any():
         return Reference('rest', 'the log has no reference')
-    lost = float(find_lost_reference(np.isfinite(heading)).mean())
-    if lost > MIN_LOST_SHARE and _is_course(log):
-        return Reference('course', f'the heading is lost for {100.0 * lost:.2g} % of the log, as '
+    if is_course(log):
+        lost = 100.0 * float(find_lost_reference(np.isfinite(heading)).mean())
+        return Reference('course', f'the heading is lost for {lost:.2g} % of the log, as '
                          'for a course at low speed, and its errors exceed those of the gyro')
     if step := encoder_step(heading):
         return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
     return Reference('motion_capture', 'the heading has no steps')
-
-
-def _is_course(log: Log) -> bool:
-    """Tell whether the errors of a heading are as large as those of a course over ground."""
-    assert log.time is not None and log.output is not None and log.reference_heading is not None
-    walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
-    bent = np.abs(np.diff(log.reference_heading, 2))
-    # a heading between slower fixes lies on straight lines
-    usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = _FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large else _COURSE_NOISE_RATIO
-    return heading_difference(replace(log, reference_rate=None)).total_walk > larger * walk > 0.0
 
 
 def is_reference_limiting(log: Log, reference: Reference) -> bool:
@@ -343,161 +284,9 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     interval = float(np.median(np.diff(log.time)))
     rate_rounding = math.sqrt(2.0) * rounding / interval
     if (rate_rounding > _MAX_RATE_NOISE_SHARE * white_noise_deviation(log.output)
-            and _evenness(log, step) > _MAX_EVENNESS):
+            and step_evenness(log, step) > _MAX_EVENNESS):
         return True
     if not (errors.is_significant or replace(errors, constant_error=rounding).is_significant):
         return False
     return (reference.kind != 'encoder' or step > _FINE_ENCODER_STEP
             or errors.constant_error > _MAX_ROUNDING_RATIO * rounding)
-
-
-def _evenness(log: Log, step: float) -> float:
-    """
-    Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
-
-    Rounding errors are independent from sample to sample if the rate varies. At a constant rate
-    they are a sawtooth, which passes for tones, and at rest they are constant.
-
-    """
-    assert log.time is not None and log.output is not None
-    interval = float(np.median(np.diff(log.time)))
-    # means over a fifth of a second, as the noise of single samples is too large
-    rate = uniform_filter1d(bridge_gaps(log.output),
-                            max(round(0.2 * _COMPARISON_SPAN / interval), 5))
-    count = max(round(2.0 * _COMPARISON_SPAN / interval), _BLOCK_SAMPLES)
-    blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
-    if not len(blocks):
-        return 1.0
-    return float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2))
-
-
-@dataclass(frozen=True)
-class HeadingDifference:
-    """
-    Difference of the headings of gyro and reference over a second.
-
-    Attributes
-    ----------
-    constant_error : standard deviation of the part that does not grow with time, rad: errors of
-        the reference, of stamps, or by vibration of the gyro
-    walk : angle random walk of the rest, at most that of the white noise of the gyro, rad/√s
-    total_walk : angle random walk that is equivalent to the whole difference in a second, rad/√s
-
-    """
-
-    constant_error: float
-    walk: float
-    total_walk: float
-
-    @property
-    def is_significant(self) -> bool:
-        """Tell whether the error is a significant part of the difference over a second."""
-        return (self.constant_error > max(_MAX_HEADING_ERROR_SHARE * self.total_walk,
-                                          _NUMERICAL_ERROR))
-
-
-def heading_difference(log: Log) -> HeadingDifference:
-    """
-    Separate the difference of the headings of gyro and reference by its growth over time.
-
-    Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
-    a lag and a scale factor of the motion are fitted. An error that was smoothed shows at lags
-    beyond its time constant.
-
-    """
-    assert log.time is not None and log.output is not None
-    interval, output = float(np.median(np.diff(log.time))), bridge_gaps(log.output)
-    turned, heading = integrate_with_curvature(log.time, output), log.reference_heading
-    slope = np.gradient(output, log.time)
-    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        rate = bridge_gaps(log.reference_rate)
-        motion = np.column_stack([output, slope, np.ones(len(output))])
-        heading = integrate_with_curvature(log.time, rate + _fit_tones(output - rate, motion))
-    assert heading is not None
-    longest = max(round(_COMPARISON_SPAN / interval), 4)
-    variance = {}
-    for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
-        off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
-                         for each in (heading - turned, turned, output, slope))
-        known = np.isfinite(off)
-        if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
-            columns = np.column_stack(motions)[known]
-            left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
-            variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
-                                       / float(stats.norm.isf(0.05))) ** 2
-    whole = variance.pop(1.0, 0.0)
-    error = max(((each - part * whole) / (6.0 * (1.0 - part)) for part, each in variance.items()),
-                default=0.0)
-    error = max(error, 0.0)
-    white = white_noise_deviation(log.output) * math.sqrt(interval)
-    walk = math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _COMPARISON_SPAN))
-    return HeadingDifference(math.sqrt(error), min(white, walk),
-                             math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
-
-
-def _fit_tones(difference: Array, motion: Array) -> Array:
-    """Return the tones in the difference of gyro and reference rate, shape (n,)."""
-    residual = difference - motion @ np.linalg.lstsq(motion, difference, rcond=None)[0]
-    count, tones = len(residual), np.zeros(len(residual))
-    for _ in range(_MAX_TONES):
-        power = np.abs(np.fft.rfft(residual, 2 * count)) ** 2
-        best = _BLOCK_SAMPLES + int(power[_BLOCK_SAMPLES:-2].argmax())
-        level = float(np.median(power[max(best - 100, 0):best + 100])) / math.log(2.0)
-        if power[best] < level * math.log(count / _TONE_CHANCE):
-            break
-        low, high = (float(np.sqrt(power[best + side])) for side in (-1, 1))
-        place = best + 0.5 * (low - high) / (low - 2.0 * float(np.sqrt(power[best])) + high)
-        phase = math.pi * place / count * np.arange(count)
-        wave = np.column_stack([np.cos(phase), np.sin(phase)])
-        tone = wave @ np.linalg.lstsq(wave, residual, rcond=None)[0]
-        residual, tones = residual - tone, tones + tone
-    return tones
-
-
-def rate_noise_share(log: Log) -> float:
-    """
-    Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
-
-    It is estimated where the reference is quietest. White noise is detected by third differences
-    of alternating sign, other noise by changes from sample to sample that the gyro does not show.
-
-    """
-    assert log.output is not None and log.reference_rate is not None
-    known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
-    rate, output = log.reference_rate[known], log.output[known]
-    if len(rate) < 100 or not np.ptp(rate) > 0.0:
-        return 0.0
-    line = np.polyfit(rate, output, 1)
-    every, rest = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
-    # a quick swing may have no three blocks in a row without a reversal, but as many half as long
-    fast = left = every[:0]
-    for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
-        quiet = _select_quietest(every, block)
-        part = every[:len(quiet)][quiet]
-        if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
-            fast, left = part, rest[:len(quiet)][quiet]
-    if not len(fast):
-        return 0.0
-    energy_of_fast = float(fast @ fast)
-    variance = energy_of_fast / len(fast) / 20.0
-    if not (variance > 0.0
-            and float(fast[1:] @ fast[:-1]) < _WHITE_CORRELATION_RATIO * energy_of_fast):
-        product = -fast * left / 20.0
-        # third differences of white noise are correlated over three samples
-        deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
-        variance = float(np.mean(product)) / line[0]
-        if not variance > _DETECTION_SIGMAS * deviation:
-            return 0.0
-    gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
-    return math.sqrt(variance / max(gyro, 1e-3 * variance))
-
-
-def _select_quietest(fast: Array, block: int) -> Mask:
-    """Tell which third differences of a rate are in the quietest blocks."""
-    blocks = len(fast) // block
-    energy = np.sum(fast[:blocks * block].reshape(blocks, block) ** 2, axis=1)
-    # selected by the blocks on both sides, as a block that is quiet itself may be so by chance;
-    # one with far more energy than these is a motion between two rests
-    sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
-    most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
-    return np.asarray(np.repeat((sides <= most) & (energy <= 3.0 * most), block))

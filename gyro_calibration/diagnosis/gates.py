@@ -32,16 +32,15 @@ from gyro_calibration.calibration.dwell_search import (
     require_output,
 )
 from gyro_calibration.diagnosis.expected_output import (
-    bridge_gaps,
     fit_line,
     identify_unit_factor,
-    integrate_trapezoidal,
     is_implausible_factor,
     model_scale_factor,
     reference_rate,
     UNIT_FACTORS,
 )
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
     Array,
     DataRefused,
@@ -50,7 +49,7 @@ from gyro_calibration.logs.log import (
     NORMAL_QUANTILE_975,
     refuse_wrapped,
 )
-from gyro_calibration.logs.quality import find_codes, white_noise_deviation
+from gyro_calibration.logs.quality import bridge_gaps, find_codes, white_noise_deviation
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
@@ -393,7 +392,7 @@ def reference_angle(log: Log) -> Array:
     if not np.isfinite(values).any():
         return np.zeros(len(values))
     return (bridge_gaps(values) if log.reference_rate is None
-            else integrate_trapezoidal(log.time, bridge_gaps(values)))
+            else integrate(log.time, bridge_gaps(values)))
 
 
 def compare_headings(log: Log, reference: Array) -> list[Agreement]:
@@ -404,7 +403,7 @@ def compare_headings(log: Log, reference: Array) -> list[Agreement]:
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 2 * _MIN_SPANS or np.isfinite(log.output).sum() < 2 * _MIN_SPANS:
         return []
-    turned = integrate_trapezoidal(log.time, bridge_gaps(log.output))
+    turned = integrate(log.time, bridge_gaps(log.output))
     span = max((log.time[-1] - log.time[0]) / _SPAN_COUNT,
                4.0 * float(np.median(np.diff(log.time))))
     number = np.floor((log.time[known] - log.time[0]) / span)

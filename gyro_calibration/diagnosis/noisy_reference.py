@@ -27,6 +27,19 @@ from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
+from gyro_calibration.calibration.heading_regression import (
+    BASE_VALUES,
+    CauseTerm,
+    design_matrix,
+    fit_spans,
+    HEADING_TREATMENT,
+    lay_out_spans,
+    MIN_STRETCHES,
+    SpanFit,
+    Spans,
+    whiten_regression,
+    WhitenedRegression,
+)
 from gyro_calibration.diagnosis.candidates import MIN_CHANNEL_RANGE, user_effects
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, mark_suspected
 from gyro_calibration.diagnosis.data_quality import inspect_record
@@ -53,19 +66,6 @@ from gyro_calibration.diagnosis.findings import (
     Trace,
 )
 from gyro_calibration.diagnosis.search import MIN_PREDICTION_SIGMAS, prediction_sigmas
-from gyro_calibration.diagnosis.spans import (
-    BASE_VALUES,
-    CauseTerm,
-    design_matrix,
-    fit_spans,
-    HEADING_TREATMENT,
-    lay_out_spans,
-    MIN_STRETCHES,
-    SpanFit,
-    Spans,
-    whiten_regression,
-    WhitenedRegression,
-)
 from gyro_calibration.diagnosis.steps import CHECKS_STEP, OnPart, OnProgress, ProgressSteps
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975

@@ -25,8 +25,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 import math
 
-from gyro_calibration.diagnosis.expected_output import integrate_trapezoidal
 from gyro_calibration.diagnosis.gates import MIN_SAMPLES, resample_reference, select_reference
+from gyro_calibration.heading.integration import integrate as integrate_trapezoidal
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
 from gyro_calibration.logs.quality import white_noise_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid

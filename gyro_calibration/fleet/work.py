@@ -40,7 +40,7 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.diagnosis.data_quality import inspect_record
-from gyro_calibration.diagnosis.expected_output import bridge_gaps, is_implausible_factor
+from gyro_calibration.diagnosis.expected_output import is_implausible_factor
 from gyro_calibration.diagnosis.gates import (
     check_gates,
     is_at_rest,
@@ -60,7 +60,7 @@ from gyro_calibration.files import (
 from gyro_calibration.fleet.table import describe_log, FleetLog
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, Log, QUANTITIES, read_log
-from gyro_calibration.logs.quality import white_noise_deviation
+from gyro_calibration.logs.quality import bridge_gaps, white_noise_deviation
 from gyro_calibration.logs.recording import read_recording
 from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.effects import BIAS

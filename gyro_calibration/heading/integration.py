@@ -104,6 +104,13 @@ def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     return heading
 
 
+def integrate_with_curvature(time: Array, rate: Array) -> Array:
+    """Return the integral of a rate, corrected for its curvature between samples, shape (n,)."""
+    slope = np.gradient(rate, time)
+    step = float(np.median(np.diff(time)))
+    return integrate(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
+
+
 def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     """Return what `ThresholdFilter` makes of a whole log, rad/s, shape (n,)."""
     if not settings.rate:

@@ -29,6 +29,15 @@ def robust_deviation(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values)))
 
 
+def bridge_gaps(values: Array) -> Array:
+    """Return values with nan interpolated linearly."""
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    places = np.arange(len(values))
+    return np.interp(places, places[known], values[known])
+
+
 def white_noise_deviation(values: Array, order: int = 3) -> float:
     """
     Return the standard deviation of the white part of a signal, by its differences.

@@ -14,6 +14,7 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ def test_a_course_that_is_lost_for_half_of_the_drive_is_fitted():
 def test_a_drive_without_turns_leaves_the_scale_to_the_prior():
     consumer, fibre = (calibrate_encoder(drive(3, turning=0.0), technology=name).fit
                        for name in ('mems', 'closed_loop_fog'))
-    for fit, largest in ((consumer, 0.02), (fibre, 0.001)):
+    for fit, largest in ((consumer, 0.01), (fibre, 0.001)):
         assert abs(fit.scale_factor_error) < 0.5 * largest
         assert math.sqrt(fit.covariance[0, 0]) < 1.1 * largest
     assert consumer.covariance[0, 0] > 10.0 * fibre.covariance[0, 0]
@@ -93,6 +94,21 @@ def test_recorded_drives_are_answered(data, name):
     bias = {'wid_03': 0.0, 'wid_07': 0.0, 'rc_car_j_unit3': -0.20 * DEGREE}[name]
     assert fit.bias == pytest.approx(bias, abs=0.03 * DEGREE)
     assert abs(fit.scale_factor_error) < 0.02
+
+
+@pytest.mark.parametrize('name', ['wid_03', 'rc_car_j_unit3'])
+def test_fit_and_diagnose_give_the_same_values_of_a_recorded_drive(data, name):
+    log = read_log(data / 'wheeled_drives' / f'{name}.csv.gz')
+    fit, found = calibrate_encoder(log).fit, diagnose([log], np.random.default_rng(0))
+    established = {each.effect: each for each in found.findings if each.status == 'established'}
+    assert set(established) <= {'time_offset', 'quantization'}
+    values = {term.effect.name: term.values for term in found.model.terms}
+    assert values == {'bias': pytest.approx([fit.bias], abs=1e-6 * DEGREE),
+                      'scale_factor_error': pytest.approx([fit.scale_factor_error], abs=1e-8)}
+    if name == 'rc_car_j_unit3':
+        delay = established['time_offset'].parameters['time_offset']
+        assert delay.estimate == pytest.approx(fit.time_offset, abs=1e-6)
+        assert delay.deviation == pytest.approx(fit.time_offset_deviation, rel=1e-6)
 
 
 @pytest.mark.evidence

@@ -13,16 +13,15 @@
 from dataclasses import replace
 
 from diagnosed import judge_findings, log_of
+from gyro_calibration.calibration.heading_regression import CauseTerm, fit_spans, lay_out_spans
+from gyro_calibration.calibration.reference_noise import heading_difference, rate_noise_share
 from gyro_calibration.diagnosis.expected_output import (
     classify_reference,
-    heading_difference,
     is_reference_limiting,
-    rate_noise_share,
 )
 from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
-from gyro_calibration.diagnosis.spans import CauseTerm, fit_spans, lay_out_spans
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.logs.recording import interpolate_with_gaps

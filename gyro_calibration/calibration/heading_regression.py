@@ -33,42 +33,51 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from gyro_calibration.calibration.course_over_ground import (
-    burst_variance,
-    COSINE_COUNT,
-    RANDOM_WALK_RANGE,
-    SMOOTHING_DEVIATION,
-)
-from gyro_calibration.calibration.encoder import MAX_TIME_OFFSET
 from gyro_calibration.calibration.likelihood import robust_residual
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns,
+    carried_shares,
     fit_noise_grid,
     GridFit,
     heading_noise,
     HierarchicalPrior,
     SharedNoise,
 )
-from gyro_calibration.diagnosis.expected_output import (
-    bridge_gaps,
+from gyro_calibration.calibration.reference_noise import (
     encoder_step,
     heading_difference,
-    integrate_trapezoidal,
-    integrate_with_curvature,
     rate_noise_share,
 )
+from gyro_calibration.heading.integration import integrate, integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
-from gyro_calibration.logs.quality import robust_deviation, white_noise_deviation
+from gyro_calibration.logs.quality import bridge_gaps, robust_deviation, white_noise_deviation
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solveh_banded
 from scipy.ndimage import binary_erosion, median_filter
 from scipy.stats import t as student
 
+#: Largest standard deviations of scale factor error and bias, rad/s, by technology.
+TECHNOLOGY_PRIORS = {
+    'mems': (0.01, 1.0 * DEGREE),
+    'open_loop_fog': (0.005, 0.02 * DEGREE),
+    'closed_loop_fog': (0.001, 0.002 * DEGREE),
+}
+#: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
+MAX_ENCODER_OFFSET = 0.25
+#: Typical duration of a burst of errors of a course, s. The few errors within it hardly determine
+#: its variance: the errors of a course have Student's distribution with so many degrees of
+#: freedom, plus one for each observed error.
+_BURST_DURATION, _STUDENT_DOF = 5.0, 4.0
+#: The random walk of the bias that is possible beside a course, rad/s/√s, and its cosines.
+_COURSE_RANDOM_WALK_RANGE, _COURSE_COSINE_COUNT = (1e-7, 1e-4), 8
+#: Prior standard deviation of the smoothing of a course, s².
+_SMOOTHING_DEVIATION = 0.1
+#: Correlations of the errors of a course over a span that are possible.
+_COURSE_CORRELATIONS = (0.0, 0.2, 0.4, 0.6, 0.8)
 #: Names of the values that are always fitted.
 BASE_VALUES = ('scale_factor_error', 'bias', 'time_offset')
 #: Least effective number of stretches of an established value.
@@ -108,8 +117,8 @@ class ReferenceTreatment:
     errs_as_heading: bool
 
 
-#: Data-sheet limits of gyros for vehicles: scale factor 1 %, bias 1 deg/s; and delays of 1 s.
-COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 15.0, False, True)
+COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0), (0.1, 1.0),
+                                      15.0, False, True)
 #: A reference with errors of an instrument.
 HEADING_TREATMENT = ReferenceTreatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), 5.0, True,
                                        True)
@@ -117,7 +126,7 @@ _TREATMENTS = {
     'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False),
     # on the host of the gyro: small delays, as a swing agrees again a period later
     'encoder': replace(HEADING_TREATMENT,
-                       prior=(*HEADING_TREATMENT.prior[:2], MAX_TIME_OFFSET / 1.5)),
+                       prior=(*HEADING_TREATMENT.prior[:2], MAX_ENCODER_OFFSET / 1.5)),
     'motion_capture': HEADING_TREATMENT, 'gyro': HEADING_TREATMENT}
 
 
@@ -253,39 +262,20 @@ class Spans:
         at = self.log.time - moved.delay
         heading_change: Array = self.heading - moved.point_means(turned)
         if self.treatment.is_fine:
-            heading_change = self._difference_of_gyro(heading_change)
             steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
             rate = rate + (np.diff(heading_change) / np.diff(self.time))[steps]
         return replace(
             moved, channels=replace(self.channels.with_rate(rate, self.log.output),
                                     heading=turned + np.interp(at, self.time, heading_change)))
 
-    def _difference_of_gyro(self, heading_change: Array) -> Array:
-        """
-        Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
-
-        The errors of the most likely heading given both are independent of the difference of both.
-        Columns computed from it are not correlated with the noise of the observations; those of
-        the gyro alone are, which matters if two columns are nearly the same.
-
-        """
-        if not self.treatment.errs_as_heading:
-            return heading_change / (1.0 + self.reference_noise_ratio ** 2)
-        walk: Array = self.walk_bounds[0] ** 2 * np.diff(self.time)
-        second = robust_deviation(np.diff(heading_change, 2)) ** 2
-        stiffness = max(second / 6.0 - float(np.median(walk)) / 3.0, 0.0) / walk
-        banded = np.zeros((2, len(heading_change)))
-        banded[1] = 1.0 + np.append(stiffness, 0.0) + np.append(0.0, stiffness)
-        banded[0, 1:] = -stiffness
-        return np.asarray(solveh_banded(banded, heading_change))
-
     def bias_wander(self) -> tuple[Array, list[SharedNoise]]:
         """Return the columns of a wandering bias, and the parts of its noise."""
         least, most = self.walk_bounds
         flicker, walk = ((low * least, high * most)
                          for low, high in (_FLICKER_RANGE, _RANDOM_WALK_RANGE))
-        waves, parts = (bias_wander_columns(self.time, flicker, walk) if self.treatment.is_fine
-                        else bias_wander_columns(self.time, None, RANDOM_WALK_RANGE, COSINE_COUNT))
+        waves, parts = bias_wander_columns(self.time, *(
+            (flicker, walk) if self.treatment.is_fine
+            else (None, _COURSE_RANDOM_WALK_RANGE, _COURSE_COSINE_COUNT)))
         assert self.log.time is not None
         begin, end = self.time[0], self.time[-1]
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
@@ -296,12 +286,12 @@ class Spans:
             return waves, parts
         # a smoothed course errs in proportion to the acceleration, by less than this, s²
         smoothing = SharedNoise('smoothing', np.append(np.zeros(waves.shape[1]), 1.0),
-                                (SMOOTHING_DEVIATION, SMOOTHING_DEVIATION))
-        return (np.column_stack([waves, self._acceleration_changes()]),
+                                (_SMOOTHING_DEVIATION, _SMOOTHING_DEVIATION))
+        return (np.column_stack([waves, self.acceleration_changes()]),
                 [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
                  smoothing])
 
-    def _acceleration_changes(self) -> Array:
+    def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
         assert self.log.time is not None and self.log.output is not None
         turned, half = integrate_with_curvature(self.log.time, self.log.output), 0.5
@@ -366,7 +356,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
         place = np.arange(len(known))
     count = np.bincount(place)
     channels = replace(channels_from_log(log), rate=output, time=time,
-                       heading=integrate_trapezoidal(time, output))
+                       heading=integrate(time, output))
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count,
                  _find_rests(time, output, known), treatment,
@@ -448,19 +438,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
     count = len(spans.time) - 1
-
-    def disagreement(delay: float) -> float:
-        """Return the robust difference of gyro and reference at a delay, rad."""
-        moved = replace(spans, delay=delay)
-        if not spans.treatment.is_fine:
-            line = np.column_stack([np.ones(count + 1), spans.time])
-            error = np.append(0.0, np.cumsum(moved.observed[:count]))
-            return float(np.mean(np.abs(robust_residual(line, error, 3))))
-        left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
-        return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
-
-    delayed = replace(spans, delay=spans.delay or min(
-        _TRIAL_DELAYS[np.abs(_TRIAL_DELAYS) <= 1.5 * prior[2]].tolist(), key=disagreement))
+    delayed = replace(spans, delay=spans.delay or find_delay(spans))
     point_variances: Array = np.ones(count + 1)
     for _ in range(2):
         design = design_matrix(delayed, causes)
@@ -469,7 +447,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
         else:
             values, error = _fit_headings(design[:count], delayed.observed[:count],
                                           point_variances, free)
-            point_variances = burst_variance(delayed.time, error)
+            point_variances = _burst_variance(delayed.time, error)
         delayed = delayed.with_corrected_rate(values)
         if spans.treatment.is_fine:
             values[2] = 0.0
@@ -484,6 +462,24 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     fit = _fit_with_noise(delayed, causes, point_variances, prior * [1e-6, 1.0, 1.0])
     fit.covariance[0, 0] = prior[0] ** 2
     return fit
+
+
+def find_delay(spans: Spans) -> float:
+    """Return the trial delay of the best agreement of gyro and reference, s."""
+    count, prior = len(spans.time) - 1, np.array(spans.treatment.prior)
+
+    def disagreement(delay: float) -> float:
+        """Return the robust difference of gyro and reference at a delay, rad."""
+        moved = replace(spans, delay=delay)
+        if not spans.treatment.is_fine:
+            line = np.column_stack([np.ones(count + 1), spans.time])
+            error = np.append(0.0, np.cumsum(moved.observed[:count]))
+            return float(np.mean(np.abs(robust_residual(line, error, 3))))
+        left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
+        return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
+
+    return float(min(_TRIAL_DELAYS[np.abs(_TRIAL_DELAYS) <= 1.5 * prior[2]].tolist(),
+                     key=disagreement))
 
 
 def design_matrix(spans: Spans, causes: Sequence[CauseTerm]) -> Array:
@@ -533,6 +529,14 @@ def _fit_headings(design: Array, observed: Array, point_variances: Array,
     return values[:-1], error
 
 
+def _burst_variance(time: Array, error: Array) -> Array:
+    """Return the variance of each point of a course relative to the usual one."""
+    around = np.abs(time[:, None] - time) <= 0.5 * _BURST_DURATION
+    squares, count = around @ error ** 2, around.sum(axis=1)
+    usual = max(float(np.median(squares / count)), 1e-12)
+    return np.asarray((_STUDENT_DOF + squares / usual) / (_STUDENT_DOF + count))
+
+
 def _point_variances(left: Array) -> Array:
     """Return the relative variance of each point, larger for outliers, at most 100."""
     point = np.concatenate([[0.0], np.cumsum(left)])
@@ -548,30 +552,35 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: 
     """Fit by the restricted likelihood over a grid of noise."""
     columns, (least, most) = design_matrix(spans, causes), spans.walk_bounds
     low, high = spans.treatment.walk_range
-    walk, *errors = heading_noise(
-        spans.time, spans.point_means(np.asarray(spans.channels.rate)), point_variances,
-        angle_random_walk=(low * least, high * most))
+    rates = spans.point_means(np.asarray(spans.channels.rate))
     assert spans.log.time is not None
     durations = np.diff(spans.log.time[spans.rests])[:, 0]
-    parts = [replace(walk, diagonal=np.append(walk.diagonal, durations))]
-    if spans.treatment.errs_as_heading:
-        more = np.zeros(len(durations))
-        parts += [replace(part, diagonal=np.append(part.diagonal, more),
-                          off_diagonal=np.append(np.asarray(part.off_diagonal), more))
-                  for part in errors]
     deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
-    waves, shared = spans.bias_wander()
+    observed, (waves, shared) = spans.observed, spans.bias_wander()
+
+    def fit_with(correlation: Array | None = None, **options: Any) -> GridFit:
+        parts = heading_noise(spans.time, rates, point_variances, correlation=correlation,
+                              angle_random_walk=(low * least, high * most))
+        parts = [replace(part, diagonal=np.append(part.diagonal, of_rests),
+                         off_diagonal=None if part.off_diagonal is None
+                         else np.append(part.off_diagonal, 0.0 * durations))
+                 for part, of_rests in zip(parts, (durations, 0.0 * durations, 0.0 * durations))]
+        return fit_noise_grid(
+            observed, columns, parts if spans.treatment.errs_as_heading else parts[:1], waves,
+            shared, prior_deviation=deviation, carried=None if correlation is None
+            else np.append(carried_shares(correlation), 0.0 * durations), **options)
+
     if spans.treatment.is_fine:
-        fit = fit_noise_grid(spans.observed, columns, parts, waves, shared,
-                             prior_deviation=deviation)
+        fit = fit_with()
     else:
+        correlations = (each ** (np.diff(spans.time) / spans.treatment.min_span)
+                        for each in _COURSE_CORRELATIONS)
+        likeliest = max(correlations, key=lambda each: fit_with(each).log_evidence)
         # what a drive of minutes does not determine is drawn to 0, and the mean bias of the drive
         # is not that of the gyro
-        sizes = [HierarchicalPrior(name, place, (1e-2 * size, size))
-                 for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2].tolist()))]
-        fit = fit_noise_grid(spans.observed, columns, parts, waves, shared,
-                             prior_deviation=deviation, wandering_value=1,
-                             hierarchical_priors=sizes)
+        fit = fit_with(likeliest, wandering_value=1, hierarchical_priors=[
+            HierarchicalPrior(name, place, (1e-2 * size, size))
+            for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2].tolist()))])
     values = fit.values.copy()
     values[2] += spans.delay
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),

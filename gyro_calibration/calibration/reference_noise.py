@@ -1,0 +1,204 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""The errors of a reference: noise of its heading or rate beside that of the gyro, and steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.heading.integration import integrate_with_curvature
+from gyro_calibration.logs.log import Array, Log, Mask
+from gyro_calibration.logs.quality import bridge_gaps, find_codes, white_noise_deviation
+import numpy as np
+from scipy import stats
+from scipy.ndimage import uniform_filter1d
+
+#: Least share of the changes of an encoder heading that are not collinear with the two before; in
+#: a calculated motion, rates are constant or change evenly.
+_MIN_IRREGULAR_SHARE = 0.1
+#: Span over which the errors of gyro and reference are compared, s.
+_COMPARISON_SPAN = 1.0
+#: Largest error of an exact reference heading as a share of the difference of the headings over a
+#: second: a fifth of its variance.
+_MAX_HEADING_ERROR_SHARE = 0.25
+#: Largest number of tones, and the probability of each in noise alone.
+_MAX_TONES, _TONE_CHANCE = 10, 1e-6
+#: Numerical error of a heading, rad.
+_NUMERICAL_ERROR = 1e-9
+#: Neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
+#: random walk, and of -0.5 for its integral, which is as smooth as a motion.
+_WHITE_CORRELATION_RATIO = -0.5
+#: Noise of a reference rate that is not white is detected from so many standard deviations on, in
+#: this quietest share of the log, in blocks of so many samples.
+_DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
+
+
+def encoder_step(heading: Array) -> float:
+    """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
+    known = heading[np.isfinite(heading)]
+    step = find_codes(known).step
+    change = np.diff(known)
+    changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
+                          for each in (change, np.diff(change, 2)))
+    return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
+
+
+def step_evenness(log: Log, step: float) -> float:
+    """
+    Return how evenly a shaft moves through the steps of its encoder, 0 to 1.
+
+    Rounding errors are independent from sample to sample if the rate varies. At a constant rate
+    they are a sawtooth, which passes for tones, and at rest they are constant.
+
+    """
+    assert log.time is not None and log.output is not None
+    interval = float(np.median(np.diff(log.time)))
+    # means over a fifth of a second, as the noise of single samples is too large
+    rate = uniform_filter1d(bridge_gaps(log.output),
+                            max(round(0.2 * _COMPARISON_SPAN / interval), 5))
+    count = max(round(2.0 * _COMPARISON_SPAN / interval), _BLOCK_SAMPLES)
+    blocks = np.exp(2j * math.pi * interval / step * rate[:len(rate) // count * count])
+    if not len(blocks):
+        return 1.0
+    return float(np.mean(np.abs(blocks.reshape(-1, count).mean(axis=1)) ** 2))
+
+
+@dataclass(frozen=True)
+class HeadingDifference:
+    """
+    Difference of the headings of gyro and reference over a second.
+
+    Attributes
+    ----------
+    constant_error : standard deviation of the part that does not grow with time, rad: errors of
+        the reference, of stamps, or by vibration of the gyro
+    walk : angle random walk of the rest, at most that of the white noise of the gyro, rad/√s
+    total_walk : angle random walk that is equivalent to the whole difference in a second, rad/√s
+
+    """
+
+    constant_error: float
+    walk: float
+    total_walk: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Tell whether the error is a significant part of the difference over a second."""
+        return (self.constant_error > max(_MAX_HEADING_ERROR_SHARE * self.total_walk,
+                                          _NUMERICAL_ERROR))
+
+
+def heading_difference(log: Log) -> HeadingDifference:
+    """
+    Separate the difference of the headings of gyro and reference by its growth over time.
+
+    Its second differences over a lag have the variance ``6 error² + 2 walk² lag`` after a delay,
+    a lag and a scale factor of the motion are fitted. An error that was smoothed shows at lags
+    beyond its time constant.
+
+    """
+    assert log.time is not None and log.output is not None
+    interval, output = float(np.median(np.diff(log.time))), bridge_gaps(log.output)
+    turned, heading = integrate_with_curvature(log.time, output), log.reference_heading
+    slope = np.gradient(output, log.time)
+    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
+        rate = bridge_gaps(log.reference_rate)
+        motion = np.column_stack([output, slope, np.ones(len(output))])
+        heading = integrate_with_curvature(log.time, rate + _fit_tones(output - rate, motion))
+    assert heading is not None
+    longest = max(round(_COMPARISON_SPAN / interval), 4)
+    variance = {}
+    for lag in [*(2 ** np.arange(int(math.log2(longest // 4)) + 1)).tolist(), longest]:
+        off, *motions = (each[2 * lag:] - 2.0 * each[lag:-lag] + each[:-2 * lag]
+                         for each in (heading - turned, turned, output, slope))
+        known = np.isfinite(off)
+        if np.count_nonzero(known) > 2 * _BLOCK_SAMPLES:
+            columns = np.column_stack(motions)[known]
+            left = off[known] - columns @ np.linalg.lstsq(columns, off[known], rcond=None)[0]
+            variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
+                                       / float(stats.norm.isf(0.05))) ** 2
+    whole = variance.pop(1.0, 0.0)
+    error = max(((each - part * whole) / (6.0 * (1.0 - part)) for part, each in variance.items()),
+                default=0.0)
+    error = max(error, 0.0)
+    white = white_noise_deviation(log.output) * math.sqrt(interval)
+    walk = math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _COMPARISON_SPAN))
+    return HeadingDifference(math.sqrt(error), min(white, walk),
+                             math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
+
+
+def _fit_tones(difference: Array, motion: Array) -> Array:
+    """Return the tones in the difference of gyro and reference rate, shape (n,)."""
+    residual = difference - motion @ np.linalg.lstsq(motion, difference, rcond=None)[0]
+    count, tones = len(residual), np.zeros(len(residual))
+    for _ in range(_MAX_TONES):
+        power = np.abs(np.fft.rfft(residual, 2 * count)) ** 2
+        best = _BLOCK_SAMPLES + int(power[_BLOCK_SAMPLES:-2].argmax())
+        level = float(np.median(power[max(best - 100, 0):best + 100])) / math.log(2.0)
+        if power[best] < level * math.log(count / _TONE_CHANCE):
+            break
+        low, high = (float(np.sqrt(power[best + side])) for side in (-1, 1))
+        place = best + 0.5 * (low - high) / (low - 2.0 * float(np.sqrt(power[best])) + high)
+        phase = math.pi * place / count * np.arange(count)
+        wave = np.column_stack([np.cos(phase), np.sin(phase)])
+        tone = wave @ np.linalg.lstsq(wave, residual, rcond=None)[0]
+        residual, tones = residual - tone, tones + tone
+    return tones
+
+
+def rate_noise_share(log: Log) -> float:
+    """
+    Return the ratio of the noise of a reference rate to that of the gyro; 0 if none is detected.
+
+    It is estimated where the reference is quietest. White noise is detected by third differences
+    of alternating sign, other noise by changes from sample to sample that the gyro does not show.
+
+    """
+    assert log.output is not None and log.reference_rate is not None
+    known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
+    rate, output = log.reference_rate[known], log.output[known]
+    if len(rate) < 100 or not np.ptp(rate) > 0.0:
+        return 0.0
+    line = np.polyfit(rate, output, 1)
+    every, rest = np.diff(rate, 3), np.diff(output - np.polyval(line, rate), 3)
+    # a quick swing may have no three blocks in a row without a reversal, but as many half as long
+    fast = left = every[:0]
+    for block in (_BLOCK_SAMPLES, _BLOCK_SAMPLES // 2):
+        quiet = _select_quietest(every, block)
+        part = every[:len(quiet)][quiet]
+        if len(part) and not (len(fast) and np.mean(fast ** 2) <= 3.0 * np.mean(part ** 2)):
+            fast, left = part, rest[:len(quiet)][quiet]
+    if not len(fast):
+        return 0.0
+    energy_of_fast = float(fast @ fast)
+    variance = energy_of_fast / len(fast) / 20.0
+    if not (variance > 0.0
+            and float(fast[1:] @ fast[:-1]) < _WHITE_CORRELATION_RATIO * energy_of_fast):
+        product = -fast * left / 20.0
+        # third differences of white noise are correlated over three samples
+        deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
+        variance = float(np.mean(product)) / line[0]
+        if not variance > _DETECTION_SIGMAS * deviation:
+            return 0.0
+    gyro = float(np.mean(left ** 2)) / 20.0 - variance * line[0] ** 2
+    return math.sqrt(variance / max(gyro, 1e-3 * variance))
+
+
+def _select_quietest(fast: Array, block: int) -> Mask:
+    """Tell which third differences of a rate are in the quietest blocks."""
+    blocks = len(fast) // block
+    energy = np.sum(fast[:blocks * block].reshape(blocks, block) ** 2, axis=1)
+    # selected by the blocks on both sides, as a block that is quiet itself may be so by chance;
+    # one with far more energy than these is a motion between two rests
+    sides = np.maximum(np.roll(energy, 1), np.roll(energy, -1))
+    most = np.quantile(sides, min(max(_QUIET_SHARE, 8.0 / blocks), 1.0))
+    return np.asarray(np.repeat((sides <= most) & (energy <= 3.0 * most), block))
