@@ -30,13 +30,11 @@ from gyro_calibration.calibration.heading_regression import (
     find_delay,
     fit_spans,
     lay_out_spans,
-    Spans,
     TECHNOLOGY_PRIORS,
 )
 from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.reference_noise import heading_difference
-from gyro_calibration.heading.integration import integrate_with_curvature
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     quantization_step,
     robust_deviation,
@@ -54,11 +52,11 @@ _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
+#: Largest ratio of the error of an encoder heading to its rounding error.
+MAX_ROUNDING_RATIO = 1.5
 #: Minimum number of spans; fewer do not determine the noise of a course.
 MIN_SPANS = 10
-#: Length of the stretches in which gyro and course are compared, s.
-STRETCH_DURATION = 15.0
-#: Largest deviation of the course from a gyro that follows it, with any side slip, rad.
+#: Largest deviation of the turn of a course in a span from that of a gyro that follows it, rad.
 MAX_FOLLOWED_RESIDUAL = 3.0 * DEGREE
 
 
@@ -77,13 +75,22 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
 
     """
     spans = lay_out_spans(log, 'course', np.array(TECHNOLOGY_PRIORS[technology]))
+    length = spans.treatment.min_span
     if len(spans.time) < MIN_SPANS:
-        length = spans.treatment.min_span
         raise DataRefused(f'the course is known for {len(spans.time) * length:.0f} s, wanted at '
                           f'least {MIN_SPANS * length:.0f} s: drive for longer, faster than a '
                           'walk')
     fit = fit_spans(spans)
-    _refuse_other_motion(fit.spans)
+    turned = np.diff(spans.heading)
+    # a bias is the same in each span
+    residual, variation = (robust_deviation(each - np.median(each))
+                           for each in (fit.spans.observed[:len(turned)], turned))
+    if residual > max(MAX_FOLLOWED_RESIDUAL, 0.5 * variation):
+        raise DataRefused(f'from span to span of {length:.0f} s the course turns by '
+                          f'{variation / DEGREE:.1f} deg, and less the gyro by '
+                          f'{residual / DEGREE:.1f} deg (robust standard deviations): the gyro '
+                          'does not follow the course. Check that both belong to one drive, and '
+                          'check axis, sign, units, and that the gyro responds')
     # intervals of a normal distribution, as wide as those of Student's
     deviations = np.array([fit.half_width(place) for place in range(3)]) / NORMAL_QUANTILE_975
     widening = deviations / np.sqrt(np.diag(fit.covariance))
@@ -96,14 +103,19 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
 def is_course(log: Log) -> bool:
     """Tell whether a heading is lost at times, as a course at low speed, and errs like one."""
     assert log.time is not None and log.output is not None and log.reference_heading is not None
-    if find_lost_reference(np.isfinite(log.reference_heading)).mean() <= MIN_LOST_SHARE:
+    known = np.isfinite(log.reference_heading)
+    if find_lost_reference(known).mean() <= MIN_LOST_SHARE:
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))
     # a heading between slower fixes lies on straight lines
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
     larger = _FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large else _COURSE_NOISE_RATIO
-    return heading_difference(replace(log, reference_rate=None)).total_walk > larger * walk > 0.0
+    # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
+    # the variance
+    rounding = quantization_step(log.reference_heading[known]) / 2.0
+    return heading_difference(replace(log, reference_rate=None)).total_walk > max(
+        larger * walk, MAX_ROUNDING_RATIO * rounding) > 0.0
 
 
 def is_noisy(log: Log) -> bool:
@@ -120,31 +132,3 @@ def is_noisy(log: Log) -> bool:
     columns = np.column_stack([spans.base_columns(), spans.acceleration_changes()])[:count]
     residual = robust_residual(columns, spans.observed[:count], 10)
     return robust_deviation(residual) > math.sqrt(2.0) * MIN_COURSE_NOISE
-
-
-def _refuse_other_motion(spans: Spans) -> None:
-    """Refuse a gyro that explains less than half of the variation of the course."""
-    assert spans.log.output is not None and spans.log.time is not None
-    turned = spans.point_means(integrate_with_curvature(spans.log.time, spans.log.output))
-    residual_variation, course_variation = (
-        _median_line_deviation(spans.time, each)
-        for each in (spans.heading - turned, spans.heading))
-    if residual_variation > max(MAX_FOLLOWED_RESIDUAL, 0.5 * course_variation):
-        raise DataRefused(f'within {STRETCH_DURATION:.0f} s the course varies by '
-                          f'{course_variation / DEGREE:.1f} deg, and less the gyro by '
-                          f'{residual_variation / DEGREE:.1f} deg (medians): the gyro does not '
-                          'follow the course. Check that both belong to one drive, and check '
-                          'axis, sign, units, and that the gyro responds')
-
-
-def _median_line_deviation(time: Array, heading: Array) -> float:
-    """Return the median deviation of a heading from a line within stretches, rad."""
-    number = np.floor((time - time[0]) / STRETCH_DURATION).astype(np.intp)
-    deviations = [np.empty(0)]
-    for each in np.unique(number):
-        inside = number == each
-        if inside.sum() > 3:
-            line = np.polyfit(time[inside], heading[inside], 1)
-            deviations.append(np.abs(heading[inside] - np.polyval(line, time[inside])))
-    joined = np.concatenate(deviations)
-    return float(np.median(joined)) if len(joined) else 0.0

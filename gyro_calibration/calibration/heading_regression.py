@@ -224,18 +224,16 @@ class Spans:
 
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
-        rate = np.asarray(self.channels.rate)
-        return np.column_stack([-self.span_integrals(rate),
-                                -self.span_integrals(np.ones_like(rate)), self._rate_changes()])
-
-    def _rate_changes(self) -> Array:
-        """Return the change of the rate, as a mean over two samples, shape (n + r,)."""
         time, output = np.asarray(self.log.time), np.asarray(self.log.output)
+        rate = np.asarray(self.channels.rate)
         turned = (np.asarray(self.channels.heading) if self.treatment.is_fine
                   else integrate_with_curvature(time, output))
+        # the rate as a mean over two samples
         half = float(np.median(np.diff(time)))
         forth, back = (np.interp(time + way, time, turned) for way in (half, -half))
-        return self.span_changes((forth - back) / (2.0 * half))
+        return np.column_stack([-self.span_integrals(rate),
+                                -self.span_integrals(np.ones_like(rate)),
+                                self.span_changes((forth - back) / (2.0 * half))])
 
     def cause_columns(self, cause: CauseTerm) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""

@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.course_over_ground import is_course
+from gyro_calibration.calibration.course_over_ground import is_course, MAX_ROUNDING_RATIO
 from gyro_calibration.calibration.dwell_search import find_lost_reference
 from gyro_calibration.calibration.reference_noise import (
     encoder_step,
@@ -242,11 +242,10 @@ REFERENCE_KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odome
 #: Largest noise of an exact reference rate as a share of that of the gyro: it adds 1e-4 to the
 #: variance, which logs of up to 2e8 samples do not show.
 _MAX_RATE_NOISE_SHARE = 0.01
-#: Largest ratio of the error of an encoder heading to its rounding error. The treatment of exact
-#: references takes rounding for white noise; but it is constant at rest, and jumps by up to a step
-#: when the motion resumes. Largest step, rad, at which this causes no false slips (bench: 0.0055
-#: deg, 50 Hz).
-_MAX_ROUNDING_RATIO, _FINE_ENCODER_STEP = 1.5, 0.01 * DEGREE
+#: The treatment of exact references takes the rounding of an encoder for white noise; but it is
+#: constant at rest, and jumps by up to a step when the motion resumes. Largest step, rad, at which
+#: this causes no false slips (bench: 0.0055 deg, 50 Hz).
+_FINE_ENCODER_STEP = 0.01 * DEGREE
 #: Largest `step_evenness` of a motion for which an encoder is taken as exact.
 _MAX_EVENNESS = 0.5
 
@@ -289,4 +288,4 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     if not (errors.is_significant or replace(errors, constant_error=rounding).is_significant):
         return False
     return (reference.kind != 'encoder' or step > _FINE_ENCODER_STEP
-            or errors.constant_error > _MAX_ROUNDING_RATIO * rounding)
+            or errors.constant_error > MAX_ROUNDING_RATIO * rounding)
