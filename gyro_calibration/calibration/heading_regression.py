@@ -571,9 +571,13 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: 
     if spans.treatment.is_fine:
         fit = fit_with()
     else:
-        correlations = (each ** (np.diff(spans.time) / spans.treatment.min_span)
-                        for each in _COURSE_CORRELATIONS)
-        likeliest = max(correlations, key=lambda each: fit_with(each).log_evidence)
+        greatest, likeliest = -math.inf, None
+        for over_span in _COURSE_CORRELATIONS:
+            correlation = over_span ** (np.diff(spans.time) / spans.treatment.min_span)
+            evidence = fit_with(correlation).log_evidence
+            if evidence < greatest:
+                break
+            greatest, likeliest = evidence, correlation
         # what a drive of minutes does not determine is drawn to 0, and the mean bias of the drive
         # is not that of the gyro
         fit = fit_with(likeliest, wandering_value=1, hierarchical_priors=[

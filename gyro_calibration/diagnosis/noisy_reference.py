@@ -455,16 +455,42 @@ class FoundCause:
     probability: dict[str, float]
 
 
-def propose_terms(fit: SpanFit) -> Iterator[CauseTerm]:
+def propose_terms(fit: SpanFit) -> list[CauseTerm]:
     """
-    Give the causes that headings over spans can show, for the channels that the log has.
+    Return the causes that headings over spans can show, for the channels that the log has.
 
     Where the scale factor error is left at 0, every cause that follows the rate would take it up,
     so that none of these is a candidate.
 
     """
-    return (each for each in _all_terms(fit)
-            if not (fit.scale_held and _follows_the_rate(each.cause)))
+    log, fine, time = fit.spans.log, fit.spans.treatment.is_fine, fit.spans.time
+    duration = float(time[-1] - time[0])
+    terms: list[tuple[str, tuple[float, ...]]] = [(name, ()) for name in (
+        'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity', 'rate_ramp',
+        'heading_sensitivity', 'reference_once_per_rev')]
+    terms += [('warm_up', (constant,)) for constant in np.geomspace(
+        duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist()]
+    terms += [(name, (moment,))
+              for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist()
+              for name in ('bias_step', 'reference_slip')[:1 if fine else 2]]
+    has = {name for name, least in MIN_CHANNEL_RANGE.items()
+           if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
+    if 'temperature' in has:
+        middle = float(np.mean(np.asarray(log.temperature)))
+        terms += [(name, (middle,)) for name in (
+            'bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature')]
+        terms += [('bias_temperature_rate', (filter_time,)) for filter_time in (3.0, 10.0)]
+        if fine:
+            terms += [('thermal_lag', (constant,)) for constant in np.geomspace(
+                5.0, min(duration, 3000.0), 6).tolist()]
+            terms += [('thermal_hysteresis', shapes) for shapes in ((1.0, 2e-3), (3.0, 5e-4))]
+    if 'specific_force' in has:
+        terms += [('acceleration_sensitivity', ()), ('vibration_rectification', (1.0,))]
+    if 'supply' in has:
+        terms.append(('supply_sensitivity', (5.0,)))
+    terms += user_effects(has, has_motion=True)
+    return [CauseTerm(*each) for each in terms
+            if not (fit.scale_held and _follows_the_rate(each[0]))]
 
 
 def _follows_the_rate(cause: str) -> bool:
@@ -473,45 +499,11 @@ def _follows_the_rate(cause: str) -> bool:
     return (cause == 'reference_once_per_rev' if effect is None else 'rate' in effect.inputs)
 
 
-def _all_terms(done: SpanFit) -> Iterator[CauseTerm]:
-    log, fine, time = done.spans.log, done.spans.treatment.is_fine, done.spans.time
-    duration = float(time[-1] - time[0])
-    for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
-                 'rate_ramp', 'heading_sensitivity', 'reference_once_per_rev'):
-        yield CauseTerm(name)
-    for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist():
-        yield CauseTerm('warm_up', (constant,))
-    for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist():
-        yield CauseTerm('bias_step', (moment,))
-        if not fine:
-            yield CauseTerm('reference_slip', (moment,))
-    has = {name for name, least in MIN_CHANNEL_RANGE.items()
-           if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
-    if 'temperature' in has:
-        middle = float(np.mean(np.asarray(log.temperature)))
-        for name in ('bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature'):
-            yield CauseTerm(name, (middle,))
-        for filter_time in (3.0, 10.0):
-            yield CauseTerm('bias_temperature_rate', (filter_time,))
-        if fine:
-            for constant in np.geomspace(5.0, min(duration, 3000.0), 6).tolist():
-                yield CauseTerm('thermal_lag', (constant,))
-            for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4)):
-                yield CauseTerm('thermal_hysteresis', (filter_time, threshold))
-    if 'specific_force' in has:
-        yield CauseTerm('acceleration_sensitivity')
-        yield CauseTerm('vibration_rectification', (1.0,))
-    if 'supply' in has:
-        yield CauseTerm('supply_sensitivity', (5.0,))
-    for name, shapes in user_effects(has, has_motion=True):
-        yield CauseTerm(name, shapes)
-
-
 def search_causes(fit: SpanFit, false_alarm_rate: float,
                   on_part: OnPart) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
     found: list[FoundCause] = []
-    candidates = list(propose_terms(fit))
+    candidates = propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
     columns = {each.cause: each for each in candidates if not each.is_single_event}
     rich_fit = fit_spans(fit.spans, list(columns.values()))
@@ -582,8 +574,12 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
                 p_values[place])
 
     simplest = min(equivalent.values(), key=complexity)
+    # every fifth stretch, where slow causes are also predicted by the bias wander of neighbouring
+    # ones, and fifths of the log
+    numbers, count = np.arange(data.stretch_count), min(FOLD_COUNT, data.stretch_count)
     folds = [_cross_fit(data, columns, places, terms, equivalent, sets)
-             for sets in _fold_sets(data.stretch_count)]
+             for sets in ([numbers[fold::count] for fold in range(count)],
+                          np.array_split(numbers, count))]
     # errors of a course are correlated over time, so that distant stretches must be predicted too
     sigmas, predicted, selected = max(folds) if spans.treatment.is_fine else min(folds)
     probability = {name: chance for name, chance in probabilities(
@@ -632,13 +628,6 @@ def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArr
         found.append(Evidence(float(fisher.sf(statistic / count, count, freedom)),
                               0.5 * statistic, effective))
     return max(found)
-
-
-def _fold_sets(stretch_count: int) -> list[list[NDArray[np.intp]]]:
-    """Return two divisions of the stretches into five: every fifth one, and fifths of the log."""
-    # in the first, slow causes are also predicted by the bias wander of neighbouring stretches
-    numbers, folds = np.arange(stretch_count), min(FOLD_COUNT, stretch_count)
-    return [[numbers[fold::folds] for fold in range(folds)], np.array_split(numbers, folds)]
 
 
 def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice],

@@ -15,6 +15,8 @@ import math
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise,
     bias_wander_columns,
+    carried_shares,
+    difference_covariance,
     fit_noise_grid,
     heading_noise,
     SharedNoise,
@@ -168,3 +170,18 @@ def test_intervals_hold_the_truth(noise):
         found = fitted(time, rate, turned, seen)
         held += np.abs(found.values - (SCALE, BIAS)) < 1.96 * found.deviations
     assert (held / 60 > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)).all()
+
+
+def test_differences_of_autoregressive_errors_have_the_covariance_that_is_stated():
+    generator = np.random.default_rng(5)
+    correlation = np.where(np.arange(8) == 3, 0.0, generator.uniform(0.0, 0.9, 8))
+    lags = np.concatenate([[0.0], np.cumsum(-np.log(np.maximum(correlation, 1e-9)))])
+    errors = np.exp(-np.abs(lags[:, None] - lags))
+    difference = np.diff(np.eye(9), axis=0)
+    quasi = np.eye(8) - np.diag(carried_shares(correlation)[1:], -1)
+    diagonal, neighbours = difference_covariance(np.ones(9), correlation)
+    assert quasi @ difference @ errors @ difference.T @ quasi.T == pytest.approx(
+        np.diag(diagonal) + np.diag(neighbours[1:], -1) + np.diag(neighbours[1:], 1), abs=1e-6)
+    spans = heading_noise(np.arange(9.0), np.zeros(9), correlation=correlation)[0]
+    assert quasi @ quasi.T == pytest.approx(np.diag(spans.diagonal) + np.diag(
+        spans.off_diagonal[1:], -1) + np.diag(spans.off_diagonal[1:], 1))
