@@ -364,7 +364,9 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
         output = output - expected
         padded = np.pad(expected, 2 * NEIGHBOURS_PER_SIDE, mode='edge')
         expected_change = np.ptp(sliding_window_view(padded, 4 * NEIGHBOURS_PER_SIDE + 1), axis=1)
-        jumps = maximum_filter1d(_distance_to_median(expected), 2 * _JOLT_SAMPLES + 1)
+        # by the cubic through two neighbours on each side, which follows a smooth motion
+        bends = np.diff(np.pad(expected, 2, mode='edge'), 4) / 6.0
+        jumps = maximum_filter1d(np.abs(bends), 2 * _JOLT_SAMPLES + 1)
     off = _distance_to_median(output)
     sigmas = _outlier_sigmas(output, off, expected_change, valid, min_scatter)
     # near a jump of the reference of half the size: a jolt, or the reference is outlying

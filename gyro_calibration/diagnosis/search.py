@@ -412,7 +412,7 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
         acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
-            tried = [_fit_slips(each, run, left[run], factors[run], moments,
+            tried = [_fit_slips(each, run, fit.residuals[run], left[run], factors[run], moments,
                                 max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
             # The largest number indicates a continuous disturbance, not slips.
             if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
@@ -420,8 +420,8 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
     return [max(found, key=lambda one: one.mean_evidence)] if found else []
 
 
-def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
-               width: float) -> _ScreenedCandidate:
+def _fit_slips(replay: Replay, log_index: int, off: Array, white: Array, factor: Array,
+               indices: Indices, width: float) -> _ScreenedCandidate:
     """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
     time = np.arange(replay.point_count) * replay.point_interval
     likely = math.log(len(indices) * len(SLIP_DURATIONS))
@@ -436,7 +436,7 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
     total = 0.0
     channels = replay.channels
     residual, output, reference = (replay.resample(each) for each in (
-        channels.output - channels.rate, channels.output, replay.reference))
+        off, channels.output, replay.reference))
     for place in np.argsort(-value)[:200]:
         if _is_sample_of_gyro(residual, output, reference, int(indices[place]),
                               max(3, round(2.0 * width / replay.point_interval))):
