@@ -466,3 +466,11 @@ def mismatch_finding(results: Sequence[Gate]) -> Finding | None:
     parameters = {} if failed.factor is None else {'unit_error': Estimate(*failed.factor, '1')}
     return Finding('unit_error' if parameters else failed.name, _GATE_SENTENCES[failed.name],
                    parameters, 0.0, evidence=failed.evidence, along='rate', remedy=failed.remedy)
+
+
+def refuse_mismatch(log: Log) -> None:
+    """Raise `DataRefused` where a gate fails, with its evidence and remedy."""
+    failed = mismatch_finding(check_gates(log))
+    if failed is not None:
+        raise DataRefused(f'{failed.sentence[:1].lower()}{failed.sentence[1:].rstrip(".")} '
+                          f'({failed.evidence}): {failed.remedy}')
