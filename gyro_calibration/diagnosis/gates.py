@@ -316,7 +316,7 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
             yield Gate('wrapped_heading', True, 'the reference heading is continuous')
         except DataRefused as refusal:
             yield Gate('wrapped_heading', False, str(refusal).partition(';')[0],
-                       'unwrap the reference heading (--unwrap), and diagnose again')
+                       'unwrap the reference heading (--unwrap)')
     reference = reference_angle(log)
     by_length = compare_headings(log, reference)
     if not by_length:
@@ -472,5 +472,5 @@ def refuse_mismatch(log: Log) -> None:
     """Raise `DataRefused` where a gate fails, with its evidence and remedy."""
     failed = mismatch_finding(check_gates(log))
     if failed is not None:
-        raise DataRefused(f'{failed.sentence[:1].lower()}{failed.sentence[1:].rstrip(".")} '
+        raise DataRefused(f'{failed.cause[:1].lower()}{failed.cause[1:].rstrip(".")} '
                           f'({failed.evidence}): {failed.remedy}')
