@@ -116,7 +116,7 @@ def test_a_gyro_that_counts_clockwise_is_not_fitted(run, tmp_path):
     rows = zip(time, -np.sin(0.3 * time) + np.tile([1e-3, -1e-3], 600), np.cos(0.3 * time) / -0.3)
     path = tmp_path / 'log.csv'
     path.write_text('time_s,gyro_rad_s,reference_heading_rad\n'
-                    + ''.join('%.3f,%.9f,%.9f\n' % row for row in rows))
+                    + ''.join(','.join(map(repr, map(float, row))) + '\n' for row in rows))
     code, text, error = run('fit', path, '--out', tmp_path / 'model.yaml')
     assert code == 1 and not text and 'opposite senses' in error and 'give --invert' in error
     assert not (tmp_path / 'model.yaml').exists()
