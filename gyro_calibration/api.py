@@ -52,6 +52,7 @@ from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
 from gyro_calibration.diagnosis.expected_output import REFERENCE_KINDS
 from gyro_calibration.diagnosis.findings import Diagnosis
+from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
@@ -331,6 +332,8 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
         _require_choice('effects', name, STATIC_EFFECTS)
     _require_choice('technology', technology, TECHNOLOGY_PRIORS)
     _require_choice('method', method, ('dwells', 'likelihood', 'course', 'rate'))
+    for log in logs:
+        refuse_mismatch(log)
     alone = len(logs) == 1 and logs[0].time is not None and logs[0].reference_rate is None
     if method in (None, 'likelihood', 'course', 'rate') and (
             method or alone and not set(effects or ()) - {'bias', 'scale_factor_error'}):

@@ -32,6 +32,7 @@ from gyro_calibration.calibration.scatter import MIN_SWEEPS
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.diagnosis.gates import refuse_mismatch
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
@@ -101,6 +102,8 @@ def _parse_orders(text: str) -> list[Effect]:
 
 def _fit(given: argparse.Namespace) -> Answer:
     logs = dict(zip(given.log, verb.read_each(given)))
+    for log in logs.values():
+        refuse_mismatch(log)
     if _select_method(given, logs) == 'dwells':
         return _fit_dwells(given, logs)
     return _fit_heading(given, logs)

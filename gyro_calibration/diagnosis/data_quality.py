@@ -364,11 +364,11 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
         output = output - expected
         padded = np.pad(expected, 2 * NEIGHBOURS_PER_SIDE, mode='edge')
         expected_change = np.ptp(sliding_window_view(padded, 4 * NEIGHBOURS_PER_SIDE + 1), axis=1)
-        jumps = maximum_filter1d(_distance_to_median(expected), 2 * _JOLT_SAMPLES + 1)
+        jumps = maximum_filter1d(_distance_to_cubic(expected), 2 * _JOLT_SAMPLES + 1)
     off = _distance_to_median(output)
     sigmas = _outlier_sigmas(output, off, expected_change, valid, min_scatter)
     # near a jump of the reference of half the size: a jolt, or the reference is outlying
-    sigmas[jumps > 0.5 * off] = 0.0
+    sigmas[jumps > 0.5 * _distance_to_cubic(output)] = 0.0
     missing = np.count_nonzero(_neighbour_samples(~valid), axis=1)
     tested = valid & (missing < NEIGHBOURS_PER_SIDE)
     outlying = (sigmas > limit) & tested
@@ -395,6 +395,11 @@ def _neighbour_samples(values: Array | Mask) -> Array:
 def _distance_to_median(values: Array) -> Array:
     """Return how far each sample is from the median of its neighbours."""
     return np.abs(values - np.median(_neighbour_samples(values), axis=1))
+
+
+def _distance_to_cubic(values: Array) -> Array:
+    """Return how far each sample is from the cubic through two on each side of it."""
+    return np.abs(np.diff(np.pad(values, 2, mode='edge'), 4)) / 6.0
 
 
 def _outlier_sigmas(values: Array, off: Array, expected_change: Array, valid: Mask,

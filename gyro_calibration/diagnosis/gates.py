@@ -315,7 +315,7 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
             yield Gate('wrapped_heading', True, 'the reference heading is continuous')
         except DataRefused as refusal:
             yield Gate('wrapped_heading', False, str(refusal).partition(';')[0],
-                       'unwrap the reference heading (--unwrap), and diagnose again')
+                       'unwrap the reference heading (--unwrap)')
     reference = reference_angle(log)
     by_length = compare_headings(log, reference)
     if not by_length:
@@ -465,3 +465,11 @@ def mismatch_finding(results: Sequence[Gate]) -> Finding | None:
     parameters = {} if failed.factor is None else {'unit_error': Estimate(*failed.factor, '1')}
     return Finding('unit_error' if parameters else failed.name, _GATE_SENTENCES[failed.name],
                    parameters, 0.0, evidence=failed.evidence, along='rate', remedy=failed.remedy)
+
+
+def refuse_mismatch(log: Log) -> None:
+    """Raise `DataRefused` where a gate fails, with its evidence and remedy."""
+    failed = mismatch_finding(check_gates(log))
+    if failed is not None:
+        raise DataRefused(f'{failed.cause[:1].lower()}{failed.cause[1:].rstrip(".")} '
+                          f'({failed.evidence}): {failed.remedy}')

@@ -91,9 +91,11 @@ from gyro_calibration.diagnosis.search import (
     complexity_penalty,
     confirm,
     evidence_for,
+    evidence_threshold,
     find_suspected,
     is_lasting,
     MAX_SLIPS,
+    p_value,
     refine_jointly,
     Search,
     search_causes,
@@ -143,7 +145,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     Parameters
     ----------
     logs : of one gyro, with time, and with a reference unless the gyro is at rest
-    generator : source of the random residuals of noise alone, and of the noise that fills gaps
+    generator : source of the noise that fills gaps
     model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
         best
     false_alarm_rate : false alarms per diagnosis
@@ -209,11 +211,11 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                       model)
                for log, clean in zip(logs, quality)]
     steps.begin('search for causes')
-    search = start_search(replays, generator, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
+    search = start_search(replays, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
     everything = search_causes(search)
     averaged = average_filtered_noise(fit_causes(search.problem, everything)).problem.replays
     if averaged is not search.problem.replays:
-        search = start_search(averaged, generator, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
+        search = start_search(averaged, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
         everything = search_causes(search)
     named, unnamed = withdraw_names(search, everything)
     named, removed = confirm(search, named)
@@ -435,9 +437,8 @@ def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence
                                                         fit.problem.replays[0].interval):
         confounders.append('unit_error')
     # the evidence of a size of n standard deviations is n² / 2
-    evidence_threshold = (search.null_distribution.threshold(name, search.rate)
-                          + complexity_penalty(known))
-    detectable_sigmas = (math.sqrt(2.0 * max(evidence_threshold, 0.0))
+    threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
+    detectable_sigmas = (math.sqrt(2.0 * max(threshold, 0.0))
                          + float(norm.isf(1.0 - _DETECTION_POWER)))
     log = ('' if candidate.log_index is None or len(fit.problem.replays) == 1
            else f'in log {candidate.log_index + 1}, ')
@@ -448,7 +449,7 @@ def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence
     elif name == 'reference_slip':
         where = min(candidate.shapes[1:]), max(candidate.shapes[1:])
     return make_finding(
-        name, parameters, search.null_distribution.p_value(name, evidence),
+        name, parameters, p_value(name, evidence),
         tuple(dict.fromkeys(confounders)),
         minimum_detectable=detectable_sigmas * deviation if deviation > 0.0 else None,
         separate_by=separate_by or (CAUSES[name].separate_by if confounders else ''),
@@ -517,8 +518,7 @@ def unexplained_structures(search: Search, fit: RegressionFit,
     for name, places in variables.items():
         without = _residual_variance(
             search, [known for place, known in enumerate(causes) if place not in places])
-        chance = min(search.null_distribution.p_value(causes[place].candidate.cause,
-                                                      evidence_for(search, causes, place))
+        chance = min(p_value(causes[place].candidate.cause, evidence_for(search, causes, place))
                      for place in places)
         structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return structures

@@ -18,13 +18,13 @@ it. The evidence of a cause is the likelihood with it over the likelihood withou
 over the noises, at the most likely value of the cause (a flat prior, scaled so that for a known
 noise the evidence is n² / 2 for a value of n standard deviations).
 
-Axes: g noises, b bands, m coefficients, q columns of a fit, p columns of candidates, d residuals.
+Axes: g noises, b bands, m coefficients, q columns of a fit, p columns of candidates.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -102,12 +102,6 @@ class RegressionProblem:
     noise_shapes: tuple[NoiseShape, ...]
     weights: Array
     log_determinants: Array
-
-    def with_noises(self, indices: Indices) -> RegressionProblem:
-        """Return the problem with some of the noises."""
-        return replace(self, noise_shapes=tuple(self.noise_shapes[place] for place in indices),
-                       weights=self.weights[indices],
-                       log_determinants=self.log_determinants[indices])
 
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
@@ -493,21 +487,14 @@ def _fit_columns(problem: RegressionProblem, distorted: tuple[Replay, ...],
     """Return the fit of a whitened residual to independent columns under each noise."""
     kept = _independent_columns(columns)
     of = columns[kept]
-    information, scores = problem.products(of, of), problem.products(residual[None], of)
-    squares, likelihood = _restricted_likelihood(problem, residual[None], information, scores)
+    information, scores = problem.products(of, of), problem.products(residual[None], of)[:, 0]
+    values = np.linalg.solve(information, scores[:, :, None])[:, :, 0]
+    squares = problem.squares(residual[None])[:, 0] - np.einsum('gq,gq->g', values, scores)
+    determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
+    likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
     return RegressionFit(problem, distorted, causes, residual, of,
                          tuple(column_owners[place] for place in kept), column_counts, information,
-                         scores[:, 0], squares[:, 0], likelihood[:, 0])
-
-
-def _restricted_likelihood(problem: RegressionProblem, residuals: Array, information: Array,
-                           scores: Array) -> tuple[Array, Array]:
-    """Return sum of squares and log likelihood of residuals, (g, d), from scores, (g, d, q)."""
-    values = np.linalg.solve(information, np.swapaxes(scores, 1, 2))
-    squares = problem.squares(residuals) - np.einsum('gqd,gdq->gd', values, scores)
-    determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
-    freedom = residuals.shape[1] - information.shape[1]
-    return squares, -0.5 * (freedom * np.log(squares) + determinants[:, None])
+                         scores, squares, likelihood)
 
 
 def _independent_columns(columns: Array) -> list[int]:
@@ -525,67 +512,41 @@ def _independent_columns(columns: Array) -> list[int]:
 
 # evidence
 
-def column_evidence(problem: RegressionProblem, nuisances: Array, columns: Array,
-                    groups: Sequence[Sequence[int]], batches: Iterable[Array]) -> Array:
+def column_evidence(fit: RegressionFit, columns: Array,
+                    groups: Sequence[Sequence[int]]) -> Array:
     """
-    Return the evidence of candidates in residuals, shape (d, groups), -inf if unidentifiable.
+    Return the evidence of candidates given a fit, shape (groups,), -inf if unidentifiable.
 
     Parameters
     ----------
-    problem : the noises
-    nuisances : whitened columns, shape (q, m)
-    columns : of the candidates, likewise, shape (p, m)
+    fit : the causes already selected
+    columns : whitened columns of the candidates, shape (p, m)
     groups : the indices of the columns of each candidate
-    batches : whitened residuals, shape (part of d, m)
 
     """
-    own, crossing = problem.products(nuisances, nuisances), problem.products(nuisances, columns)
-    towards, squares = np.linalg.solve(own, crossing), problem.squares(columns)
-    freedom = float(nuisances.shape[1] - len(nuisances))
-    by_group: list[tuple[Array, Array] | None] = []
-    for group in map(list, groups):
+    problem, freedom = fit.problem, fit.degrees_of_freedom
+    crossing = problem.products(fit.columns, columns)
+    towards = np.linalg.solve(fit.information, crossing)
+    pull = (problem.products(fit.residual[None], columns)
+            - fit.scores[:, None] @ towards)[:, 0]
+    squares, total = problem.squares(columns), logsumexp(fit.noise_log_likelihood)
+    found = np.full(len(groups), -np.inf)
+    for place, group in enumerate(map(list, groups)):
         whole = (squares[:, group, None] if len(group) == 1
                  else problem.products(columns[group], columns[group]))
         part = whole - np.swapaxes(crossing[:, :, group], 1, 2) @ towards[:, :, group]
         if (np.einsum('gpp->gp', part)
                 <= MIN_INDEPENDENT_SHARE * np.einsum('gpp->gp', whole)).any():
-            by_group.append(None)
             continue
         part = part + 1e-10 * np.eye(len(group)) * np.einsum('gpp->gp', part)[:, None]
-        by_group.append((np.linalg.inv(part), np.linalg.slogdet(part)[1]))
-    found = []
-    for residuals in batches:
-        nuisances, columns = (each.astype(residuals.dtype, copy=False)
-                              for each in (nuisances, columns))
-        scores = problem.products(residuals, nuisances)
-        left, likelihood = _restricted_likelihood(problem, residuals, own, scores)
-        pull = problem.products(residuals, columns) - scores @ towards
-        total, best = logsumexp(likelihood, axis=0), likelihood.argmax(axis=0)
-        found.append(np.full((len(residuals), len(groups)), -np.inf))
-        for place, (group, known) in enumerate(zip(map(list, groups), by_group)):
-            if known is None:
-                continue
-            inverse, determinant = known
-            explained = ((pull[:, :, group] @ inverse) * pull[:, :, group]).sum(axis=-1)
-            ratio = np.log1p(-np.minimum(explained / left, 1.0 - 1e-9))
-            scale = 0.5 * (len(group) * np.log(left) - determinant[:, None])
-            change = scale - 0.5 * (freedom - len(group)) * ratio
-            found[-1][:, place] = (logsumexp(likelihood + change, axis=0) - total
-                                   - scale[best, np.arange(len(best))])
-    return np.concatenate(found)
-
-
-def draw_residuals(problem: RegressionProblem, probability: Array, draws: int,
-                   generator: np.random.Generator) -> Array:
-    """
-    Draw residuals of noise alone, each by a noise chosen with its probability, shape (draws, m).
-
-    In single precision, which is sufficient here and twice as fast.
-
-    """
-    chosen = generator.choice(len(probability), draws, p=probability)
-    deviation = problem.by_coefficient((1.0 / np.sqrt(problem.weights)).astype(np.float32))
-    return generator.standard_normal((draws, deviation.shape[1]), np.float32) * deviation[chosen]
+        explained = np.einsum('gp,gp->g', pull[:, group], np.linalg.solve(
+            part, pull[:, group, None])[:, :, 0])
+        ratio = np.log1p(-np.minimum(explained / fit.residual_squares, 1.0 - 1e-9))
+        scale = 0.5 * (len(group) * np.log(fit.residual_squares) - np.linalg.slogdet(part)[1])
+        change = scale - 0.5 * (freedom - len(group)) * ratio
+        found[place] = (logsumexp(fit.noise_log_likelihood + change) - total
+                        - scale[fit.best_noise])
+    return found
 
 
 # deviations of discontinuous shapes

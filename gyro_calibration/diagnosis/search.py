@@ -20,7 +20,7 @@ that are held out, and if the interval of its size excludes 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 import math
 from typing import Any
@@ -44,7 +44,6 @@ from gyro_calibration.diagnosis.regression import (
     add_cause,
     build_problem,
     column_evidence,
-    draw_residuals,
     fit_causes,
     free_amplitude,
     Indices,
@@ -62,9 +61,6 @@ from scipy.signal import correlate
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
-#: Residuals of noise alone that are drawn for the distribution of the evidence, and most likely
-#: noises from which they are drawn, at most.
-NOISE_DRAWS, MAX_DRAWN_NOISES = 400, 60
 #: Penalties in log-likelihood: of a fitted shape, at least; of each column beyond the first; and
 #: of a structure without a name.
 SHAPE_PENALTY, COLUMN_PENALTY, UNNAMED_PENALTY = 2.0, 1.2, 4.0
@@ -95,33 +91,23 @@ UNPREDICTIVE = 'it does not predict held-out stretches'
 Causes = tuple[SelectedCause, ...]
 
 
-@dataclass(frozen=True)
-class NullDistribution:
+def evidence_threshold(cause: str, rate: float) -> float:
+    """Return the evidence that noise alone exceeds with a given probability: see `p_value`."""
+    return -math.log(rate) if cause in MAX_PER_LOG else 0.5 * float(chi2.isf(rate, 1))
+
+
+def p_value(cause: str, evidence: float) -> float:
     """
-    Distribution of the evidence of causes in noise alone: an exponential tail.
+    Return the probability that noise alone reaches an evidence.
 
-    The evidence exceeds `tail_start` with the probability `tail_probability`, and falls by e every
-    `tail_scale`. That of a scanned cause, which has none, contains the number of places already.
+    A value of n standard deviations has the evidence n² / 2, and the mean over the shapes of a
+    cause is not larger, so that twice the evidence is at most chi-squared with one degree of
+    freedom. That of a scanned cause, at the best of all places, is half a chi-squared with two
+    degrees of freedom less the logarithm of their number.
 
     """
-
-    tail_start: Mapping[str, float]
-    tail_scale: Mapping[str, float]
-    tail_probability: float
-
-    def threshold(self, cause: str, rate: float) -> float:
-        """Return the evidence that noise alone exceeds with a given probability."""
-        if cause not in self.tail_start:
-            return -math.log(rate)
-        return (self.tail_start[cause]
-                + self.tail_scale[cause] * math.log(self.tail_probability / rate))
-
-    def p_value(self, cause: str, evidence: float) -> float:
-        """Return the probability that noise alone reaches an evidence."""
-        if cause not in self.tail_start:
-            return math.exp(-max(evidence, 0.0))
-        above = (evidence - self.tail_start[cause]) / self.tail_scale[cause]
-        return min(1.0, self.tail_probability * math.exp(min(-above, 700.0)))
+    evidence = max(evidence, 0.0)
+    return math.exp(-evidence) if cause in MAX_PER_LOG else float(chi2.sf(2.0 * evidence, 1))
 
 
 @dataclass(frozen=True)
@@ -141,11 +127,10 @@ class CandidateColumns:
     groups: tuple[tuple[int, ...], ...]
     columns: Array
 
-    def evidence(self, problem: RegressionProblem, nuisances: Array,
-                 residuals: Iterable[Array]) -> Array:
-        """Return the evidence, (d, candidates), less the penalty of columns beyond the first."""
+    def evidence(self, fit: RegressionFit) -> Array:
+        """Return the evidence of each candidate, less the penalty of columns beyond the first."""
         penalty = COLUMN_PENALTY * np.array([len(group) - 1.0 for group in self.groups])
-        return column_evidence(problem, nuisances, self.columns, self.groups, residuals) - penalty
+        return column_evidence(fit, self.columns, self.groups) - penalty
 
 
 def make_candidate_columns(problem: RegressionProblem, candidates: Sequence[Candidate],
@@ -176,7 +161,6 @@ class Search:
     ----------
     problem : the logs
     candidate_columns : columns of all candidates without causes that distort the rate
-    null_distribution : distribution of their evidence in noise alone
     rate : false alarms per cause
     scanned_causes : causes that are scanned for over all frequencies or times
     unidentifiable : causes that these logs cannot distinguish from bias and scale factor error
@@ -187,7 +171,6 @@ class Search:
 
     problem: RegressionProblem
     candidate_columns: CandidateColumns
-    null_distribution: NullDistribution
     rate: float
     scanned_causes: frozenset[str] = frozenset(MAX_PER_LOG)
     unidentifiable: frozenset[str] = frozenset()
@@ -203,12 +186,12 @@ class Search:
 
     def excess_evidence(self, cause: str, evidence: float, rate_factor: float = 1.0) -> float:
         """Return an evidence less its threshold at so many times the false-alarm rate."""
-        return evidence - self.null_distribution.threshold(cause, rate_factor * self.rate)
+        return evidence - evidence_threshold(cause, rate_factor * self.rate)
 
 
-def start_search(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006,
+def start_search(replays: Sequence[Replay], rate: float = 0.006,
                  on_part: Callable[[str], object] = lambda words: None) -> Search:
-    """Set up a search: candidates, noises, and the distribution of evidence in noise."""
+    """Set up a search: candidates and noises."""
     on_part('candidate causes')
     found = [*propose_candidates(replays), *generic_terms(replays)]
     problem = build_problem(replays)
@@ -216,32 +199,9 @@ def start_search(replays: Sequence[Replay], generator: np.random.Generator, rate
     if not np.isfinite(fit.noise_log_likelihood).all():
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
-    shown, places = columns.evidence(problem, fit.columns, [fit.residual[None]])[0], (
-        indices_by_cause(found))
-    on_part('significance, by simulated noise')
-    return Search(problem, columns, simulate_null_distribution(fit, columns, generator),
-                  rate / len(places), on_part=on_part, unidentifiable=frozenset(
-                      cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
-
-
-def simulate_null_distribution(fit: RegressionFit, columns: CandidateColumns,
-                               generator: np.random.Generator) -> NullDistribution:
-    """Return the distribution of the evidence of causes in residuals of noise alone."""
-    probable = fit.noise_probability
-    kept = np.sort(np.argsort(-probable)[:MAX_DRAWN_NOISES])
-    problem = fit.problem.with_noises(kept)
-    shown = columns.evidence(problem, fit.columns, (
-        draw_residuals(problem, probable[kept] / probable[kept].sum(), 100, generator)
-        for _ in range(NOISE_DRAWS // 100)))
-    start, scale, share = {}, {}, 0.15
-    for cause, own in indices_by_cause(columns.candidates).items():
-        if not np.isfinite(shown[:, own]).any():
-            start[cause], scale[cause] = 0.0, 1.0  # not identifiable in these data
-            continue
-        ordered = np.sort(logsumexp(shown[:, own], axis=1) - math.log(len(own)))
-        most = ordered[int((1.0 - share) * len(ordered)):]
-        start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
-    return NullDistribution(start, scale, share)
+    shown, places = columns.evidence(fit), indices_by_cause(found)
+    return Search(problem, columns, rate / len(places), on_part=on_part, unidentifiable=frozenset(
+        cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
 
 
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
@@ -316,8 +276,7 @@ def _search_strongest(search: Search, causes: Sequence[SelectedCause],
 def _screen_causes(search: Search, fit: RegressionFit,
                    causes: Sequence[SelectedCause]) -> list[_ScreenedCandidate]:
     """Return the best first shape of each cause."""
-    found = _columns_given_causes(search, causes).evidence(search.problem, fit.columns,
-                                                           [fit.residual[None]])[0]
+    found = _columns_given_causes(search, causes).evidence(fit)
     # A second cause without a free size would only correct the shape of the first.
     taken = {each.candidate.cause for each in causes if each.candidate.amplitude is not None}
     first = [_ScreenedCandidate(search.candidates[max(own, key=lambda place: found[place])],
@@ -453,7 +412,7 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
         acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
-            tried = [_fit_slips(each, run, left[run], factors[run], moments,
+            tried = [_fit_slips(each, run, fit.residuals[run], left[run], factors[run], moments,
                                 max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
             # The largest number indicates a continuous disturbance, not slips.
             if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
@@ -461,8 +420,8 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
     return [max(found, key=lambda one: one.mean_evidence)] if found else []
 
 
-def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
-               width: float) -> _ScreenedCandidate:
+def _fit_slips(replay: Replay, log_index: int, off: Array, white: Array, factor: Array,
+               indices: Indices, width: float) -> _ScreenedCandidate:
     """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
     time = np.arange(replay.point_count) * replay.point_interval
     likely = math.log(len(indices) * len(SLIP_DURATIONS))
@@ -477,7 +436,7 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
     total = 0.0
     channels = replay.channels
     residual, output, reference = (replay.resample(each) for each in (
-        channels.output - channels.rate, channels.output, replay.reference))
+        off, channels.output, replay.reference))
     for place in np.argsort(-value)[:200]:
         if _is_sample_of_gyro(residual, output, reference, int(indices[place]),
                               max(3, round(2.0 * width / replay.point_interval))):

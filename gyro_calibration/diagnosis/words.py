@@ -157,8 +157,12 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         (found,) = diagnosis.findings
         return found.cause, f'No cause can be named until this is corrected: {found.remedy}.'
     if diagnosis.verdict == 'adequate':
-        return ('Simulation and measurement differ by no more than noise.',
-                _gain_sentence(diagnosis))
+        suspected = join_list([readable_name(each.effect) for each in diagnosis.findings])
+        reference_errs = bool(diagnosis.reference and diagnosis.reference.noise)
+        found = ('No difference is established' if reference_errs or suspected
+                 else 'Simulation and measurement differ by no more than noise')
+        return (found + ' beyond the errors of the reference' * reference_errs
+                + f'; suspected: {suspected}' * bool(suspected) + '.', _gain_sentence(diagnosis))
     parts = []
     if established := [each for each in diagnosis.findings if each.status == 'established']:
         parts.append(f'because of {_cause_list_phrase(established)}')

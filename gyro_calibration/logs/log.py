@@ -474,6 +474,10 @@ def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
     return replace(log, **arrays, others=others)
 
 
+#: Largest difference from a full turn of a jump of a wrapped heading, turns.
+_FULL_TURN_MARGIN = 0.1
+
+
 def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
                    output: Array) -> tuple[Array, bool]:
     """
@@ -496,31 +500,70 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
     if known.sum() < 2:
         return heading, False
-    plainly, rates = np.unwrap(wrapped[known]), np.nan_to_num(output)
-    angle = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(time))])
-    turned, steps = np.interp(reference_time[known], time, angle), np.diff(reference_time[known])
-    # as rates, since over a gap the unwrapped change may be wrong by any number of turns
-    plain_rate, gyro_rate = np.diff(plainly) / steps, np.diff(turned) / steps
-    sign = -1.0 if np.dot(plain_rate, gyro_rate) < 0.0 else 1.0
-    bias = float(np.median(plain_rate - sign * gyro_rate))
-    expected = sign * turned + bias * reference_time[known]
+    plainly = np.unwrap(wrapped[known])
+    expected, _ = _heading_by_gyro(reference_time[known], plainly, time, np.nan_to_num(output))
     heading[known] = expected + np.unwrap(wrapped[known] - expected)
     return heading, bool(np.abs(np.diff(heading[known]) - np.diff(plainly)).max() > np.pi)
 
 
+def _heading_by_gyro(reference_time: Array, heading: Array, time: Array,
+                     output: Array) -> tuple[Array, float]:
+    """Return the heading, (m,), by the gyro with sign and bias fitted, and its scale factor."""
+    angle = np.concatenate([[0.0], np.cumsum(0.5 * (output[1:] + output[:-1]) * np.diff(time))])
+    turned, steps = np.interp(reference_time, time, angle), np.diff(reference_time)
+    # as rates, since over a gap the unwrapped change may be wrong by any number of turns
+    rate, gyro_rate = np.diff(heading) / steps, np.diff(turned) / steps
+    sign = -1.0 if np.dot(rate, gyro_rate) < 0.0 else 1.0
+    bias = float(np.median(rate - sign * gyro_rate))
+    close = steps <= 2.0 * np.median(steps)
+    square = float(np.sum((gyro_rate[close] - np.mean(gyro_rate[close])) ** 2))
+    factor = (float(np.sum(rate[close] * (gyro_rate[close] - np.mean(gyro_rate[close])))) / square
+              if square > 0.0 else 0.0)
+    return sign * turned + bias * reference_time, factor
+
+
 def refuse_wrapped(log: Log) -> None:
-    """Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped."""
+    """
+    Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped.
+
+    Over a gap of the reference, a jump is a full turn that the gyro does not show.
+
+    """
     if log.time is None or log.reference_heading is None:
         return
-    known = np.isfinite(log.reference_heading)
+    known = np.flatnonzero(np.isfinite(log.reference_heading))
     time, change = log.time[known], np.diff(log.reference_heading[known])
-    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < 0.1
+    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL_TURN_MARGIN
     # vehicles do not turn faster than 35 rad/s
-    jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time)))
+    jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time))
+                           | _turns_without_gyro(log, known))
     if len(jumps):
-        raise DataRefused(
-            f'the reference heading jumps by a full turn from one sample to the next, the first '
-            f'time at {time[jumps[0] + 1]:.3f} s; it must be continuous: use --unwrap')
+        first, last = known[jumps[0]], known[jumps[0] + 1]
+        where = ('from one sample to the next, the first time at' if last == first + 1 else
+                 'that the gyro does not show, first in the gap that ends at')
+        raise DataRefused(f'the reference heading jumps by a full turn {where} '
+                          f'{log.time[last]:.3f} s; it must be continuous: use --unwrap')
+
+
+def _turns_without_gyro(log: Log, known: NDArray[np.intp]) -> Mask:
+    """Tell which gaps between known reference headings hold full turns that the gyro lacks."""
+    assert log.time is not None and log.reference_heading is not None
+    measured = np.zeros(0, dtype=np.intp) if log.output is None else np.flatnonzero(
+        np.isfinite(log.output))
+    if len(known) < 3 or len(measured) < 3:
+        return np.zeros(max(len(known) - 1, 0), dtype=bool)
+    assert log.output is not None
+    at, output, stamps = log.time[known], log.output[measured], log.time[measured]
+    expected, factor = _heading_by_gyro(at, log.reference_heading[known], stamps, output)
+    turns = (np.diff(log.reference_heading[known]) - np.diff(expected)) / (2.0 * math.pi)
+    # the integral of the gyro errs by less than its longest interval times its largest rate
+    pauses = np.diff(stamps)
+    begin = np.clip(np.searchsorted(stamps, at, 'right') - 1, 0, len(pauses) - 1)
+    longest = np.maximum.reduceat(pauses, begin)[:-1]
+    certain = longest * np.abs(output).max() < _FULL_TURN_MARGIN * 2.0 * math.pi
+    is_whole = (np.rint(turns) != 0.0) & (np.abs(turns - np.rint(turns)) < _FULL_TURN_MARGIN)
+    return np.asarray(certain & is_whole & (known[1:] > known[:-1] + 1)
+                      & (1.0 / 1.4 < abs(factor) < 1.4))
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:

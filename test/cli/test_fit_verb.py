@@ -111,6 +111,18 @@ def test_tables_in_several_files_are_one_calibration(run, tmp_path):
     assert code == 0 and answer['sweeps'] == 3 and 'scale_factor_temperature' in answer['effects']
 
 
+def test_a_gyro_that_counts_clockwise_is_not_fitted(run, tmp_path):
+    time = np.arange(0.0, 60.0, 0.05)
+    rows = zip(time, -np.sin(0.3 * time) + np.tile([1e-3, -1e-3], 600), np.cos(0.3 * time) / -0.3)
+    path = tmp_path / 'log.csv'
+    path.write_text('time_s,gyro_rad_s,reference_heading_rad\n'
+                    + ''.join(','.join(map(repr, map(float, row))) + '\n' for row in rows))
+    code, text, error = run('fit', path, '--out', tmp_path / 'model.yaml')
+    assert code == 1 and not text and 'opposite senses' in error and 'give --invert' in error
+    assert not (tmp_path / 'model.yaml').exists()
+    assert run('fit', path, '--invert')[0] == 0
+
+
 def test_an_outlying_dwell_is_named(run, tmp_path):
     dwells = Table().measure(GyroModel(SINE), np.random.default_rng(1))
     dwells.output[30] += 1.0 * DEGREE

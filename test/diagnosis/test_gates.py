@@ -11,11 +11,13 @@
 """What keeps gyro and reference from being compared is the only finding, with its remedy."""
 
 from dataclasses import replace
+import re
 
+from gyro_calibration import fit
 from gyro_calibration.diagnosis.gates import check_gates
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 import numpy as np
 import pytest
 
@@ -78,6 +80,8 @@ def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
     assert (found.to_dict()['gates'][-1]['passed'] is False
             and found.to_dict()['findings'][0]['remedy'] == finding.remedy)
     assert finding.remedy in ' '.join(' '.join(terminal_lines(found)).split())
+    with pytest.raises(DataRefused, match=re.escape(finding.remedy)):
+        fit(log)
 
 
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])

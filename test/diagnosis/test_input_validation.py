@@ -22,7 +22,7 @@ from gyro_calibration.diagnosis.gates import (
 )
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, refuse_wrapped, unwrap_heading
 import numpy as np
 import pytest
 
@@ -153,9 +153,26 @@ def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
         use(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=heading))
 
 
+@pytest.mark.parametrize('use', [refuse_unusable, calibrate_encoder])
+def test_a_full_turn_in_a_gap_that_the_gyro_does_not_show_is_refused(use):
+    heading = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + 2.0 * np.pi * (TIME > 32.0))
+    log = Log(output=1.03 * np.abs(RATE) + 0.01, time=TIME, reference_heading=heading)
+    with pytest.raises(DataRefused, match='full turn that the gyro does not show, first in the '
+                                          r'gap that ends at 37\..* use --unwrap'):
+        use(log)
+    restored, _ = unwrap_heading(TIME, heading, TIME, log.output)
+    refuse_wrapped(replace(log, reference_heading=restored))
+
+
 def test_turns_in_gaps_or_between_slow_samples_are_no_wrapped_heading():
-    lost = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + 2.0 * np.pi * (TIME > 32.0))
-    refuse_unusable(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=lost))
+    turn = 2.0 * np.pi * np.clip(TIME - 32.0, 0.0, 1.0)
+    lost = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + turn)
+    measured = gyro(np.abs(RATE) + np.gradient(turn, TIME))
+    refuse_unusable(Log(output=measured, time=TIME, reference_heading=lost))
+    # nor where the gyro was lost too, or has another unit
+    either = np.where(np.isnan(lost), np.nan, gyro(np.abs(RATE)))
+    refuse_unusable(Log(output=either, time=TIME, reference_heading=lost))
+    refuse_wrapped(Log(output=57.3 * measured, time=TIME, reference_heading=lost))
     slow = np.arange(1000) * 1.0
     turned = np.cumsum(2.0 * np.pi * (np.sin(0.05 * slow) > 0.0))
     rate = np.gradient(turned, slow)

@@ -19,6 +19,7 @@ import re
 import subprocess
 
 from gyro_calibration.diagnosis import charts
+from gyro_calibration.diagnosis.causes import mark_suspected
 from gyro_calibration.diagnosis.findings import (
     Change,
     Curve,
@@ -28,6 +29,7 @@ from gyro_calibration.diagnosis.findings import (
     Gain,
     HeadingCurve,
     NoiseCurve,
+    Reference,
     Trace,
     Unexplained,
 )
@@ -311,6 +313,16 @@ def test_among_several_causes_a_set_is_in_brackets_and_sizes_are_in_data_sheet_u
     assert 'time offset (or bandwidth), cubic nonlinearity and 2 more' in headline(several())[0]
     text = ' '.join(terminal_lines(several()))
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
+
+
+def test_what_a_reference_with_errors_does_not_establish_is_not_said_to_be_noise():
+    beside = replace(adequate(), reference=Reference('course', '', {'reference': 1.0 * DEGREE}))
+    suspected = mark_suspected(extended().findings[0])
+    assert headline(adequate())[0] == 'Simulation and measurement differ by no more than noise.'
+    assert headline(beside)[0] == ('No difference is established beyond the errors of the '
+                                   'reference.')
+    assert headline(replace(adequate(), findings=(suspected,)))[0] == (
+        f'No difference is established; suspected: {suspected.effect.replace("_", " ")}.')
 
 
 def test_a_verdict_says_that_no_cause_was_added_to_the_model():

@@ -64,7 +64,7 @@ def tone(size, frequency, time=TIME, phase=0.3):
 
 def found_in(replays):
     """Return a search, and what it names."""
-    search = start_search(replays, np.random.default_rng(1))
+    search = start_search(replays)
     return search, search_causes(search)
 
 
@@ -107,14 +107,14 @@ def test_what_one_stretch_shows_does_not_predict_the_others():
     lasting, brief = tone(4e-4, 3.3), np.where(abs(TIME - 203.0) < 2.0, tone(2e-2, 3.3), 0.0)
     search, named = found_in([laid(resting(lasting))])
     assert held_out_sigmas(search, named)[0] > MIN_PREDICTION_SIGMAS
-    search = start_search([laid(resting(brief))], np.random.default_rng(1))
+    search = start_search([laid(resting(brief))])
     named = refine_jointly(search, named)
     assert (evidence_for(search, named, 0) > 10.0
             and held_out_sigmas(search, named)[0] < MIN_PREDICTION_SIGMAS)
 
 
 def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
-    search = start_search([laid(resting(5e-7 * TIME))], np.random.default_rng(1))
+    search = start_search([laid(resting(5e-7 * TIME))])
     answers = []
     for level in np.geomspace(2e-2, 2e-5, 13):
         at_level = replace(search, rate=level, step_cache={})
@@ -210,13 +210,12 @@ def test_a_tone_in_each_log_has_a_phase_in_each():
 
 # contradictions
 
-def test_a_slip_whose_interval_holds_zero_is_not_named_beside_outliers():
-    """What outliers leave was a slip of -0.2 (-0.6 to 0.2) deg, by chance 1 in 10^24."""
+def test_outliers_in_fast_motion_leave_no_slip():
+    """They left a slip of -0.2 (-0.6 to 0.2) deg, by chance 1 in 10^24."""
     generator = np.random.default_rng([7, zlib.crc32(b'exact/outliers')])
     log, = hide(['outliers'], 3.0, generator, duration=500.0, sample_rate=20.0)
     found = diagnosis_of([log], generator)
     assert [each.effect for each in found.findings] == ['outliers']
-    assert any('reference slip is not named' in remark for remark in found.remarks)
 
 
 # where is looked
