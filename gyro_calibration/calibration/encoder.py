@@ -34,12 +34,17 @@ from gyro_calibration.calibration.course_over_ground import (
     fit_course,
     is_course,
     is_noisy,
+    MAX_FOLLOWED_RESIDUAL,
     MAX_ROUNDING_STEP,
 )
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
 from gyro_calibration.calibration.heading_regression import MAX_ENCODER_OFFSET, TECHNOLOGY_PRIORS
-from gyro_calibration.calibration.likelihood import fit_likelihood, ScaleBiasFit
+from gyro_calibration.calibration.likelihood import (
+    fit_likelihood,
+    MAX_BLOCK_DURATION,
+    ScaleBiasFit,
+)
 from gyro_calibration.calibration.noise_grid import (
     BandedNoise,
     bias_wander_columns,
@@ -176,6 +181,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET)
     _refuse_one_speed(motion, limits)
     refuse_dead(output)
+    _refuse_turn_in_hole(time, output, motion)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
     fit = (fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=2e-4)
            if method == 'likelihood' else _fit_by_rate(time, output, motion))
@@ -238,6 +244,25 @@ def _refuse_length(motion: Motion) -> None:
     if motion.duration > 1e8:  # three years
         raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
                           'check that time_s is in s, or give --rate')
+
+
+def _find_holes(time: Array) -> Array:
+    """Return begin and end of each hole in the samples, s, shape (k, 2)."""
+    steps = np.diff(time)
+    is_hole = steps > max(MAX_BLOCK_DURATION, 2.5 * float(np.median(steps)))
+    return np.column_stack([time[:-1], time[1:]])[is_hole]
+
+
+def _refuse_turn_in_hole(time: Array, output: Array, motion: Motion) -> None:
+    """Refuse a log whose reference turns in a hole of the samples, where the gyro is not known."""
+    for begin, end in _find_holes(time):
+        turned = float(motion.heading_at(end) - motion.heading_at(begin))
+        by_gyro = 0.5 * float(np.interp([begin, end], time, output).sum()) * (end - begin)
+        if abs(turned - by_gyro) > MAX_FOLLOWED_RESIDUAL:
+            raise DataRefused(
+                f'the gyro has no samples for {end - begin:.1f} s from {begin:.1f} s on, in which '
+                f'the reference turns by {turned / DEGREE:.0f} deg: use --method course, or fit the '
+                'log before or after it (--to, --from)')
 
 
 def _refuse_one_speed(motion: Motion, limits: RunLimits) -> None:
@@ -368,6 +393,10 @@ def _apply_drift(fit: ScaleBiasFit, drift: _Drift) -> ScaleBiasFit:
 
 def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidual:
     error = np.interp(motion.time, time, integrate(time, rate)) - motion.heading
+    for begin, end in _find_holes(time):  # the gyro's heading begins anew after it
+        after = motion.time >= 0.5 * (begin + end)
+        if after.any() and not after.all():
+            error[after] -= error[after][0] - error[~after][-1]
     return HeadingResidual(error - error.mean())
 
 

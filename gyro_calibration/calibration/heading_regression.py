@@ -160,6 +160,8 @@ class Spans:
         rate, and by the difference of gyro and reference over a second, the smaller first, rad/√s
     reference_noise_ratio : ratio of the noise of a reference rate to that of the gyro
     uses_code_changes : whether the points are changes of the code of an encoder
+    holes : begin and end of each hole in the output that is as long as a span, s, shape (k, 2);
+        over a span that meets one, nothing is compared, and its observation is 0
     delay : of the stamps of the gyro relative to the reference, s
 
     """
@@ -175,7 +177,18 @@ class Spans:
     walk_bounds: tuple[float, float]
     reference_noise_ratio: float
     uses_code_changes: bool
+    holes: Array
     delay: float = 0.0
+
+    @property
+    def is_measured(self) -> Mask:
+        """Tell which spans and rests the output covers, shape (n + r,)."""
+        assert self.log.time is not None
+        at, margin = self.time + self.delay, 0.5 * float(np.median(np.diff(self.time)))
+        first, last = np.concatenate([np.column_stack([at[:-1] - margin, at[1:] + margin]),
+                                      self.log.time[self.rests]]).T
+        begin, end = self.holes[:, :, None].transpose(1, 0, 2)
+        return np.asarray(~((begin < last) & (end > first)).any(axis=0))
 
     @property
     def stretch_numbers(self) -> NDArray[np.intp]:
@@ -209,18 +222,20 @@ class Spans:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         assert self.log.time is not None
         whole = integrate_with_curvature(self.log.time, np.broadcast_to(rate, self.log.time.shape))
-        return np.append(np.diff(self.point_means(whole)), np.diff(whole[self.rests])[:, 0])
+        return self.is_measured * np.append(np.diff(self.point_means(whole)),
+                                            np.diff(whole[self.rests])[:, 0])
 
     def span_changes(self, values: Array) -> Array:
         """Return the change of a signal over spans, 0 over rests, shape (n + r,)."""
-        return np.append(np.diff(self.point_means(values)), np.zeros(len(self.rests)))
+        return self.is_measured * np.append(np.diff(self.point_means(values)),
+                                            np.zeros(len(self.rests)))
 
     @property
     def observed(self) -> Array:
         """Return the change of the reference less that of the integral of the output, (n + r,)."""
         assert self.log.output is not None
         turned = np.append(np.diff(self.heading), np.zeros(len(self.rests)))
-        return turned - self.span_integrals(self.log.output)
+        return self.is_measured * turned - self.span_integrals(self.log.output)
 
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
@@ -316,6 +331,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
         scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
         treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))
     time, output = log.time - log.time[0], bridge_gaps(log.output)
+    measured = time[np.isfinite(log.output)]
     white = white_noise_deviation(log.output)
     reference, noisier = log.reference_heading, 0.0
     if reference is None:
@@ -358,7 +374,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count,
                  _find_rests(time, output, known), treatment,
-                 (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code)
+                 (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
+                 np.column_stack([measured[:-1], measured[1:]])[np.diff(measured) > length])
 
 
 def _find_rests(time: Array, output: Array, known: NDArray[np.intp]) -> NDArray[np.intp]:
