@@ -33,7 +33,7 @@ from gyro_calibration.calibration.heading_regression import (
     TECHNOLOGY_PRIORS,
 )
 from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
-from gyro_calibration.calibration.reference_noise import heading_difference
+from gyro_calibration.calibration.reference_noise import drop_held_values, heading_difference
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     quantization_step,
@@ -102,6 +102,7 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
 
 def is_course(log: Log) -> bool:
     """Tell whether a heading is lost at times, as a course at low speed, and errs like one."""
+    log = drop_held_values(log)
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
     if find_lost_reference(known).mean() <= MIN_LOST_SHARE:

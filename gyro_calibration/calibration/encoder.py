@@ -261,8 +261,8 @@ def _refuse_turn_in_hole(time: Array, output: Array, motion: Motion) -> None:
         if abs(turned - by_gyro) > MAX_FOLLOWED_RESIDUAL:
             raise DataRefused(
                 f'the gyro has no samples for {end - begin:.1f} s from {begin:.1f} s on, in which '
-                f'the reference turns by {turned / DEGREE:.0f} deg: use --method course, or fit the '
-                'log before or after it (--to, --from)')
+                f'the reference turns by {turned / DEGREE:.0f} deg: use --method course, or fit '
+                'the log before or after it (--to, --from)')
 
 
 def _refuse_one_speed(motion: Motion, limits: RunLimits) -> None:

@@ -46,6 +46,7 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
 )
 from gyro_calibration.calibration.reference_noise import (
+    drop_held_values,
     encoder_step,
     heading_difference,
     rate_noise_share,
@@ -325,8 +326,10 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
         known
 
     """
-    assert log.time is not None and log.output is not None
     treatment = _TREATMENTS.get(kind, COURSE_TREATMENT)
+    if treatment is COURSE_TREATMENT:
+        log = drop_held_values(log)
+    assert log.time is not None and log.output is not None
     if prior is not None:
         scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
         treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.heading.integration import integrate_with_curvature
@@ -50,6 +50,33 @@ def encoder_step(heading: Array) -> float:
     changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
                           for each in (change, np.diff(change, 2)))
     return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
+
+
+def update_interval(time: Array, values: Array, step: float) -> float | None:
+    """Return the interval between updates of a held reference, s; None if each sample is new."""
+    change = np.diff(values)
+    renewed = np.flatnonzero(np.isfinite(change) & (change != 0.0))
+    # Changes of less than a step may be lost.
+    fast = np.abs(change[renewed[1:]]) > 2.5 * step
+    gaps = np.diff(renewed)[fast]
+    if len(gaps) < 20 or np.quantile(gaps, 0.1) < 2.0:
+        return None
+    usual = int(np.median(gaps))
+    one = np.abs(gaps - usual) <= 1
+    # an update with the same value does not show
+    several = np.abs(gaps - usual * np.rint(gaps / usual)) <= 0.1 * usual
+    return (float(gaps[one].mean() * np.median(np.diff(time)))
+            if np.mean(one | several) > 0.8 else None)
+
+
+def drop_held_values(log: Log) -> Log:
+    """Return a log whose heading is known where it changes, if it is held between updates."""
+    heading = log.reference_heading
+    if log.time is None or heading is None or update_interval(
+            log.time, heading, encoder_step(heading)) is None:
+        return log
+    return replace(log, reference_heading=np.where(np.diff(heading, prepend=np.nan) == 0.0, np.nan,
+                                                   heading))
 
 
 def step_evenness(log: Log, step: float) -> float:

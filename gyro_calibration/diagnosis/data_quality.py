@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwell_search import require_output
-from gyro_calibration.calibration.reference_noise import encoder_step
+from gyro_calibration.calibration.reference_noise import encoder_step, update_interval
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.expected_output import (
     compare_output,
@@ -552,20 +552,6 @@ def _check_reference(found: DataQuality, log: Log) -> DataQuality:
             'it is interpolated.'] if update else []
     return replace(found, heading_step=step, update_interval=update,
                    remarks=(*found.remarks, *note))
-
-
-def update_interval(time: Array, values: Array, step: float) -> float | None:
-    """Return the interval between updates of a held reference, s; None if each sample is new."""
-    change = np.diff(values)
-    renewed = np.flatnonzero(np.isfinite(change) & (change != 0.0))
-    # Changes of less than a step may be lost.
-    fast = np.abs(change[renewed[1:]]) > 2.5 * step
-    gaps = np.diff(renewed)[fast]
-    if len(gaps) < 20 or np.quantile(gaps, 0.1) < 2.0:
-        return None
-    usual = int(np.median(gaps))
-    regular = np.abs(gaps - usual) <= 1
-    return float(gaps[regular].mean() * np.median(np.diff(time))) if regular.mean() > 0.8 else None
 
 
 def _check_samples(found: DataQuality, comparison: OutputComparison, has_output: Mask,

@@ -23,7 +23,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.course_over_ground import is_course, MAX_ROUNDING_RATIO
+from gyro_calibration.calibration.course_over_ground import (
+    is_course,
+    MAX_ROUNDING_RATIO,
+    MAX_ROUNDING_STEP,
+)
 from gyro_calibration.calibration.dwell_search import find_lost_reference
 from gyro_calibration.calibration.reference_noise import (
     encoder_step,
@@ -263,9 +267,16 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
         lost = 100.0 * float(find_lost_reference(np.isfinite(heading)).mean())
         return Reference('course', f'the heading is lost for {lost:.2g} % of the log, as '
                          'for a course at low speed, and its errors exceed those of the gyro')
-    if step := encoder_step(heading):
+    step = encoder_step(heading)
+    if step >= MAX_ROUNDING_STEP or step and not _is_decimal(step):
         return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
-    return Reference('motion_capture', 'the heading has no steps')
+    return Reference('motion_capture', 'the heading has no steps of an encoder')
+
+
+def _is_decimal(step: float) -> bool:
+    """Tell whether a step is a power of ten of a rad or a deg, as the last digit of a file."""
+    powers = np.log10([step, step / DEGREE])
+    return bool(np.abs(powers - np.rint(powers)).min() < 1e-4)
 
 
 def is_reference_limiting(log: Log, reference: Reference) -> bool:

@@ -22,6 +22,9 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 
 SCHEMA = 'gyro_calibration/diagnosis/2'
+#: Why a model is not offered.
+NOT_OFFERED = ('On the held-out parts, the errors of the extended model are larger than those of '
+               'the model before; it is not offered.')
 #: Least probability that is stated; the assumptions on the noise do not justify smaller ones.
 MIN_PROBABILITY = 1e-4
 #: Ratio of the level at which a lasting cause is suspected to that at which it is established.

@@ -60,6 +60,7 @@ from gyro_calibration.diagnosis.findings import (
     Finding,
     Gain,
     MIN_PROBABILITY,
+    NOT_OFFERED,
     probabilities,
     Reference,
     SUSPECTED_RATE_FACTOR,
@@ -175,15 +176,19 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     # between two clocks a delay is no property of the gyro
     clock_delay = next((each for each in findings if each.effect == 'time_offset'
                         and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
-    before = _model_with_fit(GyroModel(), plain, log) if model is None else model
-    after = (_extend_model(model, model_fit, log, clock_delay)
-             if changed or clock_delay or model is None or prior is not None else model)
+    rejected = gain is not None and gain.is_worse
+    before = (model if model is not None else GyroModel() if rejected
+              else _model_with_fit(GyroModel(), plain, log))
+    after = (before if rejected or not (changed or clock_delay or model is None
+                                        or prior is not None)
+             else _extend_model(model, model_fit, log, clock_delay))
     curve, trace = _rate_curve_and_trace(extended, parts)
     return Diagnosis(tuple(add_remedies(findings, of_heading, after)), (), _gyro_noise(extended),
                      Noise() if model is None else model.noise,
                      None if not changed and model is not None else gain, before, after,
                      _untestable_causes(plain), [curve], heading_curve(parts, time), None,
-                     (*record.remarks, *_remarks(reference, extended, prior is not None)),
+                     (*record.remarks, *_remarks(reference, extended, prior is not None),
+                      *[NOT_OFFERED] * rejected),
                      false_alarm_rate, trace=trace,
                      method=_METHOD_TEXT.format(_REFERENCE_PHRASES[reference.kind]),
                      reference=replace(reference, noise=noise), heading_shares=of_heading)

@@ -56,6 +56,7 @@ from gyro_calibration.diagnosis.findings import (
     Finding,
     Gain,
     Gate,
+    NOT_OFFERED,
     probabilities,
     Unexplained,
 )
@@ -415,8 +416,7 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
         yield (f'The {name.replace("_", " ")} occurs once: it is not in the extended model, '
                'whose bias is the mean over the logs.')
     if gain is not None and gain.is_worse:
-        yield ('On the held-out parts, the errors of the extended model are larger than those of '
-               'the model before; it is not offered.')
+        yield NOT_OFFERED
 
 
 # findings

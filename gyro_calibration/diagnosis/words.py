@@ -159,9 +159,9 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.verdict == 'adequate':
         suspected = join_list([readable_name(each.effect) for each in diagnosis.findings])
         reference_errs = bool(diagnosis.reference and diagnosis.reference.noise)
-        found = ('No difference is established' if reference_errs or suspected
-                 else 'Simulation and measurement differ by no more than noise')
-        return (found + ' beyond the errors of the reference' * reference_errs
+        verdict = ('No difference is established' if reference_errs or suspected
+                   else 'Simulation and measurement differ by no more than noise')
+        return (verdict + ' beyond the errors of the reference' * reference_errs
                 + f'; suspected: {suspected}' * bool(suspected) + '.', _gain_sentence(diagnosis))
     parts = []
     if established := [each for each in diagnosis.findings if each.status == 'established']:
@@ -233,6 +233,8 @@ def _gain_sentence(diagnosis: Diagnosis) -> str:
     model = ('The extended model' if is_extended
              else f'The model, {_model_values_phrase(diagnosis.model)} alone,')
     what, change, unit = gain.rows()[0]
+    if not diagnosis.model.terms:
+        model = 'A model with the best bias and scale factor error is not offered: it'
     return (f'{model} {change_phrase(change, unit, f"the {what}")}, measured on '
             f'{to_printable(gain.held_out)}.')
 
