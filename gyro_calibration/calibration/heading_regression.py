@@ -301,11 +301,11 @@ class Spans:
         # a smoothed course errs in proportion to the acceleration, by less than this, s²
         smoothing = SharedNoise('smoothing', np.append(np.zeros(waves.shape[1]), 1.0),
                                 (_SMOOTHING_DEVIATION, _SMOOTHING_DEVIATION))
-        return (np.column_stack([waves, self.acceleration_changes()]),
+        return (np.column_stack([waves, self._acceleration_changes()]),
                 [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
                  smoothing])
 
-    def acceleration_changes(self) -> Array:
+    def _acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
         assert self.log.time is not None and self.log.output is not None
         turned, half = integrate_with_curvature(self.log.time, self.log.output), 0.5
@@ -406,7 +406,6 @@ class SpanFit:
     values, covariance : estimates and their cluster-robust covariance
     effective_stretches : effective number of stretches that determine each value
     freedom : degrees of freedom of the deviation of each value
-    prior : standard deviations of the prior of scale factor error, bias and delay
 
     """
 
@@ -417,20 +416,20 @@ class SpanFit:
     covariance: Array
     effective_stretches: Array
     freedom: Array
-    prior: Array
 
     def half_width(self, value_index: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
         deviation = math.sqrt(max(self.covariance[value_index, value_index], 0.0))
         half = float(student.ppf(0.975, self.freedom[value_index])) * deviation
-        prior = self.spans.treatment.prior
-        return (min(half, NORMAL_QUANTILE_975 * prior[value_index]) if value_index < len(prior)
-                else half)
+        if value_index >= len(BASE_VALUES):
+            return half
+        of_prior = NORMAL_QUANTILE_975 * self.spans.treatment.prior[value_index]
+        return of_prior if value_index == 0 and self.lacks_turns else min(half, of_prior)
 
     @property
-    def scale_held(self) -> bool:
-        """Tell whether the log does not show the scale factor error, which is left at 0."""
-        return bool(self.prior[0] < self.spans.treatment.prior[0])
+    def lacks_turns(self) -> bool:
+        """Tell whether too few stretches turn to show the scale factor error."""
+        return bool(self.effective_stretches[0] < MIN_STRETCHES)
 
     def value_slice(self, cause: CauseTerm) -> slice:
         """Return the places of the values of a cause."""
@@ -449,14 +448,14 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
     A scale factor error that is determined by fewer than `MIN_STRETCHES` stretches cannot be
-    separated from errors of the reference. It is kept at 0, and its interval is that of the prior.
+    separated from errors of the reference; its interval is that of the prior.
 
     """
     prior = np.array(spans.treatment.prior)
     free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
     count = len(spans.time) - 1
-    delayed = replace(spans, delay=spans.delay or find_delay(spans))
+    delayed = replace(spans, delay=spans.delay or _find_delay(spans))
     point_variances: Array = np.ones(count + 1)
     for _ in range(2):
         design = design_matrix(delayed, causes)
@@ -472,17 +471,11 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
             left = delayed.observed - design_matrix(delayed, causes) @ values
             point_variances = _point_variances(left[:count])
     if len(spans.rests):
-        delayed = _drop_contradicted_rests(delayed, causes, point_variances, prior)
-    fit = _fit_with_noise(delayed, causes, point_variances, prior)
-    if fit.effective_stretches[0] >= MIN_STRETCHES:
-        return fit
-    delayed = delayed.with_corrected_rate(np.append(0.0, fit.fit.values[1:3]))
-    fit = _fit_with_noise(delayed, causes, point_variances, prior * [1e-6, 1.0, 1.0])
-    fit.covariance[0, 0] = prior[0] ** 2
-    return fit
+        delayed = _drop_contradicted_rests(delayed, causes, point_variances)
+    return _fit_with_noise(delayed, causes, point_variances)
 
 
-def find_delay(spans: Spans) -> float:
+def _find_delay(spans: Spans) -> float:
     """Return the trial delay of the best agreement of gyro and reference, s."""
     count, prior = len(spans.time) - 1, np.array(spans.treatment.prior)
 
@@ -520,12 +513,11 @@ def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tupl
     return values, left
 
 
-def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm], point_variances: Array,
-                             prior: Array) -> Spans:
+def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm],
+                             point_variances: Array) -> Spans:
     """Return the spans without rests whose rate is not the bias that the course shows."""
     assert spans.log.output is not None
-    by_course = _fit_with_noise(replace(spans, rests=spans.rests[:0]), causes, point_variances,
-                                prior)
+    by_course = _fit_with_noise(replace(spans, rests=spans.rests[:0]), causes, point_variances)
     rates = np.array([spans.log.output[first:last].mean() for first, last in spans.rests])
     agree = np.abs(rates - by_course.values[1]) < by_course.half_width(1)
     return replace(spans, rests=spans.rests[agree])
@@ -565,15 +557,16 @@ def _point_variances(left: Array) -> Array:
     return np.clip(off / (3.0 * size), 1.0, 10.0) ** 2
 
 
-def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: Array,
-                    prior: Array) -> SpanFit:
+def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
+                    point_variances: Array) -> SpanFit:
     """Fit by the restricted likelihood over a grid of noise."""
     columns, (least, most) = design_matrix(spans, causes), spans.walk_bounds
     low, high = spans.treatment.walk_range
     rates = spans.point_means(np.asarray(spans.channels.rate))
     assert spans.log.time is not None
     durations = np.diff(spans.log.time[spans.rests])[:, 0]
-    deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
+    prior = spans.treatment.prior
+    deviation = np.append(prior, np.full(columns.shape[1] - len(prior), np.inf))
     observed, (waves, shared) = spans.observed, spans.bias_wander()
 
     def fit_with(correlation: Array | None = None, **options: Any) -> GridFit:
@@ -602,11 +595,11 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm], point_variances: 
         # is not that of the gyro
         fit = fit_with(likeliest, wandering_value=1, hierarchical_priors=[
             HierarchicalPrior(name, place, (1e-2 * size, size))
-            for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2].tolist()))])
+            for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2]))])
     values = fit.values.copy()
     values[2] += spans.delay
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
-                   np.ones(len(values)), prior)
+                   np.ones(len(values)))
     covariance, effective, freedom = _cluster_robust_covariance(
         whiten_regression(done, causes), fit)
     return replace(done, covariance=covariance, effective_stretches=effective, freedom=freedom)
@@ -720,7 +713,7 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     columns = np.column_stack([design_matrix(spans, causes), waves])
     width = columns.shape[1] - waves.shape[1]
     prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
-    prior[:3, :3] = np.diag(1.0 / fit.prior)
+    prior[:3, :3] = np.diag(1.0 / np.array(spans.treatment.prior))
     prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
     stretches = spans.stretch_numbers
     sectors = [spans.shaft_sectors] if spans.uses_code_changes else []

@@ -386,7 +386,7 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
             continue
         if lacks := sorted(missing & cause.required_channels):
             reason = f'the logs have no {" and no ".join(lacks)}'.replace('_', ' ')
-        elif plain.scale_held and _follows_the_rate(name):
+        elif plain.lacks_turns and _follows_the_rate(name):
             reason = ('fewer than three stretches turn, which do not distinguish it from a scale '
                       'factor error')
         else:
@@ -405,10 +405,10 @@ def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Itera
     yield (f'The reference is taken as {_REFERENCE_PHRASES[reference.kind]} '
            f'({reference.evidence}); if it is another kind, state it with --reference-kind. Its '
            f'errors: {errors}.')
-    if done.scale_held:
-        yield ('Fewer than three stretches with rotation determine the scale factor error, and it '
-               f'is kept at 0 +- {100.0 * done.spans.treatment.prior[0]:g} %: turn more often, '
-               'in both directions.')
+    if done.lacks_turns:
+        yield ('Fewer than three stretches with rotation determine the scale factor error, whose '
+               'standard deviation is that of the prior, '
+               f'{100.0 * done.spans.treatment.prior[0]:g} %: turn more often, in both directions.')
 
 
 def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
@@ -464,8 +464,8 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
     """
     Return the causes that headings over spans can show, for the channels that the log has.
 
-    Where the scale factor error is left at 0, every cause that follows the rate would take it up,
-    so that none of these is a candidate.
+    Where too few stretches turn, no cause that follows the rate can be distinguished from the
+    scale factor error, so that none of these is a candidate.
 
     """
     log, fine, time = fit.spans.log, fit.spans.treatment.is_fine, fit.spans.time
@@ -495,7 +495,7 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
         terms.append(('supply_sensitivity', (5.0,)))
     terms += user_effects(has, has_motion=True)
     return [CauseTerm(*each) for each in terms
-            if not (fit.scale_held and _follows_the_rate(each[0]))]
+            if not (fit.lacks_turns and _follows_the_rate(each[0]))]
 
 
 def _follows_the_rate(cause: str) -> bool:
@@ -516,9 +516,7 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
         found_terms = [each.cause_term for each in found]
         names = {each.cause for each in found_terms}
         on_part(f'search for causes after {len(found)} found' if found else 'search for causes')
-        # what a scale factor error that is kept at 0 would explain is no evidence of a cause
-        data = whiten_regression(replace(fit, prior=np.array(fit.spans.treatment.prior)),
-                                 found_terms, rich_fit, use_max_random_walk=True)
+        data = whiten_regression(fit, found_terms, rich_fit, use_max_random_walk=True)
         best = _find_best_cause(fit.spans, data,
                                 [each for each in candidates if each.cause not in names],
                                 false_alarm_rate)

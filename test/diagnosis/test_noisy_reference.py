@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
 from gyro_calibration.logs.recording import interpolate_with_gaps
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -81,6 +81,49 @@ def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed)
     assert named['time_offset'].parameters['time_offset'].estimate == pytest.approx(
         DELAY, abs=0.05)
     assert 'time_offset' not in {term.effect.name for term in found.model.terms}
+
+
+def test_nothing_is_compared_across_a_hole_in_the_samples():
+    log = drive(3)
+    rows = np.abs(log.time - 100.0) > 12.0
+    whole, parts = diagnosed(log), diagnosed(select_rows(log, rows))
+    turned = np.ptp(log.reference_heading[np.flatnonzero(~rows)[[0, -1]]])
+    assert turned > 20.0 * DEGREE
+    assert value(parts.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.03 * DEGREE)
+    assert parts.gain.heading.after < 1.5 * whole.gain.heading.after
+    assert {each.effect for each in parts.findings if each.status == 'established'} <= {
+        'time_offset', 'dropped_samples'}
+
+
+def test_a_course_that_is_repeated_between_its_fixes_is_a_course():
+    log = drive(4)
+    held = np.full(len(log), np.nan)
+    held[::25] = log.reference_heading[::25]
+    last = np.maximum.accumulate(np.where(np.isfinite(held), np.arange(len(log)), 0))
+    found = diagnosed(replace(log, reference_heading=held[last]))
+    assert found.reference.kind == 'course'
+    assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.05 * DEGREE)
+
+
+def test_the_last_digit_of_a_file_is_no_step_of_an_encoder():
+    log = drive(0)
+    heading = np.cumsum(log.output) / RATE
+    kinds = [classify_reference(replace(log, reference_heading=step * np.round(heading / step)))
+             for step in (1e-6, 1e-4 * DEGREE, 2.0 * np.pi / 65536, 0.1 * DEGREE)]
+    assert [each.kind for each in kinds] == 2 * ['motion_capture'] + 2 * ['encoder']
+
+
+def test_a_bias_that_held_out_parts_contradict_is_not_offered():
+    """The wheels of a robot slip in the first half of the log alone."""
+    generator = np.random.default_rng(2)
+    time = np.arange(0.0, 60.0, 1.0 / RATE)
+    rate = 0.02 * np.sin(0.7 * time)
+    heading = np.cumsum(rate) / RATE + 0.01 * np.minimum(time, 25.0)
+    log = Log(output=rate + 1e-4 * generator.standard_normal(len(time)), time=time,
+              reference_heading=2e-3 * np.round(heading / 2e-3))
+    found = diagnosed(log)
+    assert found.gain.is_worse and not found.model.terms
+    assert 'is not offered' in ' '.join(terminal_lines(found))
 
 
 HIDDEN = {
