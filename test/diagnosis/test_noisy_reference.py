@@ -114,11 +114,11 @@ def test_the_last_digit_of_a_file_is_no_step_of_an_encoder():
 
 
 def test_a_bias_that_held_out_parts_contradict_is_not_offered():
-    """The wheels of a robot slip in the first half of the log alone."""
+    """The wheels of a robot slip to one side, then to the other, in each sixth of the log."""
     generator = np.random.default_rng(2)
-    time = np.arange(0.0, 60.0, 1.0 / RATE)
-    rate = 0.02 * np.sin(0.7 * time)
-    heading = np.cumsum(rate) / RATE + 0.01 * np.minimum(time, 25.0)
+    time = np.arange(0.0, 600.0, 1.0 / RATE)
+    rate, side = 0.02 * np.sin(0.7 * time), np.where(time // 100.0 % 2 == 1.0, -1.0, 1.0)
+    heading = np.cumsum(rate + 0.01 * side) / RATE
     log = Log(output=rate + 1e-4 * generator.standard_normal(len(time)), time=time,
               reference_heading=2e-3 * np.round(heading / 2e-3))
     found = diagnosed(log)
