@@ -27,11 +27,12 @@ import math
 
 from gyro_calibration.calibration.dwell_search import find_lost_reference
 from gyro_calibration.calibration.heading_regression import (
+    find_delay,
     fit_spans,
     lay_out_spans,
     TECHNOLOGY_PRIORS,
 )
-from gyro_calibration.calibration.likelihood import ScaleBiasFit
+from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.reference_noise import drop_held_values, heading_difference
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
@@ -41,7 +42,7 @@ from gyro_calibration.logs.quality import (
 )
 import numpy as np
 
-#: A reference that is lost for this part of the time, or noisier than this, rad,
+#: A reference that is lost for this part of the time, or noisier than this from span to span, rad,
 #: is taken for a course; one in steps of more than this, rad, for an encoder.
 MIN_LOST_SHARE, MIN_COURSE_NOISE, MAX_ROUNDING_STEP = 0.003, 0.25 * DEGREE, 2e-4
 #: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
@@ -119,11 +120,16 @@ def is_course(log: Log) -> bool:
 
 
 def is_noisy(log: Log) -> bool:
-    """Tell whether a heading without steps is as noisy as a course."""
+    """Tell whether a heading without steps is as noisy as a course from span to span."""
     assert log.reference_heading is not None
     if quantization_step(log.reference_heading[np.isfinite(log.reference_heading)]
                          ) > MAX_ROUNDING_STEP:
         return False
-    # the difference in a second of headings with independent errors has 3 times their variance
-    return (heading_difference(replace(log, reference_rate=None)).total_walk
-            > math.sqrt(3.0) * MIN_COURSE_NOISE)
+    spans = lay_out_spans(log)
+    count = len(spans.time) - 1
+    if count < MIN_SPANS:
+        return False
+    spans = replace(spans, delay=find_delay(spans))
+    columns = np.column_stack([spans.base_columns(), spans.acceleration_changes()])[:count]
+    residual = robust_residual(columns, spans.observed[:count], 10)
+    return robust_deviation(residual) > math.sqrt(2.0) * MIN_COURSE_NOISE

@@ -37,6 +37,7 @@ from gyro_calibration.calibration.course_over_ground import (
     MAX_FOLLOWED_RESIDUAL,
     MAX_ROUNDING_STEP,
 )
+from gyro_calibration.calibration.dwell_search import interpolate_reference
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
 from gyro_calibration.calibration.heading_regression import MAX_ENCODER_OFFSET, TECHNOLOGY_PRIORS
@@ -149,8 +150,12 @@ def calibrate_encoder(log: Log, method: str | None = None,
     """
     time, output, motion = _extract_motion(log)
     _refuse_length(motion)
-    method = method or ('course' if log.reference_heading is not None
-                        and (is_course(log) or is_noisy(log)) else 'likelihood')
+    if method is None:
+        method = 'likelihood'
+        if log.reference_heading is not None and log.time is not None:
+            sampled = replace(log, reference_heading=interpolate_reference(
+                log.time, log.reference_heading))
+            method = 'course' if is_course(sampled) or is_noisy(sampled) else 'likelihood'
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)

@@ -301,11 +301,11 @@ class Spans:
         # a smoothed course errs in proportion to the acceleration, by less than this, s²
         smoothing = SharedNoise('smoothing', np.append(np.zeros(waves.shape[1]), 1.0),
                                 (_SMOOTHING_DEVIATION, _SMOOTHING_DEVIATION))
-        return (np.column_stack([waves, self._acceleration_changes()]),
+        return (np.column_stack([waves, self.acceleration_changes()]),
                 [*(replace(each, variance=np.append(each.variance, 0.0)) for each in parts),
                  smoothing])
 
-    def _acceleration_changes(self) -> Array:
+    def acceleration_changes(self) -> Array:
         """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
         assert self.log.time is not None and self.log.output is not None
         turned, half = integrate_with_curvature(self.log.time, self.log.output), 0.5
@@ -455,7 +455,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
     count = len(spans.time) - 1
-    delayed = replace(spans, delay=spans.delay or _find_delay(spans))
+    delayed = replace(spans, delay=spans.delay or find_delay(spans))
     point_variances: Array = np.ones(count + 1)
     for _ in range(2):
         design = design_matrix(delayed, causes)
@@ -475,7 +475,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     return _fit_with_noise(delayed, causes, point_variances)
 
 
-def _find_delay(spans: Spans) -> float:
+def find_delay(spans: Spans) -> float:
     """Return the trial delay of the best agreement of gyro and reference, s."""
     count, prior = len(spans.time) - 1, np.array(spans.treatment.prior)
 
