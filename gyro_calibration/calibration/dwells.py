@@ -29,6 +29,7 @@ from gyro_calibration.calibration.dwell_search import (
     Samples,
     SteadinessLimits,
 )
+from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 import numpy as np
@@ -79,10 +80,12 @@ def extract_dwells(log: Log, name: str = '') -> Dwells:
 
     Raises
     ------
-    DataRefused : output or reference are missing, or nothing is steady
+    DataRefused : output or reference are missing or in another unit, or nothing is steady
 
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log)
+    if log.counts is None and np.ptp(found.rate) > 0.0:  # a sensitivity may be what is wanted
+        refuse_unit_error(float(np.polyfit(found.rate, found.output, 1)[0]), 'reference')
     if not name:
         return found
     return replace(found, location=tuple(f'{name}: {place}' for place in found.location),

@@ -82,14 +82,14 @@ _UNIT_CONFUSIONS = {
 _UNIT_LOG_TOLERANCE = math.log(1.1)
 
 
-def describe_unit_error(scale: float, profile_suspect: bool = True) -> str:
+def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
     """
-    Return the error of units, of gyro or profile, that explains a scale; '' where there is none.
+    Raise `DataRefused` for a scale that a confused unit explains.
 
     Parameters
     ----------
     scale : reported over true rate
-    profile_suspect : the unit of the profile may be wrong too
+    reference : its name, if its unit may be the wrong one; else ''
 
     """
     size = abs(math.log(max(abs(scale), 1e-300)))
@@ -97,12 +97,12 @@ def describe_unit_error(scale: float, profile_suspect: bool = True) -> str:
                   key=lambda factor: abs(math.log(max(abs(scale), 1e-300) / factor)))
     if (size < _UNIT_LOG_TOLERANCE
             or abs(math.log(max(abs(scale), 1e-300) / nearest)) > _UNIT_LOG_TOLERANCE):
-        return ''
+        return
     sign_note = ', and turns the other way' if scale < 0.0 else ''
     gyro, profile = _UNIT_CONFUSIONS[nearest]
-    cause = f'either {gyro}, or {profile}' if profile_suspect else gyro
-    return (f'the gyro reports {abs(scale):.4g} times what was turned{sign_note}: '
-            f'{cause}; correct the unit')
+    cause = f'either {gyro}, or {profile.replace("profile", reference)}' if reference else gyro
+    raise DataRefused(f'the gyro reports {abs(scale):.4g} times what was turned{sign_note}: '
+                      f'{cause}; correct the unit')
 
 
 @dataclass(frozen=True)

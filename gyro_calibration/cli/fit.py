@@ -32,6 +32,7 @@ from gyro_calibration.calibration.scatter import MIN_SWEEPS
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
+from gyro_calibration.files import suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
@@ -83,8 +84,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _parse_effects(text: str) -> list[Effect]:
     unknown = [name for name in text.split(',') if name not in STATIC_EFFECTS]
     if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is an unknown effect; '
-                                         f'choose from {", ".join(STATIC_EFFECTS)}')
+        raise argparse.ArgumentTypeError(
+            f'{unknown[0]!r} is no effect that dwells at steady rates show; choose from '
+            f'{", ".join(STATIC_EFFECTS)}{suggest_nearest(unknown[0], STATIC_EFFECTS)}')
     return [STATIC_EFFECTS[name] for name in dict.fromkeys(text.split(','))]
 
 

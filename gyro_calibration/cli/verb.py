@@ -144,9 +144,10 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('--columns', dest='names', type=parse_columns, default={},
                         metavar='QUANTITY=NAME:UNIT,...',
                         help='columns with other names than in the log format, such as '
-                        'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; default unit: SI')
+                        'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; default unit: SI; '
+                        'attitude=qw/qx/qy/qz is a quaternion in place of a heading')
     parser.add_argument('--axis', choices=AXES, default='z', help='axis of the gyro, for columns '
-                        'such as gyro_x_dps and for recordings; default: z')
+                        'such as gyro_x_dps, an attitude and recordings; default: z')
     parser.add_argument('--unwrap', action='store_true', help='remove jumps by full turns from '
                         'the reference heading')
     parser.add_argument('--from', dest='begin', type=float, default=0.0, metavar='S',
@@ -314,6 +315,7 @@ def require_output(given: argparse.Namespace, log: Log) -> Array:
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
-        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; '
-                         'give the sample rate in Hz with --rate')
+        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; name its '
+                         'column, as by --columns time=NAME:s, or give the sample rate in Hz '
+                         'with --rate')
     return log.time

@@ -69,7 +69,8 @@ class InvalidValue(ValueError):
     """A value does not fit its schema; the message is part of a sentence."""
 
     def __init__(self, key_path: str, value: Any, expected: str):
-        super().__init__(f'{to_printable(key_path[:100])} is {_SHORT_REPR.repr(value)}; wanted '
+        super().__init__(f'{to_printable(key_path[:100])} is '
+                         f'{"empty" if value is None else _SHORT_REPR.repr(value)}; wanted '
                          f'{expected}')
 
 
