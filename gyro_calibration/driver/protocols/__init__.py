@@ -13,7 +13,7 @@ Wire formats of serial gyros: bytes to samples and back, and recognition of form
 
 This package uses no port, no ROS and no clock.
 
->>> decoder = find('kvh_dsp3000').decoder()
+>>> decoder = find_protocol('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')
 [Sample(output=-0.00027459265121626786, ...)]
 
