@@ -43,6 +43,7 @@ from gyro_calibration.logs.log import (
 from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
 from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel
+import numpy as np
 from tqdm import tqdm
 
 #: Time before progress is shown, s.
@@ -223,7 +224,7 @@ def _picture_file(text: str) -> str:
 
 
 def read(given: argparse.Namespace) -> Log:
-    """Read the log of a verb by its options."""
+    """Read the log of a verb by its options; it has an output."""
     with _show_bytes_read(given.log) as on_progress:
         if is_recording(given.log):
             topics = Topics(given.topic, given.reference_topic, given.temperature_topic,
@@ -232,20 +233,18 @@ def read(given: argparse.Namespace) -> Log:
         else:
             log = read_log(given.log, sensitivity(given), given.rate, given.names, given.axis,
                            on_progress)
+    log = _orient_output(given, log)
     if given.unwrap and log.reference_heading is not None:
         time = require_time(given, log)
         log = replace(log, reference_heading=unwrap_heading(time, log.reference_heading, time,
-                                                            require_output(given, log))[0])
-    return _apply_invert(given, next(_cut_to_range(given, [log])))
+                                                            np.asarray(log.output))[0])
+    return next(_cut_to_range(given, [log]))
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the logs of a verb that takes several; each has an output."""
+    """Read the logs of a verb that takes several."""
     for path in given.log:
-        given_one = argparse.Namespace(**{**vars(given), 'log': path})
-        log = read(given_one)
-        require_output(given_one, log)
-        yield log
+        yield read(argparse.Namespace(**{**vars(given), 'log': path}))
 
 
 def _cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
@@ -294,7 +293,7 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
         blocks = read_log_blocks(given.log, sensitivity(given), given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _cut_to_range(given, blocks):
-            yield _apply_invert(given, log)
+            yield _orient_output(given, log)
 
 
 def sensitivity(given: argparse.Namespace) -> float | None:
@@ -302,15 +301,11 @@ def sensitivity(given: argparse.Namespace) -> float | None:
     return None if given.sensitivity is None else given.sensitivity * DEGREE
 
 
-def _apply_invert(given: argparse.Namespace, log: Log) -> Log:
-    return replace(log, output=-require_output(given, log)) if given.invert else log
-
-
-def require_output(given: argparse.Namespace, log: Log) -> Array:
+def _orient_output(given: argparse.Namespace, log: Log) -> Log:
     if log.output is None:
         raise UsageError(f'{given.log}: has gyro_counts only; '
                          'give the deg/s per count with --sensitivity')
-    return log.output
+    return replace(log, output=-log.output) if given.invert else log
 
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:

@@ -461,7 +461,8 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
         arrays: dict[str, Any] = {quantity: np.asarray(table[list(table)[index]], float) * factor
                                   + offset for quantity, (index, factor, offset) in found.items()}
     except (TypeError, ValueError) as error:
-        raise LogError(f'the table is no log: {describe_error(error)}') from None
+        fault = error if isinstance(error, InputError) else describe_error(error)
+        raise LogError(f'the table is no log: {fault}') from None
     shapes = {values.shape for values in arrays.values()}
     if len(shapes) > 1 or min(shapes) < (2,) or len(min(shapes)) != 1:
         raise LogError(f'the columns have shapes {sorted(shapes)}; wanted one shape (n,), with at '
