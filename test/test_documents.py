@@ -136,7 +136,7 @@ def test_the_configuration_holds_every_parameter_with_its_default(parameters):
 
 
 def test_the_models_in_the_documents_can_be_read(tmp_path):
-    page = (DOCS / 'explanation/error_model.md').read_text()
+    page = (DOCS / 'reference/error_model.md').read_text()
     texts = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)
     models = []
     for number, text in enumerate(texts):
@@ -158,7 +158,7 @@ def headline(text):
 
 
 def test_the_example_of_a_diagnosis_still_says_what_the_pages_show(run, tmp_path, monkeypatch):
-    page = (DOCS / 'explanation/diagnosis.md').read_text()
+    page = (DOCS / 'tutorials/hidden_effect.md').read_text()
     monkeypatch.chdir(tmp_path)
     for name in ('gyro.yaml', 'real.yaml', 'profile.csv'):
         block = re.search(rf'`{name}`[^`]*?:\n\n((?:    .*\n)+)', page)[1]
@@ -205,7 +205,7 @@ def test_the_quickstarts_run_as_written_and_give_the_numbers_that_are_shown(
 
 
 def test_the_error_model_describes_every_effect():
-    text = (DOCS / 'explanation/error_model.md').read_text()
+    text = (DOCS / 'reference/error_model.md').read_text()
     assert not [effect for effect in (*CATALOGUE, POLYNOMIAL) if f'`{effect}`' not in text]
 
 

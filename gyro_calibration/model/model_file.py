@@ -81,7 +81,7 @@ def parse_model(content: Any, name: str = 'the model') -> GyroModel:
     try:
         return _parse_content(content)
     except InvalidValue as error:
-        raise ModelError(f'{name}: {error}; correct it (see docs/explanation/error_model.md) '
+        raise ModelError(f'{name}: {error}; correct it (see docs/reference/error_model.md) '
                          'or calibrate again') from None
 
 
