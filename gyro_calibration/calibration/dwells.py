@@ -29,7 +29,11 @@ from gyro_calibration.calibration.dwell_search import (
     Samples,
     SteadinessLimits,
 )
-from gyro_calibration.calibration.run_faults import refuse_unit_error
+from gyro_calibration.calibration.run_faults import (
+    fit_scale,
+    MAX_UNEXPLAINED_SHARE,
+    refuse_unit_error,
+)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 import numpy as np
@@ -84,8 +88,9 @@ def extract_dwells(log: Log, name: str = '') -> Dwells:
 
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log)
-    if log.counts is None and np.ptp(found.rate) > 0.0:  # a sensitivity may be what is wanted
-        refuse_unit_error(float(np.polyfit(found.rate, found.output, 1)[0]), 'reference')
+    unexplained, scale = fit_scale(found.output, found.rate)
+    if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
+        refuse_unit_error(scale, 'reference')
     if not name:
         return found
     return replace(found, location=tuple(f'{name}: {place}' for place in found.location),

@@ -105,6 +105,14 @@ def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
                       f'{cause}; correct the unit')
 
 
+def fit_scale(reported: Array, reference: Array) -> tuple[float, float]:
+    """Return the unexplained part of the squares about the mean, and the scale."""
+    known, turned = reference - reference.mean(), reported - reported.mean()
+    power = float(known @ known)
+    scale = float(known @ turned) / power if power > 0.0 else 0.0
+    return 1.0 - scale * float(known @ turned) / max(float(turned @ turned), 1e-300), scale
+
+
 @dataclass(frozen=True)
 class RunPieces:
     """A run in short pieces: their edges, s, and how far the gyro turned in each, rad."""
@@ -119,12 +127,7 @@ class RunPieces:
 
     def fit_scale(self, reference: Array) -> tuple[float, float]:
         """Return the unexplained part of the squares, and the scale; 1 and 0 without pieces."""
-        if not len(self.gyro_angle):
-            return 1.0, 0.0
-        known, turned = reference - reference.mean(), self.gyro_angle - self.gyro_angle.mean()
-        power = float(known @ known)
-        scale = float(known @ turned) / power if power > 0.0 else 0.0
-        return 1.0 - scale * float(known @ turned) / max(float(turned @ turned), 1e-300), scale
+        return fit_scale(self.gyro_angle, reference) if len(self.gyro_angle) else (1.0, 0.0)
 
 
 def split_run(time: Array, rate: Array) -> RunPieces:

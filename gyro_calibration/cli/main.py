@@ -137,6 +137,7 @@ class _Parser(argparse.ArgumentParser):
                         'of other verbs do not depend on it, so omit it')
         elif wrong:
             message += suggest_nearest(wrong[1], names)
+        message = re.sub(r'invalid \w+ value: (.*)', r'\1 is no number', message)
         self.exit(2, f'{self.prog}: {message}; see {self.prog} --help\n')
 
 

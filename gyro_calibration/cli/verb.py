@@ -206,7 +206,8 @@ def non_negative_integer(text: str) -> int:
 
 def _bounded(value: float, low: float, high: float = math.inf, unit: str = '') -> float:
     if not low <= value <= high:
-        wanted = f'from {low:g} to {high:g}' if high < math.inf else f'of {low:g} or more'
+        wanted = ('above 0' if high == MAX_MAGNITUDE else f'from {low:g} to {high:g}'
+                  if high < math.inf else f'of {low:g} or more')
         raise argparse.ArgumentTypeError(f'{value:g}{unit} is out of range; give a number '
                                          f'{wanted}{unit}')
     return value
@@ -306,6 +307,12 @@ def _orient_output(given: argparse.Namespace, log: Log) -> Log:
         raise UsageError(f'{given.log}: has gyro_counts only; '
                          'give the deg/s per count with --sensitivity')
     return replace(log, output=-log.output) if given.invert else log
+
+
+def require_folder(path: str) -> None:
+    """Refuse a file where a folder of results is wanted."""
+    if os.path.exists(path) and not os.path.isdir(path):
+        raise UsageError(f'{path}: is a file, but must be a folder; give another name')
 
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:
