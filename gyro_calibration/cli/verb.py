@@ -243,9 +243,15 @@ def read(given: argparse.Namespace) -> Log:
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the logs of a verb that takes several."""
+    """Read the logs of a verb that takes several; name an attitude that could be a reference."""
     for path in given.log:
-        yield read(argparse.Namespace(**{**vars(given), 'log': path}))
+        log = read(argparse.Namespace(**{**vars(given), 'log': path}))
+        found = {name[-2:].lower(): name for name in log.others}
+        names = [found[part] for part in ('qw', 'qx', 'qy', 'qz') if part in found]
+        if len(names) == 4 and log.reference_heading is None and log.reference_rate is None:
+            print_message(f'{path}: for the attitude as the reference, give --columns attitude='
+                          f'{"/".join(names)}')
+        yield log
 
 
 def _cut_to_range(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:

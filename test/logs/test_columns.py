@@ -211,6 +211,13 @@ def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(
         np.testing.assert_allclose(heading[known], turned[known], atol=1e-2)
 
 
+def test_the_columns_of_an_attitude_are_named_where_a_reference_is_missing(run, tmp_path):
+    path = written(tmp_path, 'time_s,gyro_dps,ref_qx,ref_qy,ref_qz,ref_qw\n'
+                   '0,1,0,0,0,1\n1,2,0,0,0,1\n')
+    code, text, error = run('diagnose', path)
+    assert (code, text) == (1, '') and '--columns attitude=ref_qw/ref_qx/ref_qy/ref_qz\n' in error
+
+
 @pytest.mark.parametrize('names, said', [
     ({'attitude': 'qw'}, 'the four columns of a quaternion'),
     ({'attitude': 'w/w/w/v'}, 'no column v among'),
