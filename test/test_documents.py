@@ -14,6 +14,7 @@ from pathlib import Path
 import re
 import shlex
 
+from gyro_calibration.cli import VERBS
 from gyro_calibration.cli.main import _make_parser
 from gyro_calibration.driver.protocols import PROTOCOLS
 from gyro_calibration.heading.integration import integrate
@@ -213,3 +214,8 @@ def test_every_wire_format_is_in_the_tables():
     text = (DOCS / 'reference/wire_formats.md').read_text()
     assert not [name for name in PROTOCOLS
                 if not re.search(rf'^\| `{name}` \|', text, re.MULTILINE)]
+
+
+def test_every_verb_has_a_section():
+    titles = re.findall(r'^### (\S+)$', (DOCS / 'reference/logs.md').read_text(), re.MULTILINE)
+    assert not {verb.replace('_', '-') for verb in VERBS} - set(titles)
