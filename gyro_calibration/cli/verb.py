@@ -29,7 +29,7 @@ from typing import Any
 
 from gyro_calibration import __version__
 from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
-from gyro_calibration.logs.columns import AXES
+from gyro_calibration.logs.columns import AXES, suggest_attitude
 from gyro_calibration.logs.log import (
     Array,
     DataRefused,
@@ -246,11 +246,9 @@ def read_each(given: argparse.Namespace) -> Iterator[Log]:
     """Read the logs of a verb that takes several; name an attitude that could be a reference."""
     for path in given.log:
         log = read(argparse.Namespace(**{**vars(given), 'log': path}))
-        found = {name[-2:].lower(): name for name in log.others}
-        names = [found[part] for part in ('qw', 'qx', 'qy', 'qz') if part in found]
-        if len(names) == 4 and log.reference_heading is None and log.reference_rate is None:
-            print_message(f'{path}: for the attitude as the reference, give --columns attitude='
-                          f'{"/".join(names)}')
+        if (log.reference_heading is None and log.reference_rate is None
+                and (attitude := suggest_attitude(log.others))):
+            print_message(f'{path}: for the attitude as reference, add {attitude} to --columns')
         yield log
 
 

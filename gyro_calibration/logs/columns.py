@@ -18,7 +18,7 @@ A name of the log format states quantity and unit. The user assigns other names,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import difflib
 import math
 import re
@@ -178,7 +178,8 @@ def suggest_columns(header: Sequence[str]) -> str:
             if quantity not in wanted and (unit := _guess_unit(name, quantity)):
                 wanted[quantity] = f'{quantity}={name}:{unit}'
     if 'gyro' in wanted:
-        text = ','.join(wanted.values())
+        attitude = '' if 'heading' in wanted else suggest_attitude(names)
+        text = ','.join(filter(None, [*wanted.values(), attitude]))
         units = (', with a unit in place of each UNIT, such as s, ms, deg/s, rad/s, deg, rad'
                  if 'UNIT' in text else '')
         return f'; perhaps --columns {shlex.quote(text)} is meant{units}'
@@ -186,6 +187,13 @@ def suggest_columns(header: Sequence[str]) -> str:
         if name not in COLUMNS and (close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
             return f'; perhaps {close[0]} is meant by {_shorten(name)}'
     return ''
+
+
+def suggest_attitude(names: Iterable[str]) -> str:
+    """Return what names the columns of a quaternion in --columns; '' without one."""
+    found = {name[-2:].lower(): name for name in names}
+    parts = [found.get(f'q{axis}', '') for axis in ('w', *AXES)]
+    return f'attitude={"/".join(parts)}' if all(parts) else ''
 
 
 def _guess_unit(name: str, quantity: str) -> str:

@@ -215,7 +215,10 @@ def test_the_columns_of_an_attitude_are_named_where_a_reference_is_missing(run, 
     path = written(tmp_path, 'time_s,gyro_dps,ref_qx,ref_qy,ref_qz,ref_qw\n'
                    '0,1,0,0,0,1\n1,2,0,0,0,1\n')
     code, text, error = run('diagnose', path)
-    assert (code, text) == (1, '') and '--columns attitude=ref_qw/ref_qx/ref_qy/ref_qz\n' in error
+    attitude = 'attitude=ref_qw/ref_qx/ref_qy/ref_qz'
+    assert (code, text) == (1, '') and f'add {attitude} to --columns\n' in error
+    path.write_text(path.read_text().replace('time_s,gyro_dps', 't,wz'))
+    assert f'--columns time=t:UNIT,gyro=wz:UNIT,{attitude} is meant' in run('diagnose', path)[2]
 
 
 @pytest.mark.parametrize('names, said', [
