@@ -52,8 +52,8 @@ build = ['setuptools', 'wheel', 'colcon-ros', 'colcon-bash', 'colcon-package-inf
 peers = ['vqf; python_version < "3.14"', 'imufusion']
 # launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings;
 # mujoco reads what export writes
-test = ['pytest<8.4', 'pytest-xdist', 'rosbags', 'mcap>=1.6', 'mujoco', *plot, *fuzz, *lint,
-        *build, *peers]
+test = ['pytest<8.4', 'pytest-xdist', 'pandas', 'rosbags', 'mcap>=1.6', 'mujoco', *plot, *fuzz,
+        *lint, *build, *peers]
 
 # Executables belong into lib/<package>, where `ros2 run` and launch look; only the command line
 # has to be on the PATH. setup.cfg says so to colcon and to bloom. pip does not read that: it puts

@@ -220,7 +220,7 @@ WAYS: dict[str, tuple[Callable[[Run], Array], Motion, str]] = {
     'twice the rate': (twice_the_rate, CALIBRATION_MOTION, 'twice its rate'),
     'twice as fast': (twice_as_fast, CALIBRATION_MOTION, 'times as fast'),
     'dead gyro': (dead, CALIBRATION_MOTION, 'dead'),
-    'noise alone': (noise_alone, CALIBRATION_MOTION, 'did the robot move'),
+    'noise alone': (noise_alone, CALIBRATION_MOTION, 'that the robot moved'),
     'twenty times the noise': (noisy, CALIBRATION_MOTION, 'as noisy'),
     'saturated gyro': (saturated, CALIBRATION_MOTION, 'saturated'),
     'half the sensitivity': (of_scale(0.5), CALIBRATION_MOTION, 'half its sensitivity'),

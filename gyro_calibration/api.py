@@ -99,8 +99,10 @@ def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
     source : a file in the log format (.csv, .csv.gz), a ROS 2 recording (folder, .mcap, .db3), or
         a table: a pandas DataFrame, or a mapping of names to arrays
     columns : quantity -> name, or name:unit, where columns have names of other programs, such as
-        ``{'time': 't:ms', 'gyro': 'wz:deg/s', 'heading': 'yaw:deg'}``; without a unit SI
-    axis : x, y or z of a gyro with three
+        ``{'time': 't:ms', 'gyro': 'wz:deg/s', 'heading': 'yaw:deg'}``; without a unit SI;
+        or 'attitude' -> the names of a quaternion, ``qw/qx/qy/qz``, whose rotation about the axis
+        becomes the reference heading
+    axis : x, y or z of a gyro with three, and of an attitude
     rate : Hz; the samples of a file came at this rate, whatever it says of time
     sensitivity : rad/s a count, for files with raw counts
     unwrap : the reference heading jumps by whole turns; make it continuous

@@ -19,8 +19,9 @@ is replaced keeps its mode, and its owner and group where that is allowed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+import difflib
 import errno
 import fcntl
 import hashlib
@@ -74,6 +75,12 @@ def to_printable(text: object, allowed: str = '') -> str:
     """
     return ''.join(each if each.isprintable() or each in allowed else
                    each.encode('unicode_escape').decode() for each in str(text))
+
+
+def suggest_nearest(name: str, names: Iterable[str]) -> str:
+    """Return the end of a message on a wrong name: the nearest right one; '' without one."""
+    near = difflib.get_close_matches(name, list(names), 1)
+    return f'; perhaps {to_printable(near[0][:100])} is meant' if near else ''
 
 
 def describe_error(error: Exception) -> str:
@@ -213,7 +220,7 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
     OSError : the folder cannot be written to, or the path is not a regular file
 
     """
-    path, temporary = Path(path), None
+    path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         old = _stat_replaceable(path)
@@ -237,8 +244,9 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
                 os.unlink(temporary)
             raise
     except OSError as error:
-        ours = error.filename in (None, temporary) or Path(error.filename) in path.parents
-        if error.errno is None or not ours:
+        if error.errno is None or error.filename is not None and not (
+                Path(error.filename) in path.parents
+                or Path(error.filename).name.startswith(_temporary_prefix(path))):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 

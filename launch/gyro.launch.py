@@ -32,7 +32,7 @@ DRIVER = {
     'frame_id': ('frame_id', 'frame of the gyro, whose z is its input axis'),
 }
 COMPENSATION = {
-    'model_file': ('model_file', 'model of the gyro, see docs/explanation/error_model.md'),
+    'model_file': ('model_file', 'model of the gyro, see docs/reference/error_model.md'),
     'calibration_file': ('calibration_file', 'where the last self-calibration is kept'),
     'profile_file': ('calibration.profile_file', 'motion profile of the self-calibration'),
     'wheels': ('wheels', 'what feeds the detection of standstill: none, odom, cmd_vel or both'),

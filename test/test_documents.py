@@ -14,6 +14,7 @@ from pathlib import Path
 import re
 import shlex
 
+from gyro_calibration.cli import VERBS
 from gyro_calibration.cli.main import _make_parser
 from gyro_calibration.driver.protocols import PROTOCOLS
 from gyro_calibration.heading.integration import integrate
@@ -136,7 +137,7 @@ def test_the_configuration_holds_every_parameter_with_its_default(parameters):
 
 
 def test_the_models_in_the_documents_can_be_read(tmp_path):
-    page = (DOCS / 'explanation/error_model.md').read_text()
+    page = (DOCS / 'reference/error_model.md').read_text()
     texts = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)
     models = []
     for number, text in enumerate(texts):
@@ -158,7 +159,7 @@ def headline(text):
 
 
 def test_the_example_of_a_diagnosis_still_says_what_the_pages_show(run, tmp_path, monkeypatch):
-    page = (DOCS / 'explanation/diagnosis.md').read_text()
+    page = (DOCS / 'tutorials/hidden_effect.md').read_text()
     monkeypatch.chdir(tmp_path)
     for name in ('gyro.yaml', 'real.yaml', 'profile.csv'):
         block = re.search(rf'`{name}`[^`]*?:\n\n((?:    .*\n)+)', page)[1]
@@ -205,7 +206,7 @@ def test_the_quickstarts_run_as_written_and_give_the_numbers_that_are_shown(
 
 
 def test_the_error_model_describes_every_effect():
-    text = (DOCS / 'explanation/error_model.md').read_text()
+    text = (DOCS / 'reference/error_model.md').read_text()
     assert not [effect for effect in (*CATALOGUE, POLYNOMIAL) if f'`{effect}`' not in text]
 
 
@@ -213,3 +214,8 @@ def test_every_wire_format_is_in_the_tables():
     text = (DOCS / 'reference/wire_formats.md').read_text()
     assert not [name for name in PROTOCOLS
                 if not re.search(rf'^\| `{name}` \|', text, re.MULTILINE)]
+
+
+def test_every_verb_has_a_section():
+    titles = re.findall(r'^### (\S+)$', (DOCS / 'reference/logs.md').read_text(), re.MULTILINE)
+    assert not {verb.replace('_', '-') for verb in VERBS} - set(titles)

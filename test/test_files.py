@@ -42,3 +42,9 @@ def test_what_is_no_regular_file_is_refused_and_not_left_open(tmp_path, kind):
 def test_the_folder_is_made(tmp_path):
     write_atomically(tmp_path / 'a' / 'b' / 'model.yaml', b'x')
     assert (tmp_path / 'a' / 'b' / 'model.yaml').read_bytes() == b'x'
+
+
+def test_a_folder_that_takes_no_file_is_reported_by_the_name_that_was_given():
+    with pytest.raises(FileNotFoundError) as refused:
+        write_atomically('/proc/model.yaml', b'new')
+    assert refused.value.filename == '/proc/model.yaml'

@@ -29,6 +29,11 @@ from gyro_calibration.calibration.dwell_search import (
     Samples,
     SteadinessLimits,
 )
+from gyro_calibration.calibration.run_faults import (
+    fit_scale,
+    MAX_UNEXPLAINED_SHARE,
+    refuse_unit_error,
+)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 import numpy as np
@@ -79,10 +84,13 @@ def extract_dwells(log: Log, name: str = '') -> Dwells:
 
     Raises
     ------
-    DataRefused : output or reference are missing, or nothing is steady
+    DataRefused : output or reference are missing or in another unit, or nothing is steady
 
     """
     found = dwells_from_table(log) if log.time is None else find_dwells(log)
+    unexplained, scale = fit_scale(found.output, found.rate)
+    if unexplained <= MAX_UNEXPLAINED_SHARE and log.counts is None:  # of counts it is wanted
+        refuse_unit_error(scale, 'reference')
     if not name:
         return found
     return replace(found, location=tuple(f'{name}: {place}' for place in found.location),

@@ -54,6 +54,7 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     TridiagonalMatrix,
 )
+from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import fit_rate, refuse_scale, RunLimits
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
@@ -190,6 +191,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     # the gyro's lag is assumed to be about that of a filter of 20 ms
     fit = (fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=2e-4)
            if method == 'likelihood' else _fit_by_rate(time, output, motion))
+    refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
     corrected = (output - fit.bias) / (1.0 + fit.scale_factor_error)
     drift = _estimate_drift(motion, _heading_residual(

@@ -82,14 +82,14 @@ _UNIT_CONFUSIONS = {
 _UNIT_LOG_TOLERANCE = math.log(1.1)
 
 
-def describe_unit_error(scale: float, profile_suspect: bool = True) -> str:
+def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
     """
-    Return the error of units, of gyro or profile, that explains a scale; '' where there is none.
+    Raise `DataRefused` for a scale that a confused unit explains.
 
     Parameters
     ----------
     scale : reported over true rate
-    profile_suspect : the unit of the profile may be wrong too
+    reference : its name, if its unit may be the wrong one; else ''
 
     """
     size = abs(math.log(max(abs(scale), 1e-300)))
@@ -97,12 +97,20 @@ def describe_unit_error(scale: float, profile_suspect: bool = True) -> str:
                   key=lambda factor: abs(math.log(max(abs(scale), 1e-300) / factor)))
     if (size < _UNIT_LOG_TOLERANCE
             or abs(math.log(max(abs(scale), 1e-300) / nearest)) > _UNIT_LOG_TOLERANCE):
-        return ''
+        return
     sign_note = ', and turns the other way' if scale < 0.0 else ''
     gyro, profile = _UNIT_CONFUSIONS[nearest]
-    cause = f'either {gyro}, or {profile}' if profile_suspect else gyro
-    return (f'the gyro reports {abs(scale):.4g} times what was turned{sign_note}: '
-            f'{cause}; correct the unit')
+    cause = f'either {gyro}, or {profile.replace("profile", reference)}' if reference else gyro
+    raise DataRefused(f'the gyro reports {abs(scale):.4g} times what was turned{sign_note}: '
+                      f'{cause}; correct the unit')
+
+
+def fit_scale(reported: Array, reference: Array) -> tuple[float, float]:
+    """Return the unexplained part of the squares about the mean, and the scale."""
+    known, turned = reference - reference.mean(), reported - reported.mean()
+    power = float(known @ known)
+    scale = float(known @ turned) / power if power > 0.0 else 0.0
+    return 1.0 - scale * float(known @ turned) / max(float(turned @ turned), 1e-300), scale
 
 
 @dataclass(frozen=True)
@@ -119,12 +127,7 @@ class RunPieces:
 
     def fit_scale(self, reference: Array) -> tuple[float, float]:
         """Return the unexplained part of the squares, and the scale; 1 and 0 without pieces."""
-        if not len(self.gyro_angle):
-            return 1.0, 0.0
-        known, turned = reference - reference.mean(), self.gyro_angle - self.gyro_angle.mean()
-        power = float(known @ known)
-        scale = float(known @ turned) / power if power > 0.0 else 0.0
-        return 1.0 - scale * float(known @ turned) / max(float(turned @ turned), 1e-300), scale
+        return fit_scale(self.gyro_angle, reference) if len(self.gyro_angle) else (1.0, 0.0)
 
 
 def split_run(time: Array, rate: Array) -> RunPieces:

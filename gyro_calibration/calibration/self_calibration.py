@@ -36,11 +36,11 @@ from gyro_calibration.calibration.likelihood import (
     ScaleBiasFit,
 )
 from gyro_calibration.calibration.run_faults import (
-    describe_unit_error,
     fit_profile,
     format_slip,
     MAX_UNEXPLAINED_SHARE,
     refuse_other_motion,
+    refuse_unit_error,
     RunPieces,
     split_run,
 )
@@ -278,9 +278,9 @@ def refuse_samples(time: Array, rate: Array, limits: RunLimits) -> None:
 def refuse_scale(scale_factor_error: float, reference: str, remedy: str) -> None:
     """Refuse a gyro that saw almost none of the reference's turns, or all with the other sign."""
     if abs(1.0 + scale_factor_error) < 0.5:
-        raise DataRefused(f'the gyro saw {100 * (1 + scale_factor_error):.0f} % of the '
+        raise DataRefused(f'the gyro shows {100 * (1 + scale_factor_error):.0f} % of the '
                           f"{reference}'s turns: "
-                          'did the robot move, and does the gyro respond?')
+                          'check that the robot moved, and that the gyro responds')
     if scale_factor_error < -1.5:
         raise DataRefused(f'the gyro turns the other way than the {reference} '
                           f'(scale {1 + scale_factor_error:.2f}): {remedy}')
@@ -298,10 +298,7 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     unexplained, scale = fit_profile(run, motion, largest_offset)
     if unexplained <= MAX_UNEXPLAINED_SHARE:
-        unit = (describe_unit_error(scale) if abs(scale - 1.0) > limits.max_scale_factor_error
-                else '')
-        if unit:
-            raise DataRefused(unit)
+        refuse_unit_error(scale)
         refuse_scale(scale - 1.0, 'profile', "set the driver's parameter invert")
     rate_spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
     if rate_spread < limits.min_rate_spread:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS, ScaleBiasFit
-from gyro_calibration.calibration.run_faults import describe_unit_error
+from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import refuse_samples, refuse_scale, RunLimits
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
@@ -173,10 +173,9 @@ def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:
     if turns is not None:
         # another unit or sign explains the scale; a factor of two may be a wrong count
         scale = measured / turns
-        is_implausible = (abs(scale - 1.0) > limits.max_scale_factor_error
-                          and not 0.4 < abs(scale) < 2.5)
-        if is_implausible and (unit := describe_unit_error(scale, profile_suspect=False)):
-            raise DataRefused(unit)
+        if (abs(scale - 1.0) > limits.max_scale_factor_error
+                and not 0.4 < abs(scale) < 2.5):
+            refuse_unit_error(scale, '')
         refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
                      "else set the driver's parameter invert")
     if abs(measured - count) > (MAX_COUNT_ERROR if turns else MAX_COUNTING_SCALE_ERROR

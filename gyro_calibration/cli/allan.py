@@ -59,7 +59,7 @@ def _allan(given: argparse.Namespace) -> Answer:
     model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
     try:
         time = verb.require_time(given, log)
-        record = build_rest_record(time, verb.require_output(given, log), log.moving,
+        record = build_rest_record(time, np.asarray(log.output), log.moving,
                                    log.reference_heading)
         with show_progress('noise figures from the Allan deviation'):
             chart = allan_deviation(record.rate, record.interval)

@@ -144,14 +144,11 @@ def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
                           found: _Totals) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and update the counts."""
     if given.rest or given.hindsight:
-        log = verb.read(given)
-        blocks = track_log(replace(log, output=verb.require_output(given, log)), model,
-                           given.hindsight, given.log)
+        blocks = track_log(verb.read(given), model, given.hindsight, given.log)
     else:
         threshold = Threshold(given.threshold * DEGREE, given.window,
                               model.noise.angle_random_walk)
-        blocks = integrate_log((replace(log, output=verb.require_output(given, log))
-                                for log in verb.read_blocks(given)), model, threshold, given.log)
+        blocks = integrate_log(verb.read_blocks(given), model, threshold, given.log)
     for piece in blocks:
         found.add(piece)
         yield piece.log, piece.full_columns()

@@ -36,4 +36,5 @@ def _demo(given: argparse.Namespace) -> Answer:
     except ImportError as error:
         raise UsageError(f'the demo needs ROS 2 and matplotlib ({error}); source ROS 2, or '
                          'install gyro_calibration[ros,plot]') from None
+    verb.require_folder(given.out)
     return run_demo(Path(given.out), given.seed)

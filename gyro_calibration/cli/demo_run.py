@@ -185,7 +185,11 @@ def _node_process(module: str, **parameters: object) -> Iterator[None]:
         yield
     finally:
         process.terminate()
-        process.wait(20.0)
+        try:
+            process.wait(20.0)
+        except subprocess.TimeoutExpired:  # a busy machine
+            process.kill()
+            process.wait()
 
 
 def run_demo(out: Path, seed: int) -> Answer:

@@ -53,6 +53,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _diagnose(given: argparse.Namespace) -> Answer:
+    if given.out:
+        verb.require_folder(given.out)
     logs = list(verb.read_each(given))
     model = None if given.model is None else read_model(given.model)
     with show_progress('diagnosis') as on_progress:

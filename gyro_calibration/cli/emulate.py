@@ -67,7 +67,7 @@ def _emulate(given: argparse.Namespace) -> None:
     except ValueError as error:
         raise UsageError(str(error)) from None
     log = verb.read(given) if given.log else simulate_log(given)[0]
-    time, output = verb.require_time(given, log), verb.require_output(given, log)
+    time, output = verb.require_time(given, log), np.asarray(log.output)
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
                           'have an output; give a log with two or more')

@@ -33,6 +33,7 @@ from gyro_calibration.calibration.selection import select_effects, Selection, TE
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import refuse_mismatch
+from gyro_calibration.files import suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     Effect,
@@ -45,9 +46,9 @@ from gyro_calibration.model.model_file import POLYNOMIAL, write_model
 import numpy as np
 
 #: SI unit -> unit in tables for people, and the factor to it.
-_DISPLAY_UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
-                  'rad/s/K²': ('deg/s/K²', 1 / DEGREE), 's/rad': ('s/deg', DEGREE),
-                  's²/rad²': ('s²/deg²', DEGREE ** 2)}
+_DISPLAY_UNITS = {'1': ('%', 100.0), '1/K': ('ppm/K', 1e6), 'rad/s': ('deg/s', 1 / DEGREE),
+                  'rad/s/K': ('deg/s/K', 1 / DEGREE), 'rad/s/K²': ('deg/s/K²', 1 / DEGREE),
+                  's/rad': ('s/deg', DEGREE), 's²/rad²': ('s²/deg²', DEGREE ** 2)}
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -84,8 +85,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _parse_effects(text: str) -> list[Effect]:
     unknown = [name for name in text.split(',') if name not in STATIC_EFFECTS]
     if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is an unknown effect; '
-                                         f'choose from {", ".join(STATIC_EFFECTS)}')
+        raise argparse.ArgumentTypeError(
+            f'{unknown[0]!r} is no effect that dwells at steady rates show; choose from '
+            f'{", ".join(STATIC_EFFECTS)}{suggest_nearest(unknown[0], STATIC_EFFECTS)}')
     return [STATIC_EFFECTS[name] for name in dict.fromkeys(text.split(','))]
 
 
@@ -163,7 +165,8 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
                   *(' '.join(f'{value: .8e}' for value in row) for row in matrix)]
     return Answer(lines, {'out': given.out, 'method': 'dwells', **_dwell_data(selection),
                           **_model_data(model), 'matrix_dps': matrix,
-                          'remarks': list(table.remarks)}, (given.out,))
+                          'remarks': list(table.remarks)},
+                  (given.picture, given.surface, given.out))
 
 
 def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
@@ -197,7 +200,7 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
                    'rms_heading_after_rad': found.residual_after.rms,
                    'largest_heading_before_rad': found.residual_before.largest,
                    'largest_heading_after_rad': found.residual_after.largest, 'remarks': remarks},
-                  (given.out,))
+                  (given.picture, given.out))
 
 
 def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:

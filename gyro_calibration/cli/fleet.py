@@ -98,8 +98,7 @@ def _parse_pattern(text: str) -> re.Pattern[str]:
 def _fleet(given: argparse.Namespace) -> Answer:
     logs = find_logs(given.logs, excluded_folder=given.out)
     folder = os.path.abspath(given.out)
-    if os.path.exists(folder) and not os.path.isdir(folder):
-        raise UsageError(f'{given.out}: is a file, but must be a folder; give another name')
+    verb.require_folder(given.out)
     generator = None if given.no_diagnosis else np.random.default_rng(given.seed)
     records = _process_logs(given, [LogTask(entry, folder, given.technology, given.pattern,
                                             generator, given.gyro_type or '', given.rate)

@@ -20,6 +20,7 @@ import json
 import math
 import os
 from pathlib import Path
+import re
 import sys
 from typing import Any, NoReturn
 
@@ -32,7 +33,13 @@ from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
 from gyro_calibration.cli.verb import print_message, UsageError
 from gyro_calibration.diagnosis.causes import add_causes
-from gyro_calibration.files import describe_error, describe_os_error, InputError, to_printable
+from gyro_calibration.files import (
+    describe_error,
+    describe_os_error,
+    InputError,
+    suggest_nearest,
+    to_printable,
+)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.effects import add_effects
 import numpy as np
@@ -114,15 +121,24 @@ def _print_text(text: str) -> None:
 class _Parser(argparse.ArgumentParser):
     """Reports wrong arguments without control characters, which names of files may contain."""
 
+    options: Sequence[str] = ()
+
     def _print_message(self, message: str, file: Any = None) -> None:
         super()._print_message(to_printable(message, allowed='\n'), file)
 
     def error(self, message: str) -> NoReturn:
+        """End with 2 and one sentence, which has the nearest right name of a wrong one."""
+        wrong = re.match(r'(?:argument .*: invalid choice: .|unrecognized arguments: )([\w-]+)',
+                         message)
+        names = re.findall(r'[\w-]+', message.partition('choose from')[2]) or self.options
         if '--technology' in message and message.startswith('unrecognized arguments'):
             message += ('; the technology decides between effects in fit, turn and fleet only. '
                         'diagnose reads it from the model, gyro: {technology: mems}; the answers '
                         'of other verbs do not depend on it, so omit it')
-        super().error(message)
+        elif wrong:
+            message += suggest_nearest(wrong[1], names)
+        message = re.sub(r'invalid \w+ value: (.*)', r'\1 is no number', message)
+        self.exit(2, f'{self.prog}: {message}; see {self.prog} --help\n')
 
 
 def _make_parser(verb_name: str = '') -> argparse.ArgumentParser:
@@ -139,4 +155,5 @@ def _make_parser(verb_name: str = '') -> argparse.ArgumentParser:
         verb_parser.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
                                  help='Python file, which is executed, with EFFECTS, a list of '
                                  'further effects for models and diagnoses')
+        parser.options = re.findall(r'--[\w-]+', verb_parser.format_usage())
     return parser

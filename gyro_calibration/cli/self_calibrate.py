@@ -115,7 +115,7 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
 
 
 def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, _ = verb.require_time(given, log), verb.require_output(given, log)
+    time = verb.require_time(given, log)
     motion, begin = ((read_motion(given.profile), time[0]) if given.profile
                      else _reference_motion(given, log))
     _refuse_implausible(given, model, log)
@@ -175,7 +175,7 @@ def calibrate_run(log: Log, model: GyroModel, motion: Motion, begin: float, meth
 
 
 def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
-    time, output = verb.require_time(given, log), verb.require_output(given, log)
+    time, output = verb.require_time(given, log), np.asarray(log.output)
     known = _refuse_implausible(given, model, log)
     rates = compensate_log(with_self_calibration(model, None), log)
     marking = MARK_DEVIATION if given.marking is None else given.marking * DEGREE

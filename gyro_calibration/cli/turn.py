@@ -74,7 +74,6 @@ def _turn(given: argparse.Namespace) -> Answer:
         raise UsageError('--technology selects effects, and --model has its own; give one of '
                          'the two')
     log = verb.read(given)
-    verb.require_output(given, log)  # a log with counts only is wrong use, as for other verbs
     found = extract_dwells(log)
     with show_progress('fit of effects, and errors of turns'):
         rate, is_inlier, remarks, data = (

@@ -29,7 +29,7 @@ from typing import Any
 
 from gyro_calibration import __version__
 from gyro_calibration.files import InputError, MAX_MAGNITUDE, sha256_digest, to_printable
-from gyro_calibration.logs.columns import AXES
+from gyro_calibration.logs.columns import AXES, suggest_attitude
 from gyro_calibration.logs.log import (
     Array,
     DataRefused,
@@ -43,6 +43,7 @@ from gyro_calibration.logs.log import (
 from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
 from gyro_calibration.logs.ros_bag import is_recording, list_recording_files
 from gyro_calibration.model.gyro_model import GyroModel
+import numpy as np
 from tqdm import tqdm
 
 #: Time before progress is shown, s.
@@ -144,9 +145,10 @@ def add_log_options(parser: argparse.ArgumentParser, **options: Any) -> None:
     parser.add_argument('--columns', dest='names', type=parse_columns, default={},
                         metavar='QUANTITY=NAME:UNIT,...',
                         help='columns with other names than in the log format, such as '
-                        'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; default unit: SI')
+                        'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; default unit: SI; '
+                        'attitude=qw/qx/qy/qz is a quaternion in place of a heading')
     parser.add_argument('--axis', choices=AXES, default='z', help='axis of the gyro, for columns '
-                        'such as gyro_x_dps and for recordings; default: z')
+                        'such as gyro_x_dps, an attitude and recordings; default: z')
     parser.add_argument('--unwrap', action='store_true', help='remove jumps by full turns from '
                         'the reference heading')
     parser.add_argument('--from', dest='begin', type=float, default=0.0, metavar='S',
@@ -204,7 +206,8 @@ def non_negative_integer(text: str) -> int:
 
 def _bounded(value: float, low: float, high: float = math.inf, unit: str = '') -> float:
     if not low <= value <= high:
-        wanted = f'from {low:g} to {high:g}' if high < math.inf else f'of {low:g} or more'
+        wanted = ('above 0' if high == MAX_MAGNITUDE else f'from {low:g} to {high:g}'
+                  if high < math.inf else f'of {low:g} or more')
         raise argparse.ArgumentTypeError(f'{value:g}{unit} is out of range; give a number '
                                          f'{wanted}{unit}')
     return value
@@ -222,7 +225,7 @@ def _picture_file(text: str) -> str:
 
 
 def read(given: argparse.Namespace) -> Log:
-    """Read the log of a verb by its options."""
+    """Read the log of a verb by its options; it has an output."""
     with _show_bytes_read(given.log) as on_progress:
         if is_recording(given.log):
             topics = Topics(given.topic, given.reference_topic, given.temperature_topic,
@@ -231,19 +234,21 @@ def read(given: argparse.Namespace) -> Log:
         else:
             log = read_log(given.log, sensitivity(given), given.rate, given.names, given.axis,
                            on_progress)
+    log = _orient_output(given, log)
     if given.unwrap and log.reference_heading is not None:
         time = require_time(given, log)
         log = replace(log, reference_heading=unwrap_heading(time, log.reference_heading, time,
-                                                            require_output(given, log))[0])
-    return _apply_invert(given, next(_cut_to_range(given, [log])))
+                                                            np.asarray(log.output))[0])
+    return next(_cut_to_range(given, [log]))
 
 
 def read_each(given: argparse.Namespace) -> Iterator[Log]:
-    """Read the logs of a verb that takes several; each has an output."""
+    """Read the logs of a verb that takes several; name an attitude that could be a reference."""
     for path in given.log:
-        given_one = argparse.Namespace(**{**vars(given), 'log': path})
-        log = read(given_one)
-        require_output(given_one, log)
+        log = read(argparse.Namespace(**{**vars(given), 'log': path}))
+        if (log.reference_heading is None and log.reference_rate is None
+                and (attitude := suggest_attitude(log.others))):
+            print_message(f'{path}: for the attitude as reference, add {attitude} to --columns')
         yield log
 
 
@@ -293,7 +298,7 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
         blocks = read_log_blocks(given.log, sensitivity(given), given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _cut_to_range(given, blocks):
-            yield _apply_invert(given, log)
+            yield _orient_output(given, log)
 
 
 def sensitivity(given: argparse.Namespace) -> float | None:
@@ -301,19 +306,22 @@ def sensitivity(given: argparse.Namespace) -> float | None:
     return None if given.sensitivity is None else given.sensitivity * DEGREE
 
 
-def _apply_invert(given: argparse.Namespace, log: Log) -> Log:
-    return replace(log, output=-require_output(given, log)) if given.invert else log
-
-
-def require_output(given: argparse.Namespace, log: Log) -> Array:
+def _orient_output(given: argparse.Namespace, log: Log) -> Log:
     if log.output is None:
         raise UsageError(f'{given.log}: has gyro_counts only; '
                          'give the deg/s per count with --sensitivity')
-    return log.output
+    return replace(log, output=-log.output) if given.invert else log
+
+
+def require_folder(path: str) -> None:
+    """Refuse a file where a folder of results is wanted."""
+    if os.path.exists(path) and not os.path.isdir(path):
+        raise UsageError(f'{path}: is a file, but must be a folder; give another name')
 
 
 def require_time(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
-        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; '
-                         'give the sample rate in Hz with --rate')
+        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; name its '
+                         'column, as by --columns time=NAME:s, or give the sample rate in Hz '
+                         'with --rate')
     return log.time

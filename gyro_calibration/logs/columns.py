@@ -18,14 +18,14 @@ A name of the log format states quantity and unit. The user assigns other names,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import difflib
 import math
 import re
 import shlex
 from typing import NamedTuple
 
-from gyro_calibration.files import InputError, to_printable
+from gyro_calibration.files import InputError, suggest_nearest, to_printable
 
 _DEGREE = math.radians(1.0)
 
@@ -45,6 +45,8 @@ COLUMNS: Mapping[str, tuple[str, float]] = {
     'moving': ('moving', 1.0),
 }
 QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
+#: Parts of a quaternion, from which a reader computes the reference heading.
+ATTITUDE = ('attitude_w', 'attitude_x', 'attitude_y', 'attitude_z')
 #: Axes of a gyro; column names may contain one, such as gyro_x_dps.
 AXES = ('x', 'y', 'z')
 
@@ -62,6 +64,7 @@ _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'acceleration': ('specific_force', {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}),
     'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
     'moving': ('moving', {'1': 1.0}),
+    'attitude': ('reference_heading', {'1': 1.0}),
 }
 #: Name of a quantity in options -> pattern of column names in other programs, in lower case,
 #: letters only, before the unit.
@@ -97,22 +100,30 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
 
     Returns
     -------
-    quantity -> column
+    quantity, or part of `ATTITUDE` -> column
 
     Raises
     ------
     InputError : an unknown quantity, column or unit, a quantity in two columns, or no output
 
     """
-    found: dict[str, Column] = {}
+    found, by_user = dict[str, Column](), set[str]()
     for name, text in user_columns.items():
         if name not in _OPTION_QUANTITIES:
             raise InputError(
                 f'{name} is no quantity of a log; wanted one of '
-                f'{", ".join(_OPTION_QUANTITIES)}{_suggest_nearest(name, _OPTION_QUANTITIES)}')
+                f'{", ".join(_OPTION_QUANTITIES)}{suggest_nearest(name, _OPTION_QUANTITIES)}')
         quantity, units = _OPTION_QUANTITIES[name]
-        found[quantity] = _find_column(header, name, text, units)
-    by_user = set(found)
+        if quantity in by_user:
+            raise InputError(f'heading and attitude both give the {quantity}; name one of them')
+        by_user.add(quantity)
+        columns = text.split('/') if name == 'attitude' else [text]
+        parts = ATTITUDE if name == 'attitude' else (quantity,)
+        if len(columns) != len(parts):
+            raise InputError(f'{name}={text}: wanted the four columns of a quaternion, such as '
+                             'attitude=qw/qx/qy/qz')
+        found |= {part: _find_column(header, name, column, units)
+                  for part, column in zip(parts, columns)}
     asked = {column.position for column in found.values()}
     for index, name in enumerate(header):
         quantity, factor = COLUMNS.get(_strip_axis(name, axis), ('', 0.0))
@@ -136,10 +147,10 @@ def _find_column(header: Sequence[str], name: str, text: str,
         column, _, unit = text.rpartition(':')
     if unit not in units:
         raise InputError(f'{name}={text}: {unit} is no unit of it; wanted one of '
-                         f'{", ".join(units)}')
+                         f'{", ".join(units)}{suggest_nearest(unit, units)}')
     if column not in header:
         raise InputError(f'{name}={text}: there is no column {column} among '
-                         f'{_shorten(",".join(header))}{_suggest_nearest(column, header)}')
+                         f'{_shorten(",".join(header))}{suggest_nearest(column, header)}')
     offset = {'K': -273.15, 'degF': -160.0 / 9.0}.get(unit, 0.0)
     return Column(header.index(column), units[unit], offset)
 
@@ -152,7 +163,8 @@ def _strip_axis(name: str, axis: str) -> str:
 
 def is_header(header: Sequence[str], user_columns: Mapping[str, str], axis: str) -> bool:
     """Tell whether a row contains at least one known column name."""
-    named = {text for name in user_columns.values() for text in (name, name.rpartition(':')[0])}
+    named = {text for names in user_columns.values() for name in (names, *names.split('/'))
+             for text in (name, name.rpartition(':')[0])}
     return any(name in named or _strip_axis(name, axis) in COLUMNS for name in header)
 
 
@@ -166,7 +178,8 @@ def suggest_columns(header: Sequence[str]) -> str:
             if quantity not in wanted and (unit := _guess_unit(name, quantity)):
                 wanted[quantity] = f'{quantity}={name}:{unit}'
     if 'gyro' in wanted:
-        text = ','.join(wanted.values())
+        attitude = '' if 'heading' in wanted else suggest_attitude(names)
+        text = ','.join(filter(None, [*wanted.values(), attitude]))
         units = (', with a unit in place of each UNIT, such as s, ms, deg/s, rad/s, deg, rad'
                  if 'UNIT' in text else '')
         return f'; perhaps --columns {shlex.quote(text)} is meant{units}'
@@ -174,6 +187,13 @@ def suggest_columns(header: Sequence[str]) -> str:
         if name not in COLUMNS and (close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
             return f'; perhaps {close[0]} is meant by {_shorten(name)}'
     return ''
+
+
+def suggest_attitude(names: Iterable[str]) -> str:
+    """Return what names the columns of a quaternion in --columns; '' without one."""
+    found = {name[-2:].lower(): name for name in names}
+    parts = [found.get(f'q{axis}', '') for axis in ('w', *AXES)]
+    return f'attitude={"/".join(parts)}' if all(parts) else ''
 
 
 def _guess_unit(name: str, quantity: str) -> str:
@@ -192,8 +212,3 @@ def _guess_unit(name: str, quantity: str) -> str:
 def _shorten(text: str) -> str:
     """Return at most 100 characters of a text, safe for a terminal."""
     return to_printable(text[:100])[:100]
-
-
-def _suggest_nearest(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
-    close = difflib.get_close_matches(name, names, 1)
-    return f'; perhaps {_shorten(close[0])} is meant' if close else ''

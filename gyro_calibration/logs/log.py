@@ -43,6 +43,8 @@ from gyro_calibration.files import (
     to_printable,
 )
 from gyro_calibration.logs.columns import (
+    ATTITUDE,
+    AXES,
     Column,
     COLUMNS,
     find_columns,
@@ -77,7 +79,7 @@ _MAX_LOG_VALUES = 1 << 29
 
 #: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
 _MAX_MAGNITUDES = {'temperature': 1e5}
-_NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading')
+_NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading', *ATTITUDE)
 #: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
 #: as text.
 _ParsedRows = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
@@ -151,8 +153,9 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     sensitivity : rad/s per count; used where the file has raw counts only
     rate : sample rate, Hz, which replaces the time in the file
     columns : names of columns outside of the log format: time, gyro, counts, temperature, rate,
-        heading, acceleration, supply or moving -> name, or name:unit
-    axis : x, y or z, for columns such as gyro_x_dps
+        heading, acceleration, supply or moving -> name, or name:unit; or attitude -> the four
+        names of a quaternion, w/x/y/z, whose rotation about the axis is the reference heading
+    axis : x, y or z, for columns such as gyro_x_dps, and for an attitude
     on_progress : as for `read_log_blocks`
 
     Raises
@@ -196,6 +199,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
 
     """
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
+    rotation = _AxisRotation(axis)
     with _convert_read_errors(path), open_regular_file(
             path, allow_pipes=True) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
@@ -220,6 +224,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
             last = _refuse_unordered_time(path, places, arrays.get('time'), last)
+            rotation.replace_attitude(arrays)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
             if on_progress is not None and file.seekable():
@@ -227,7 +232,8 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             if count > 1:
                 yield Log(**arrays, notes=table.notes, others=others)
     if count < 2:
-        raise LogError(f'{path}: {count} rows of data, but at least 2 are needed; record more')
+        raise LogError(f'{path}: has {count} of the 2 rows of data that are needed at least; '
+                       'record more')
 
 
 @contextmanager
@@ -301,6 +307,9 @@ def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, s
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_normalize_newlines(name.strip()) for name in next(rows, [])]
     if not is_header(header, columns, axis):
+        if not header:
+            raise LogError(f'{path}: has no line with the names of columns; record again, or name '
+                           'another file')
         meant = suggest_columns(header) or (
             '; put one such as time_s,gyro_dps,reference_heading_deg there, with # before the '
             'lines above it, or name the columns, as by --columns time=NAME:s,gyro=NAME:deg/s')
@@ -452,7 +461,8 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
         arrays: dict[str, Any] = {quantity: np.asarray(table[list(table)[index]], float) * factor
                                   + offset for quantity, (index, factor, offset) in found.items()}
     except (TypeError, ValueError) as error:
-        raise LogError(f'the table is no log: {describe_error(error)}') from None
+        fault = error if isinstance(error, InputError) else describe_error(error)
+        raise LogError(f'the table is no log: {fault}') from None
     shapes = {values.shape for values in arrays.values()}
     if len(shapes) > 1 or min(shapes) < (2,) or len(min(shapes)) != 1:
         raise LogError(f'the columns have shapes {sorted(shapes)}; wanted one shape (n,), with at '
@@ -462,6 +472,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
             raise LogError(f'row {int(np.argmax(wrong))} of {header[found[quantity].position]} is '
                            f'{values[np.argmax(wrong)]:g}; remove the row')
     _refuse_unordered_time('the table', range(*min(shapes)), arrays.get('time'), -math.inf)
+    _AxisRotation(axis).replace_attitude(arrays)
     return Log(**arrays)
 
 
@@ -472,6 +483,41 @@ def select_rows(log: Log, rows: slice | Mask | NDArray[np.integer[Any]]) -> Log:
                               if getattr(log, name) is not None}
     others = {name: tuple(texts[place] for place in which) for name, texts in log.others.items()}
     return replace(log, **arrays, others=others)
+
+
+class _AxisRotation:
+    """
+    Integrates attitudes to the angle that a gyro with one axis turns, tilted or not.
+
+    The rotations between neighbouring attitudes are added by their component along the axis of
+    the sensor. A quaternion turns axes of the sensor into those of the room.
+
+    """
+
+    def __init__(self, axis: str):
+        self._axis = AXES.index(axis)
+        self._angle, self._last = 0.0, np.empty((0, 4))
+
+    def replace_attitude(self, arrays: dict[str, Array]) -> None:
+        """Replace the parts of a quaternion, in quantity -> values, by the reference heading."""
+        if ATTITUDE[0] not in arrays:
+            return
+        attitude = np.stack([arrays.pop(part) for part in ATTITUDE], axis=1)
+        length = np.linalg.norm(attitude, axis=1)
+        known = np.abs(length - 1.0) < 0.4  # as in recordings
+        heading = np.full(len(attitude), np.nan)
+        if known.any():
+            path = np.concatenate([self._last, attitude[known] / length[known, None]])
+            (w0, v0), (w1, v1) = ((each[:, :1], each[:, 1:]) for each in (path[:-1], path[1:]))
+            cosine = w0 * w1 + np.sum(v0 * v1, axis=1, keepdims=True)
+            vector = w0 * v1 - w1 * v0 - np.cross(v0, v1)
+            sine = np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
+            turned = (2.0 * np.copysign(np.arctan2(sine, np.abs(cosine)), cosine) / sine
+                      * vector)[:, self._axis]
+            angles = self._angle + np.cumsum(turned)
+            heading[known] = angles if len(self._last) else np.concatenate([[0.0], angles])
+            self._angle, self._last = float(heading[known][-1]), path[-1:]
+        arrays['reference_heading'] = heading
 
 
 #: Largest difference from a full turn of a jump of a wrapped heading, turns.

@@ -175,11 +175,13 @@ def refuse_dead(output: Array) -> None:
     values, counts = np.unique(output, return_counts=True)
     share, value = counts.max() / len(output), float(values[counts.argmax()])
     if len(values) == 1:
-        raise DataRefused(f'all {len(output)} samples have the same value, {value:g} rad/s: '
-                          'the gyro is dead or not powered')
+        raise DataRefused(f'all {len(output)} samples have the same value, '
+                          f'{value / DEGREE:g} deg/s: the gyro is dead or not powered; check '
+                          'power and wires')
     if share > 0.9:  # the last bit may toggle
-        raise DataRefused(f'{100 * share:.1f} % of the samples have the same value, {value:g} '
-                          'rad/s: the gyro is dead, not powered, or did not move')
+        raise DataRefused(f'{100 * share:.1f} % of the samples have the same value, '
+                          f'{value / DEGREE:g} deg/s: the gyro is dead, not powered, or did not '
+                          'move; check power and wires')
 
 
 def refuse_saturated(output: Array) -> None:

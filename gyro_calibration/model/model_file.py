@@ -17,7 +17,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.files import describe_error, InputError, MAX_MAGNITUDE, write_atomically
+from gyro_calibration.files import (
+    describe_error,
+    InputError,
+    MAX_MAGNITUDE,
+    suggest_nearest,
+    write_atomically,
+)
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import (
     CATALOGUE,
@@ -75,7 +81,7 @@ def parse_model(content: Any, name: str = 'the model') -> GyroModel:
     try:
         return _parse_content(content)
     except InvalidValue as error:
-        raise ModelError(f'{name}: {error}; correct it (see docs/explanation/error_model.md) '
+        raise ModelError(f'{name}: {error}; correct it (see docs/reference/error_model.md) '
                          'or calibrate again') from None
 
 
@@ -161,7 +167,8 @@ def _parse_term(name: str, values: Any) -> Term:
         return _parse_polynomial(place, given)
     if name not in CATALOGUE:
         raise InvalidValue(place, given, 'an effect that this version knows, or one of your own '
-                           f'(--catalogue): {", ".join([*CATALOGUE, POLYNOMIAL])}')
+                           f'(--catalogue): {", ".join([*CATALOGUE, POLYNOMIAL])}'
+                           f'{suggest_nearest(name, CATALOGUE)}')
     return Term(CATALOGUE[name], _parse_values(place, CATALOGUE[name], given))
 
 

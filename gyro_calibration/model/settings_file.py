@@ -25,7 +25,7 @@ import re
 import reprlib
 from typing import Any
 
-from gyro_calibration.files import MAX_MAGNITUDE, read_bytes, to_printable
+from gyro_calibration.files import MAX_MAGNITUDE, read_bytes, suggest_nearest, to_printable
 import numpy as np
 import yaml
 
@@ -69,7 +69,8 @@ class InvalidValue(ValueError):
     """A value does not fit its schema; the message is part of a sentence."""
 
     def __init__(self, key_path: str, value: Any, expected: str):
-        super().__init__(f'{to_printable(key_path[:100])} is {_SHORT_REPR.repr(value)}; wanted '
+        super().__init__(f'{to_printable(key_path[:100])} is '
+                         f'{"empty" if value is None else _SHORT_REPR.repr(value)}; wanted '
                          f'{expected}')
 
 
@@ -105,7 +106,9 @@ def refuse_unknown_names(key_path: str, given: Mapping[str, Any],
     """Raise `InvalidValue` for an unknown name."""
     for name in given:
         if name not in known:
-            raise InvalidValue(f'{key_path}.{name}', given[name], f'one of {", ".join(known)}')
+            place = name if key_path == 'the file' else f'{key_path}.{name}'
+            raise InvalidValue(place, given[name],
+                               f'one of {", ".join(known)}{suggest_nearest(name, known)}')
 
 
 def parse_number(key_path: str, value: Any, low: float = -MAX_MAGNITUDE,

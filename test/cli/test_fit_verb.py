@@ -146,10 +146,12 @@ def test_as_many_values_as_dwells_are_fitted_but_nothing_says_how_sure_they_are(
      'record '
      'temperature_degc'),
     ('0,0.1\n10,10\n', ['--polynomial', '3,0'], 1, '2 dwells do not determine 4 values'),
-    ('0,0.1\n10,10\n', ['--effects', 'bias,charm'], 2, "'charm' is an unknown effect"),
+    ('0,0.1\n10,10\n', ['--effects', 'bias,charm'], 2, "'charm' is no effect that dwells"),
     ('0,0.1\n10,10\n', ['--polynomial', '3'], 2, 'is not two orders'),
     ('0,0.1\n10,10\n', ['--polynomial', '3,2', '--effects', 'bias'], 2, 'not allowed with'),
     ('0,0.1\n10,10\n', ['--method', 'likelihood'], 1, 'no reference over time'),
+    ('0,0\n10,573\n-10,-573\n', [], 1,
+     'the gyro is in deg/s and read as rad/s, or the reference in'),
     ('0,0.1\n10,ten\n', [], 2, "line 3, column gyro_dps: 'ten' is not a number"),
 ])
 def test_what_does_not_work_ends_with_one_sentence(run, tmp_path, rows, words, code, said):

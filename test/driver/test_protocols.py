@@ -329,7 +329,9 @@ def test_increments_are_refused_where_the_device_sends_rates():
             find_protocol(name).decoder(replace(SETTINGS[name], increments=True))
 
 
-@pytest.mark.parametrize('name', ['kvh_dsp_3000', ''])
-def test_an_unknown_protocol_is_refused_with_the_known_ones(name):
-    with pytest.raises(ValueError, match=rf'^protocol .*: choose one of {", ".join(PROTOCOLS)}$'):
+@pytest.mark.parametrize(
+    'name, near', [('kvh_dsp_3000', '; perhaps kvh_dsp3000 is meant'), ('', '')])
+def test_an_unknown_protocol_is_refused_with_the_known_ones(name, near):
+    known = ', '.join(PROTOCOLS)
+    with pytest.raises(ValueError, match=f'^protocol .*: choose one of {known}{near}$'):
         find_protocol(name)

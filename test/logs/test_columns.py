@@ -18,11 +18,13 @@ from gyro_calibration.logs.log import (
     log_from_table,
     LogError,
     read_log,
+    read_log_blocks,
     select_rows,
     unwrap_heading,
 )
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 DEGREE = math.pi / 180.0
 
@@ -180,6 +182,52 @@ def test_a_part_holds_all_columns():
     log = Log(output=np.arange(4.0), time=np.arange(4.0), others={'a': ('w', 'x', 'y', 'z')})
     found = select_rows(log, log.time > 1.0)
     assert found.output.tolist() == [2.0, 3.0] and found.others == {'a': ('y', 'z')}
+
+
+def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(tmp_path):
+    time = np.arange(0.0, 20.0, 1e-3)
+    rates = np.stack([np.cos(1.3 * time), 0.8 * np.sin(time), 1.5 * np.sin(0.7 * time)], axis=1)
+    attitudes = [Rotation.from_rotvec([0.2, -0.1, 0.3])]
+    for rate in 0.5 * (rates[1:] + rates[:-1]):
+        attitudes.append(attitudes[-1] * Rotation.from_rotvec(1e-3 * rate))
+    quaternion = np.array([each.as_quat() for each in attitudes])[::20, [3, 0, 1, 2]]
+    quaternion[::3] *= -1.0  # both signs are the same attitude
+    turned = np.concatenate([[0.0], np.cumsum(0.5e-3 * (rates[1:, 2] + rates[:-1, 2]))])[::20]
+    yaw = np.unwrap([each.as_euler('ZYX')[0] for each in attitudes[::20]])
+    assert np.ptp(yaw - turned) > 1.0, 'it does not tilt'
+    quaternion[400:404] = np.nan
+    names = {'gyro': 'w', 'attitude': 'qw/qx/qy/qz'}
+    table = dict(zip(('time_s', 'w', 'qw', 'qx', 'qy', 'qz'),
+                     (time[::20], rates[::20, 2], *quaternion.T)))
+    rows = '\n'.join(','.join(map(repr, map(float, row))) for row in zip(*table.values()))
+    path = written(tmp_path, f'{",".join(table)}\n{rows}\n')
+    found = [read_log(path, columns=names), log_from_table(table, names)]
+    blocks = [each.reference_heading for each in read_log_blocks(path, rows=300, columns=names)]
+    known = np.isfinite(quaternion[:, 0])
+    for heading in (*(each.reference_heading for each in found), np.concatenate(blocks)):
+        assert (np.isfinite(heading) == known).all()
+        np.testing.assert_allclose(heading[:400], turned[:400], atol=3e-4)
+        # over the gap of 0.1 s, the shortest rotation
+        np.testing.assert_allclose(heading[known], turned[known], atol=1e-2)
+
+
+def test_the_columns_of_an_attitude_are_named_where_a_reference_is_missing(run, tmp_path):
+    path = written(tmp_path, 'time_s,gyro_dps,ref_qx,ref_qy,ref_qz,ref_qw\n'
+                   '0,1,0,0,0,1\n1,2,0,0,0,1\n')
+    code, text, error = run('diagnose', path)
+    attitude = 'attitude=ref_qw/ref_qx/ref_qy/ref_qz'
+    assert (code, text) == (1, '') and f'add {attitude} to --columns\n' in error
+    path.write_text(path.read_text().replace('time_s,gyro_dps', 't,wz'))
+    assert f'--columns time=t:UNIT,gyro=wz:UNIT,{attitude} is meant' in run('diagnose', path)[2]
+
+
+@pytest.mark.parametrize('names, said', [
+    ({'attitude': 'qw'}, 'the four columns of a quaternion'),
+    ({'attitude': 'w/w/w/v'}, 'no column v among'),
+    ({'attitude': 'w/w/w/w', 'heading': 'w'}, 'heading and attitude both')])
+def test_an_attitude_is_named_by_four_columns_and_is_the_only_heading(tmp_path, names, said):
+    with pytest.raises(LogError, match=said):
+        read_log(written(tmp_path, 'gyro_dps,w\n1,1\n2,2\n'), columns=names)
 
 
 def test_an_empty_cell_of_a_reference_is_a_lost_value(tmp_path):

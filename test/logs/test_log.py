@@ -53,8 +53,8 @@ def test_every_column_is_converted_to_si(tmp_path, column, attribute, factor):
 
 
 REFUSED = {
-    'empty': ('', 'line 1 is no header'),
-    'only notes': ('# a\n# b\n', 'line 3 is no header'),
+    'empty': ('', 'has no line with the names'),
+    'only notes': ('# a\n# b\n', 'has no line with the names'),
     'no header': ('# note\n0.0,1.0\n0.1,1.0\n', 'line 2 is no header'),
     'no gyro': ('time_s,temperature_degc\n0,1\n1,1\n',
                 'no gyro column among time_s,temperature_degc'),
@@ -79,7 +79,7 @@ REFUSED = {
                  'line 3, column gyro_dps: -inf is not a finite number'),
     'infinite reference': ('gyro_dps,reference_heading_deg\n0,1\n1,inf\n',
                            'line 3, column reference_heading_deg'),
-    'one row': ('gyro_dps\n0\n', '1 rows of data'),
+    'one row': ('gyro_dps\n0\n', '1 of the 2 rows of data'),
     'short row': ('time_s,gyro_dps\n0,1\n1\n', 'line 3 has 1 values where the header has 2'),
     'long row': ('time_s,gyro_dps\n0,1\n1,2,3\n', 'line 3 has 3 values where the header has 2'),
     'text after a text': ('gyro_dps,place\n0,"a\nb"\n1,c\nfast,d\n',

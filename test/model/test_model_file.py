@@ -70,14 +70,14 @@ def test_a_file_without_tolerances_is_one_of_a_model_that_has_none(tmp_path):
 BAD = {
     'a tolerance below zero': ('effects: {}\ntolerance: {bias: -1.0}', 'tolerance.bias is -1.0'),
     'an unknown tolerance': ('effects: {}\ntolerance: {magic: 1.0}', 'tolerance.magic is 1.0'),
-    'empty': ('', 'the file is None'),
+    'empty': ('', 'the file is empty'),
     'a list': ('[1, 2]', 'the file is [1, 2]'),
     'a number': ('3', 'the file is 3'),
     'no YAML': ('effects: {bias: {bias: 0.01}\nvalid: [', 'cannot be read as YAML (line 2: '),
     'binary': (b'\xff\xfe\x00\x01', 'cannot be read as YAML'),
     'a noise that vanishes when it is squared': (
         'effects: {}\nnoise: {angle_random_walk: 1.0e-300}', 'noise.angle_random_walk is 1e-300'),
-    'other YAML': ('name: a robot\nwheels: 4\n', 'effects is None'),
+    'other YAML': ('name: a robot\nwheels: 4\n', 'effects is empty'),
     'another format': ('format: a/b\neffects: {}\n', "format is 'a/b'"),
     'newer version': ('version: 2\neffects: {}',
                       'version is 2; wanted at most 1: install a newer'),
@@ -88,7 +88,7 @@ BAD = {
     'unknown effect': ('effects: {magic: {magic: 1.0}}',
                        'an effect that this version knows, or one of your own '
                        '(--catalogue): bias'),
-    'no value': ('effects: {bias: {}}', 'effects.bias.bias is None; wanted a finite number'),
+    'no value': ('effects: {bias: {}}', 'effects.bias.bias is empty; wanted a finite number'),
     'unknown value': ('effects: {bias: {bias: 1.0, bais: 2.0}}',
                       'effects.bias.bais is 2.0; wanted one of bias'),
     'nan': ('effects: {bias: {bias: .nan}}', 'effects.bias.bias is nan; wanted a finite number'),

@@ -13,7 +13,7 @@ Wire formats of serial gyros: bytes to samples and back, and recognition of form
 
 This package uses no port, no ROS and no clock.
 
->>> decoder = find('kvh_dsp3000').decoder()
+>>> decoder = find_protocol('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')
 [Sample(output=-0.00027459265121626786, ...)]
 
@@ -30,6 +30,7 @@ from gyro_calibration.driver.protocols.minimu9 import MINIMU9
 from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample, Settings
 from gyro_calibration.driver.protocols.razor import RAZOR
 from gyro_calibration.driver.protocols.witmotion import WITMOTION
+from gyro_calibration.files import suggest_nearest
 
 PROTOCOLS = {protocol.name: protocol for protocol in (KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA,
                                                       MINIMU9, WITMOTION, RAZOR, CSV)}
@@ -41,4 +42,5 @@ def find_protocol(name: str) -> Protocol:
     """Return a protocol by its name; ValueError names the known ones where there is none."""
     if name in PROTOCOLS:
         return PROTOCOLS[name]
-    raise ValueError(f'protocol {name!r} is not known: choose one of {", ".join(PROTOCOLS)}')
+    raise ValueError(f'protocol {name!r} is not known: choose one of {", ".join(PROTOCOLS)}'
+                     f'{suggest_nearest(name, PROTOCOLS)}')
