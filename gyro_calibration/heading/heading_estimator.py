@@ -269,15 +269,15 @@ class HeadingEstimator:
                 model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
-        propagated = propagate_calibration(calibration, self.table, self.age(now), now,
-                                           self._known_temperature, self.is_calibrated_this_run)
-        self._calibration_message = propagated.message
+        calibration, self._calibration_message = propagate_calibration(
+            calibration, self.table, self.age(now), now, self._known_temperature,
+            self.is_calibrated_this_run)
         if (self._dated_age(now) or 0.0) < -_AGE_TOLERANCE:
             self._calibration_message = (
                 f'the calibration is dated {calibration.time}, which is later than the clock of '
                 'this computer: its age is not known and taken for a year; set the clock, or '
                 'calibrate again')
-        return with_self_calibration(model, propagated.calibration), 0.0
+        return with_self_calibration(model, calibration), 0.0
 
     @property
     def calibration_message(self) -> str:
