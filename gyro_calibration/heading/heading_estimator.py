@@ -571,9 +571,8 @@ class HeadingEstimator:
             if abs(at - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
                 places.append(place)
                 self._rest_sensitivity_time = at
-        rows = self._sensitivity_rows(places, output, np.zeros(len(output)), result, distance)
-        counts = np.diff([0, *places, len(time)])
-        whole = np.repeat(np.vstack([self._rest_sensitivity, rows]), counts, axis=0)
+        whole = self._hold_sensitivities(self._rest_sensitivity, places, output,
+                                         np.zeros(len(output)), result, distance)
         self._rest_sensitivity = whole[-1]
         return whole
 
@@ -590,22 +589,21 @@ class HeadingEstimator:
                 and self._held_time_and_rate[0] > -math.inf):
             self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
         held = self._rest_sensitivity if self._held_sensitivity is None else self._held_sensitivity
-        rows = self._sensitivity_rows(places, output, rates, result, distance)
         self._held_time_and_rate = held_time_and_rate
-        whole = np.repeat(np.vstack([held, rows]), np.diff([0, *places, len(time)]), axis=0)
+        whole = self._hold_sensitivities(held, places, output, rates, result, distance)
         self._held_sensitivity = whole[-1]
         return whole
 
-    def _sensitivity_rows(self, places: list[int], output: Array, rate: Array,
-                          result: CompensatedSamples, distance: Array) -> Array:
-        """Return the sensitivities of some samples, shape (k, m)."""
-        if not places:
-            return np.empty((0, len(self.covariance)))
-        temperature = result.temperature
-        if isinstance(temperature, np.ndarray):
-            temperature = temperature[places]
-        return self._uncertain_sensitivity(output[places], rate[places], temperature, None,
-                                           distance[places]).T
+    def _hold_sensitivities(self, held: Array, places: list[int], output: Array, rate: Array,
+                            result: CompensatedSamples, distance: Array) -> Array:
+        """Return a sensitivity, and from each place on the one computed there, shape (n, m)."""
+        rows, temperature = [held], result.temperature
+        if places:
+            if isinstance(temperature, np.ndarray):
+                temperature = temperature[places]
+            rows.extend(self._uncertain_sensitivity(
+                output[places], rate[places], temperature, None, distance[places]).T)
+        return np.repeat(rows, np.diff([0, *places, len(output)]), axis=0)
 
     # The bias at rest for the next run
 

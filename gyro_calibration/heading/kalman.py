@@ -301,9 +301,10 @@ def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:
 @lru_cache(maxsize=4096)
 def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
                        value_count: int) -> tuple[Array, Array, Array]:
-    """Return one of the two transitions with room for the values of a calibration."""
-    seen, kept, grown = (_unobserved_transition if is_unobserved else _wander_transition)(
-        noise, duration)
+    """Return the transition of `_wander_transition`, with room for calibrated values."""
+    seen, kept, grown = _wander_transition(noise, duration)
+    if is_unobserved:  # walk and flicker go on, and contribute nothing
+        seen[:] = grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
     whole = np.zeros((len(kept) + value_count, len(kept) + value_count))
     whole[:len(kept), :len(kept)] = grown
     return (np.concatenate([seen, np.zeros(value_count)]),
@@ -326,13 +327,6 @@ def _wander_transition(noise: Noise, duration: float) -> tuple[Array, Array, Arr
     grown[HEADING_INDEX, _FLICKER_INDEX:] = -variance * constants * (1.0 - left) ** 2
     grown[:, HEADING_INDEX] = grown[HEADING_INDEX]
     grown[HEADING_INDEX, HEADING_INDEX] = integral
-    return seen, kept, grown
-
-
-def _unobserved_transition(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
-    """Return the same without rates: walk and flicker go on, and contribute nothing."""
-    seen, kept, grown = (values.copy() for values in _wander_transition(noise, duration))
-    seen[:] = grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
     return seen, kept, grown
 
 

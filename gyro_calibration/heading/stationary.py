@@ -233,7 +233,8 @@ class Snapshot:
     state, deleted_heading, step_count : the state, the heading deleted until then, rad, and number
         of steps
     rate_integral : integral of the rates since the rest began
-    innovation, variance : last innovation, rad, and its variance by noise and bias, rad²
+    innovation, variance : deviation of the last angle from the mean of this rest before it, or
+        at first from the state, rad, and its variance by noise, rad²
     scatter : median of `SCATTER_RATIOS` by the innovations so far; 0 before the first
     log_likelihood : of the innovations since the rest began, by `SCATTER_RATIOS`, shape (k,)
 

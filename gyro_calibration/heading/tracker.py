@@ -681,8 +681,9 @@ class HeadingTracker:
         self.is_resting, self._rest_integral = True, self._zero_integral
         self._recognition_left, self._wheels_stand = 0.0, False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
+        _, median = self._rest_scatter.mean_and_median(np.zeros(1))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
-                                    len(self.steps))]
+                                    len(self.steps), scatter=median)]
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
@@ -808,12 +809,17 @@ class HeadingTracker:
 
     def _advance_at_rest(self, turn: RateIntegral, remaining: RateIntegral) -> None:
         """Propagate the state over a part of a rest, and update the scatter of its rates."""
-        before, (expected, variance) = self._snapshots[-1], self._state.expected_rest_angle(turn)
+        before, past, share = self._snapshots[-1], self._rest_integral, 1.0
         white = self._state.noise.angle_random_walk ** 2 * turn.duration
+        if past.duration > 0.0:  # an error of the bias at the begin of the rest is no scatter
+            share += turn.duration / past.duration
+            expected, variance = turn.duration * past.angle / past.duration, share * white
+        else:
+            expected, variance = self._state.expected_rest_angle(turn)
         innovation, wander = turn.angle - expected, SCATTER_RATIOS * white
         shared = SCATTER_CORRELATIONS * wander
         gain = shared / (before.variance + wander)
-        spread = variance + wander - gain * shared
+        spread = variance + share * wander - gain * shared
         likelihood = before.log_likelihood - 0.5 * (
             (innovation - gain * before.innovation) ** 2 / spread + np.log(spread / variance))
         scatter, median = self._rest_scatter.mean_and_median(likelihood)
