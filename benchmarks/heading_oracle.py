@@ -32,11 +32,11 @@ import argparse
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise
+from heading_track import track
 import numpy as np
 from scipy.signal import lfilter
 
