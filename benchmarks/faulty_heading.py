@@ -39,7 +39,6 @@ from gyro_calibration.calibration.self_calibration import self_calibrate, to_mod
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
@@ -47,6 +46,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.model.noise import simulate_noise
 from gyro_calibration.model.presets import Preset
+from heading_track import track
 import numpy as np
 
 BURST = 0.016  # s; what an FTDI adapter collects by default

@@ -168,8 +168,8 @@ def carried_answers(generator, curve, runs=4, rests=12, **given):
                           temperature=history.temperature[0, made])
     time, rows = history.time[run, 0], []
     for table in (BiasTable(MODEL), learned(history, run)):
-        now = propagate_calibration(calibration, table, time - history.time[0, made], time,
-                                    history.temperature[run, 0]).calibration
+        now, _ = propagate_calibration(calibration, table, time - history.time[0, made], time,
+                                       history.temperature[run, 0])
         rows.append((now.bias - history.bias[run, 0], now.standard_deviations[1]))
     return np.array(rows)
 

@@ -135,27 +135,6 @@ class Jump:
 _Dated = TypeVar('_Dated', Entry, Jump)
 
 
-@dataclass(frozen=True)
-class PropagatedCalibration:
-    """
-    A stored calibration propagated to the present.
-
-    Attributes
-    ----------
-    calibration : with the present bias and covariance; to be used, and not to be stored
-    bias_change : its bias less the stored one, rad/s
-    variance_growth : increase of the variance of the bias, (rad/s)²; negative if the table is more
-        precise; nan if it was not known
-    message : for diagnostics, if age or temperature matters; else ''
-
-    """
-
-    calibration: SelfCalibration
-    bias_change: float
-    variance_growth: float
-    message: str
-
-
 class BiasTable:
     """
     Biases at rest over temperature, of one gyro behind one model.
@@ -503,7 +482,7 @@ def _clip_to_range(temperature: float, time: float) -> tuple[float, float]:
 
 def propagate_calibration(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
                           temperature: float | None = None,
-                          this_run: bool = False) -> PropagatedCalibration:
+                          this_run: bool = False) -> tuple[SelfCalibration, str]:
     """
     Return a stored calibration propagated to the present by the table.
 
@@ -514,33 +493,26 @@ def propagate_calibration(calibration: SelfCalibration, table: BiasTable, age: f
 
     Parameters
     ----------
-    calibration : as it was stored
+    calibration : as it was stored, with a covariance
     table : of the model in use; may be empty
     age : of the calibration, s
     time : now, s since 1970
     temperature : now, degC; None where it is not known
     this_run : the calibration was made in this run
 
+    Returns
+    -------
+    the calibration with the present bias and covariance, to be used and not to be stored; and a
+    sentence for diagnostics if age or temperature matters, else ''
+
     """
-    if calibration.covariance is None:
-        return _move_calibration(calibration, table, time, temperature)
-    (a, c), (_, own) = calibration.covariance
+    assert calibration.covariance is not None
+    (a, c), _ = calibration.covariance
     bias, variance, weight = table.combine_with_calibration(
         calibration, age, time, temperature, this_run)
-    moved = replace(calibration, bias=bias, covariance=((a, weight * c), (weight * c, variance)))
-    return PropagatedCalibration(
-        moved, bias - calibration.bias, variance - own,
-        _propagation_message(calibration, table, age, temperature, variance))
-
-
-def _move_calibration(calibration: SelfCalibration, table: BiasTable, time: float,
-                      temperature: float | None) -> PropagatedCalibration:
-    """Return a calibration without a covariance, at another temperature."""
-    here = calibration.temperature
-    change = (0.0 if here is None or temperature is None
-              else table.bias_difference(here, temperature, time)[0])
-    return PropagatedCalibration(replace(calibration, bias=calibration.bias + change), change,
-                                 math.nan, '')
+    return (replace(calibration, bias=bias,
+                    covariance=((a, weight * c), (weight * c, variance))),
+            _propagation_message(calibration, table, age, temperature, variance))
 
 
 def _propagation_message(calibration: SelfCalibration, table: BiasTable, age: float,

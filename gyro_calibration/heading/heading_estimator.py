@@ -269,15 +269,15 @@ class HeadingEstimator:
                 model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
-        propagated = propagate_calibration(calibration, self.table, self.age(now), now,
-                                           self._known_temperature, self.is_calibrated_this_run)
-        self._calibration_message = propagated.message
+        calibration, self._calibration_message = propagate_calibration(
+            calibration, self.table, self.age(now), now, self._known_temperature,
+            self.is_calibrated_this_run)
         if (self._dated_age(now) or 0.0) < -_AGE_TOLERANCE:
             self._calibration_message = (
                 f'the calibration is dated {calibration.time}, which is later than the clock of '
                 'this computer: its age is not known and taken for a year; set the clock, or '
                 'calibrate again')
-        return with_self_calibration(model, propagated.calibration), 0.0
+        return with_self_calibration(model, calibration), 0.0
 
     @property
     def calibration_message(self) -> str:
@@ -571,9 +571,8 @@ class HeadingEstimator:
             if abs(at - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
                 places.append(place)
                 self._rest_sensitivity_time = at
-        rows = self._sensitivity_rows(places, output, np.zeros(len(output)), result, distance)
-        counts = np.diff([0, *places, len(time)])
-        whole = np.repeat(np.vstack([self._rest_sensitivity, rows]), counts, axis=0)
+        whole = self._hold_sensitivities(self._rest_sensitivity, places, output,
+                                         np.zeros(len(output)), result, distance)
         self._rest_sensitivity = whole[-1]
         return whole
 
@@ -590,22 +589,21 @@ class HeadingEstimator:
                 and self._held_time_and_rate[0] > -math.inf):
             self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
         held = self._rest_sensitivity if self._held_sensitivity is None else self._held_sensitivity
-        rows = self._sensitivity_rows(places, output, rates, result, distance)
         self._held_time_and_rate = held_time_and_rate
-        whole = np.repeat(np.vstack([held, rows]), np.diff([0, *places, len(time)]), axis=0)
+        whole = self._hold_sensitivities(held, places, output, rates, result, distance)
         self._held_sensitivity = whole[-1]
         return whole
 
-    def _sensitivity_rows(self, places: list[int], output: Array, rate: Array,
-                          result: CompensatedSamples, distance: Array) -> Array:
-        """Return the sensitivities of some samples, shape (k, m)."""
-        if not places:
-            return np.empty((0, len(self.covariance)))
-        temperature = result.temperature
-        if isinstance(temperature, np.ndarray):
-            temperature = temperature[places]
-        return self._uncertain_sensitivity(output[places], rate[places], temperature, None,
-                                           distance[places]).T
+    def _hold_sensitivities(self, held: Array, places: list[int], output: Array, rate: Array,
+                            result: CompensatedSamples, distance: Array) -> Array:
+        """Return a sensitivity, and from each place on the one computed there, shape (n, m)."""
+        rows, temperature = [held], result.temperature
+        if places:
+            if isinstance(temperature, np.ndarray):
+                temperature = temperature[places]
+            rows.extend(self._uncertain_sensitivity(
+                output[places], rate[places], temperature, None, distance[places]).T)
+        return np.repeat(rows, np.diff([0, *places, len(output)]), axis=0)
 
     # The bias at rest for the next run
 

@@ -301,39 +301,27 @@ def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:
 @lru_cache(maxsize=4096)
 def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
                        value_count: int) -> tuple[Array, Array, Array]:
-    """Return one of the two transitions with room for the values of a calibration."""
-    seen, kept, grown = (_unobserved_transition if is_unobserved else _wander_transition)(
-        noise, duration)
-    whole = np.zeros((len(kept) + value_count, len(kept) + value_count))
-    whole[:len(kept), :len(kept)] = grown
-    return (np.concatenate([seen, np.zeros(value_count)]),
-            np.concatenate([kept, np.ones(value_count)]), whole)
-
-
-def _wander_transition(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
     """
-    Return contributions of heading, walk and flicker to the integral, decay, and process noise.
+    Return contributions to the integral, decay, and process noise, with calibrated values last.
 
-    White noise is not included.
+    White noise is not included. Without rates, walk and flicker go on, and contribute nothing.
 
     """
     constants, variance = noise.flicker_processes()
     left, walk = np.exp(-duration / constants), noise.rate_random_walk ** 2
-    kept = np.concatenate([[1.0, 1.0], left])
     (seen,), (integral,) = _integrated_wander(noise, np.array([duration]))
-    grown = np.diag(np.concatenate([[0.0, walk * duration], variance * (1.0 - left ** 2)]))
-    grown[HEADING_INDEX, WALK_INDEX] = -0.5 * walk * duration ** 2
-    grown[HEADING_INDEX, _FLICKER_INDEX:] = -variance * constants * (1.0 - left) ** 2
-    grown[:, HEADING_INDEX] = grown[HEADING_INDEX]
-    grown[HEADING_INDEX, HEADING_INDEX] = integral
-    return seen, kept, grown
-
-
-def _unobserved_transition(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
-    """Return the same without rates: walk and flicker go on, and contribute nothing."""
-    seen, kept, grown = (values.copy() for values in _wander_transition(noise, duration))
-    seen[:] = grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
-    return seen, kept, grown
+    grown = np.diag(np.concatenate(
+        [[0.0, walk * duration], variance * (1.0 - left ** 2), np.zeros(value_count)]))
+    if is_unobserved:
+        seen[:] = 0.0
+    else:
+        flicker = slice(_FLICKER_INDEX, len(seen))
+        grown[HEADING_INDEX, WALK_INDEX] = -0.5 * walk * duration ** 2
+        grown[HEADING_INDEX, flicker] = -variance * constants * (1.0 - left) ** 2
+        grown[:, HEADING_INDEX] = grown[HEADING_INDEX]
+        grown[HEADING_INDEX, HEADING_INDEX] = integral
+    return (np.concatenate([seen, np.zeros(value_count)]),
+            np.concatenate([[1.0, 1.0], left, np.ones(value_count)]), grown)
 
 
 def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral],

@@ -17,24 +17,17 @@ A model with history is evaluated over blocks of the log.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
-from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.kalman import HEADING_INDEX, HeadingState, smooth_states
-from gyro_calibration.heading.tracker import (
-    HeadingTracker,
-    MAX_ACCELERATION,
-    MAX_RATE_STEP,
-    Settings,
-)
+from gyro_calibration.heading.tracker import HeadingTracker, MAX_ACCELERATION, MAX_RATE_STEP
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, select_rows
 from gyro_calibration.model.compensation import compensate, CompensatedSamples, rate_sensitivity
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
-from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 
@@ -179,63 +172,6 @@ def _interpolate_heading(time: Array, heading: Array | None) -> Array | float:
     if heading is None or not (known := np.isfinite(heading)).any():
         return 0.0
     return heading if known.all() else np.interp(time, time[known], heading[known])
-
-
-@dataclass(frozen=True)
-class Track:
-    """
-    A heading over a log.
-
-    Attributes
-    ----------
-    heading, variance, rate, rate_variance : rad, rad², rad/s and (rad/s)², shape (n,)
-    resting : shape (n,)
-    deleted_heading : heading attributed to bias or noise at rest, or deleted by the threshold
-        filter, rad
-    intervals : of the samples, with the number of lost ones
-
-    """
-
-    heading: Array
-    variance: Array
-    rate: Array
-    rate_variance: Array
-    resting: Mask
-    deleted_heading: float
-    intervals: Intervals
-
-
-def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
-          settings: Settings, wheels: Sequence[bool | None] | None = None, hindsight: bool = False,
-          age: float | None = 0.0, still: Array | None = None) -> Track:
-    """
-    Return the heading over a whole log.
-
-    Parameters
-    ----------
-    time, rate : s and rad/s, compensated, shape (n,)
-    sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
-    noise, covariance, settings, age : as in `HeadingTracker`
-    wheels : whether wheels or commands move the robot, n of them, or None
-    still : as in `HeadingTracker.add`
-    hindsight : smooth the heading by all later data
-
-    Raises
-    ------
-    OverflowError : with hindsight, a heading or its variance is not finite
-
-    """
-    tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
-    found = tracker.follow(time, rate, np.ascontiguousarray(sensitivity.T), wheels, still)
-    heading, variance, shown, rate_variance, resting = found.T
-    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted_heading,
-                 tracker.intervals)
-    if not hindsight:
-        return live
-    if not np.isfinite(found).all():
-        raise OverflowError('the variance of the heading is not finite')
-    later, with_hindsight, rested = smooth_track(tracker, time, rate)
-    return replace(live, heading=later, variance=with_hindsight, resting=rested)
 
 
 def _remove_spikes(time: Array, rate: Array) -> Array:

@@ -42,22 +42,22 @@ from scipy.special import chdtri, ndtri
 BLOCK_DURATION, WINDOW_DURATION = 0.1, 0.5
 #: Durations, s, over which the mean of the rate is compared with the bias known before them.
 MEAN_LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
-#: Durations, s, over which the scatter of means over 1 s is compared with the noise.
-SCATTER_LAGS = (4.0, 8.0, 16.0, 32.0, 64.0)
 #: Least number of samples in a window.
 _MIN_WINDOW_SAMPLES = 8
 #: Windows in the memory of the noise, least number for its use, and largest ratio to the noise of
 #: the model.
 _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
-#: to it; the first is that of a rest, the others are those of straight drives.
-SCATTER_RATIOS = np.append(0.0, 4.0 ** np.arange(7))
+#: to it, and correlations of neighbours: first those of a rest, then those of straight drives.
+#: With a larger variance, most means over 1 s are beyond the limit of `mean_threshold_sigmas`.
+SCATTER_RATIOS, SCATTER_CORRELATIONS = np.array(
+    [(0.0, 0.0), *((ratio, shared) for ratio in 4.0 ** np.arange(4)
+                   for shared in (0.0, 0.25, 0.5))]).T
+#: The same of sums of many means, relative to that of white noise.
+_SUM_RATIOS = SCATTER_RATIOS * (1.0 + 2.0 * SCATTER_CORRELATIONS)
 #: Prior numbers of rests, 3, and of straight drives that pass for rests, 1; largest total.
 _PRIOR_COUNTS = np.append(3.0, np.full(len(SCATTER_RATIOS) - 1, 1.0 / (len(SCATTER_RATIOS) - 1)))
 _MAX_STRETCHES = 20.0
-#: Threshold per mean for the onset of scatter: the maximum likelihood for a variance of three
-#: times that of the noise.
-SCATTER_ONSET_THRESHOLD = math.log(3.0) / (1.0 - 1.0 / 3.0)
 
 
 @dataclass(slots=True)
@@ -100,13 +100,6 @@ def mean_threshold_sigmas(lag: float, false_alarms: float) -> float:
 def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
     """Return the value that chi squared exceeds with a probability."""
     return float(chdtri(degrees_of_freedom, chance))
-
-
-def scatter_threshold(lag: float, degrees_of_freedom: int, false_alarms: float) -> float:
-    """Return the sum of squares of means over `lag` s that gives `false_alarms` per hour."""
-    chances = 3600.0 / lag * _OVERLAP_FACTOR
-    return _chi_squared_quantile(degrees_of_freedom,
-                                 min(false_alarms / (_TEST_COUNT * chances), 0.5))
 
 
 #: Number of tests that share the false alarms, and factor of false alarms by overlapping windows.
@@ -240,9 +233,10 @@ class Snapshot:
     state, deleted_heading, step_count : the state, the heading deleted until then, rad, and number
         of steps
     rate_integral : integral of the rates since the rest began
-    innovation_square_sum, innovation_count : sum of the squared normalized innovations since it
-        began, and their number
-    log_likelihood : log-likelihood of their scatter for each of `SCATTER_RATIOS`, shape (k,)
+    innovation, variance : deviation of the last angle from the mean of this rest before it, or
+        at first from the state, rad, and its variance by noise, rad²
+    scatter : median of `SCATTER_RATIOS` by the innovations so far; 0 before the first
+    log_likelihood : of the innovations since the rest began, by `SCATTER_RATIOS`, shape (k,)
 
     """
 
@@ -250,8 +244,9 @@ class Snapshot:
     rate_integral: RateIntegral
     deleted_heading: float
     step_count: int
-    innovation_square_sum: float = 0.0
-    innovation_count: int = 0
+    innovation: float = 0.0
+    variance: float = math.inf
+    scatter: float = 0.0
     log_likelihood: Array = field(default_factory=lambda: np.zeros(len(SCATTER_RATIOS)))
 
 
@@ -272,6 +267,12 @@ class RestScatter:
         """Return the probability of each scatter, shape (k,)."""
         chances = self.counts * np.exp(likelihood - likelihood.max())
         return np.asarray(chances / chances.sum())
+
+    def mean_and_median(self, likelihood: Array) -> tuple[float, float]:
+        """Return the mean ratio for sums of correlated means, and the median ratio."""
+        chances = self.probabilities(likelihood)
+        return (float(chances @ _SUM_RATIOS),
+                float(SCATTER_RATIOS[np.searchsorted(np.cumsum(chances), 0.5)]))
 
     def learn(self, last: Snapshot) -> None:
         """Add a detected rest that has ended."""

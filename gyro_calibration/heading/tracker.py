@@ -43,10 +43,8 @@ from gyro_calibration.heading.stationary import (
     mean_threshold_sigmas,
     RestScatter,
     Samples,
-    SCATTER_LAGS,
-    SCATTER_ONSET_THRESHOLD,
+    SCATTER_CORRELATIONS,
     SCATTER_RATIOS,
-    scatter_threshold,
     SETTLING_TIME,
     SlowTurn,
     Snapshot,
@@ -648,35 +646,20 @@ class HeadingTracker:
             if before is None:
                 return
             turn = self._rest_integral - before.rate_integral
-            if abs(self._normalized_innovation(before.state, turn)) > self._sigmas[lag]:
+            expected, variance = before.state.expected_rest_angle(turn)
+            if wheels is not False:
+                variance += (before.scatter * turn.duration
+                             * before.state.noise.angle_random_walk ** 2)
+            if abs(turn.angle - expected) > self._sigmas[lag] * math.sqrt(variance):
                 if wheels is False:
                     if lag < _WHEEL_DELAY:
                         continue
-                    expected, _ = before.state.expected_rest_angle(turn)
                     self._state = self._state.with_added_variance(
                         WALK_INDEX, ((turn.angle - expected) / turn.duration) ** 2)
                     self._enter_rest()
                     self._adopt_state()
                 else:
                     self._revert_to_motion(lag)
-                return
-        if wheels is not False:
-            self._compare_scatter()
-
-    def _compare_scatter(self) -> None:
-        """Compare the scatter of the means over 1 s with the noise, over the longer lags."""
-        last = self._snapshots[-1]
-        for lag in SCATTER_LAGS:
-            before = self._snapshot_before(lag)
-            if before is None:
-                return
-            limit = _NOISE_TOLERANCE ** 2 * scatter_threshold(
-                lag, last.innovation_count - before.innovation_count, self._settings.false_alarms)
-            if last.innovation_square_sum - before.innovation_square_sum > limit:
-                onset = max(self._snapshots, key=lambda each: (
-                    last.innovation_square_sum - each.innovation_square_sum
-                    - SCATTER_ONSET_THRESHOLD * (last.innovation_count - each.innovation_count)))
-                self._revert_to_motion(lag, onset)
                 return
 
     def _snapshot_before(self, lag: float) -> Snapshot | None:
@@ -698,8 +681,9 @@ class HeadingTracker:
         self.is_resting, self._rest_integral = True, self._zero_integral
         self._recognition_left, self._wheels_stand = 0.0, False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
+        _, median = self._rest_scatter.mean_and_median(np.zeros(1))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
-                                    len(self.steps))]
+                                    len(self.steps), scatter=median)]
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
@@ -712,21 +696,19 @@ class HeadingTracker:
             self._recognition_left = _RECOGNITION_TIME
         self._enter_motion(WINDOW_DURATION)
 
-    def _revert_to_motion(self, lag: float, snapshot: Snapshot | None = None) -> None:
-        """Revise a rest to a motion since `lag` s before the last block, or since a snapshot."""
+    def _revert_to_motion(self, lag: float) -> None:
+        """Revise a rest to a motion since `lag` s before the last block."""
         self._advance_state()
-        scattered = snapshot is not None
-        snapshot = (snapshot or self._snapshot_before(max(lag, WINDOW_DURATION))
-                    or self._snapshots[0])
-        sudden = lag <= WINDOW_DURATION and not scattered
+        snapshot = self._snapshot_before(max(lag, WINDOW_DURATION)) or self._snapshots[0]
+        sudden = lag <= WINDOW_DURATION
         if not sudden and self._rest_integral.duration < _MIN_REST_DURATION - TIME_TOLERANCE:
             snapshot = self._snapshots[0]
         turn = self._rest_integral - snapshot.rate_integral
         if sudden:
             snapshot, turn = self._locate_motion_start(snapshot, turn)
         self._suspected_turn = (self._slow_turn_since(snapshot, turn)
-                                if lag >= MEAN_LAGS[0] and not scattered else None)
-        if self._snapshots[-1].innovation_count and not self._wheels_stand:
+                                if lag >= MEAN_LAGS[0] else None)
+        if len(self._snapshots) > 1 and not self._wheels_stand:
             self._rest_scatter.learn(self._snapshots[-1])
         self._state, self.deleted_heading = snapshot.state, snapshot.deleted_heading
         self._open_integral = turn
@@ -827,12 +809,20 @@ class HeadingTracker:
 
     def _advance_at_rest(self, turn: RateIntegral, remaining: RateIntegral) -> None:
         """Propagate the state over a part of a rest, and update the scatter of its rates."""
-        before, (expected, variance) = self._snapshots[-1], self._state.expected_rest_angle(turn)
+        before, past, share = self._snapshots[-1], self._rest_integral, 1.0
         white = self._state.noise.angle_random_walk ** 2 * turn.duration
-        squared = (turn.angle - expected) ** 2 / variance
-        ratios = 1.0 + SCATTER_RATIOS * white / variance
-        likelihood = before.log_likelihood - 0.5 * (squared / ratios + np.log(ratios))
-        scatter = float(self._rest_scatter.probabilities(likelihood) @ SCATTER_RATIOS)
+        if past.duration > 0.0:  # an error of the bias at the begin of the rest is no scatter
+            share += turn.duration / past.duration
+            expected, variance = turn.duration * past.angle / past.duration, share * white
+        else:
+            expected, variance = self._state.expected_rest_angle(turn)
+        innovation, wander = turn.angle - expected, SCATTER_RATIOS * white
+        shared = SCATTER_CORRELATIONS * wander
+        gain = shared / (before.variance + wander)
+        spread = variance + share * wander - gain * shared
+        likelihood = before.log_likelihood - 0.5 * (
+            (innovation - gain * before.innovation) ** 2 / spread + np.log(spread / variance))
+        scatter, median = self._rest_scatter.mean_and_median(likelihood)
         turn.wander_variance = 0.0 if self._wheels_stand else scatter * white
         self._propagate_state(turn,
                               self._last_time - self._block_integral.duration - remaining.duration)
@@ -840,7 +830,7 @@ class HeadingTracker:
         self._snapshots.append(Snapshot(
             self._state, self._rest_integral,
             self.deleted_heading - self._corrected_angle(self._block_integral), len(self.steps),
-            before.innovation_square_sum + squared, before.innovation_count + 1, likelihood))
+            innovation, variance, median, likelihood))
         del self._snapshots[:-_MAX_SNAPSHOTS]
 
     def _propagate_state(self, turn: RateIntegral, end: float) -> None:

@@ -16,7 +16,6 @@ from gyro_calibration.cli.main import main
 from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
-from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
@@ -24,6 +23,7 @@ from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
 from heading_oracle import DRIVES, GYROS, score
+from heading_track import track
 import numpy as np
 from operations import operations
 import pytest

@@ -21,13 +21,13 @@ import math
 from faulty_heading import one
 from gyro_calibration.heading.gaps import GapModel, Intervals
 from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
-from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
+from heading_track import track
 import numpy as np
 import pytest
 

@@ -20,12 +20,12 @@ from gyro_calibration.heading.kalman import (
     RateIntegral,
     smooth_states,
 )
-from gyro_calibration.heading.log_compensation import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model import presets
 from gyro_calibration.model.motion import constant_rate_motion, motion_from_rates
 from gyro_calibration.model.noise import Noise, simulate_noise
+from heading_track import track
 import numpy as np
 import pytest
 from scipy.stats import poisson
