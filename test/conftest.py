@@ -95,7 +95,7 @@ def _prepare_environment():
 _prepare_environment()  # before any test module imports rclpy
 
 
-_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch', 'test_serial_port'
+_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch'
 
 # Of those that only compute, what takes longest comes first: the last files, which one of several
 # processes may have to itself, are then short ones.
