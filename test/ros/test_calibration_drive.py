@@ -41,38 +41,28 @@ def stored(rig):
 # A run that drives the robot
 
 
-def test_a_run_finds_scale_and_bias_stores_and_uses_them(tmp_path):
+def test_a_run_drives_the_profile_and_finds_stores_and_uses_scale_and_bias(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
+    begin, first = rig.clock.now, len(rig.outputs)
     success, message = rig.calibrate()
     assert success, message
+    assert 'delay of the gyro 0.3' in message and 'at rest after it' in message
     kept = stored(rig)
     assert kept.scale_factor_error == pytest.approx(SCALE, abs=5e-4)
     assert kept.bias == pytest.approx(BIAS, abs=2e-4)
     assert rig.pipeline.estimator.model.self_calibration == kept
-    assert 'delay of the gyro 0.3' in message and 'at rest after it' in message
-
-
-def test_the_commands_are_the_profile_and_end_with_one_zero(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    begin = rig.clock.now
-    assert rig.calibrate()[0]
-    rates = np.array([rate for _, rate in rig.commands])
-    times = np.array([when for when, _ in rig.commands]) - begin
+    # the commands
+    times, rates = np.array(rig.commands).T
     assert (rates.max(), rates.min()) == pytest.approx((FULL, -FULL), abs=1e-6)
-    np.testing.assert_allclose(rates[:-1], CALIBRATION_MOTION.rate_at(times[:-1] - 0.01),
-                               atol=0.06)
+    np.testing.assert_allclose(
+        rates[:-1], CALIBRATION_MOTION.rate_at(times[:-1] - begin - 0.01), atol=0.06)
     assert np.diff(times).max() < 1.5 * Drive.INTERVAL and rates[-1] == 0.0
-
-
-def test_the_heading_goes_on_with_the_old_calibration_and_does_not_jump_to_the_new_one(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    begin = len(rig.outputs)
-    assert rig.calibrate()[0]
+    # the heading goes on with the old calibration, and does not jump to the new one
     rig.go(1.0)
-    headings = np.array([each.heading for each in rig.outputs[begin:]])
+    headings = np.array([each.heading for each in rig.outputs[first:]])
     assert np.abs(np.diff(headings)).max() < 1.1 * (1 + SCALE) * FULL * 0.01
-    during = [each.rate for each in rig.outputs[begin:] if abs(each.rate) > 0.7]
-    assert max(during) == pytest.approx((1 + SCALE) * FULL, abs=0.01), 'not yet the new scale'
+    assert max(each.rate for each in rig.outputs[first:]) == pytest.approx(
+        (1 + SCALE) * FULL, abs=0.01), 'not yet the new scale'
 
 
 def test_the_next_start_uses_the_stored_calibration_and_the_heading_is_right(tmp_path):
