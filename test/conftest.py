@@ -129,7 +129,6 @@ def pytest_collection_modifyitems(config, items):
 
 
 def pytest_unconfigure(config):
-    """Remove the folder of this run."""
     shutil.rmtree(_FOLDER, ignore_errors=True)
 
 
@@ -151,13 +150,11 @@ def wait_until(predicate, timeout=30.0, what=None):
 
 @pytest.fixture(name='wait_until')
 def _wait_until():
-    """Return the function `wait_until(predicate, timeout=30.0, what=None)`."""
     return wait_until
 
 
 @pytest.fixture
 def data():
-    """Return the folder with recordings of real gyros; skip where it is missing."""
     folder = Path(os.environ.get('GYRO_CALIBRATION_DATA', '/nonexistent'))
     if not folder.is_dir():
         pytest.skip('no recordings: set GYRO_CALIBRATION_DATA to the folder that holds them')
@@ -274,7 +271,6 @@ class NodeProcess:
         return Path(self._output).read_text(errors='replace')
 
     def wait(self, timeout=30.0):
-        """Wait until it ends by itself and return its exit code."""
         self.waited = True
         return self.process.wait(timeout)
 
@@ -284,7 +280,6 @@ class NodeProcess:
         return self.wait(timeout)
 
     def interrupt(self, number=signal.SIGINT):
-        """Send a signal to its process group, if it still runs."""
         if self.process.poll() is None:
             os.killpg(self.process.pid, number)
 
@@ -380,7 +375,6 @@ class Ros:
             self._executor.spin_once(timeout_sec=0.05)
 
     def collect(self, message_type, topic, quality=None):
-        """Subscribe, and return the list that the messages go to."""
         messages = []
         self.node.create_subscription(message_type, topic, messages.append,
                                       quality or _sensor_quality())
@@ -391,7 +385,6 @@ class Ros:
         return self.node.create_publisher(message_type, topic, quality or _sensor_quality())
 
     def call(self, service_type, name, request=None, timeout=30.0):
-        """Call a service and return its response."""
         client = self.node.create_client(service_type, name)
         assert client.wait_for_service(timeout), f'no service {name} within {timeout} s'
         future = client.call_async(request or service_type.Request())

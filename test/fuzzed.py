@@ -78,8 +78,6 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 @dataclass(frozen=True)
 class Target:
-    """Something that reads bytes."""
-
     #: Takes any bytes, raises where a claim is broken, and tells whether they were read.
     check: Callable[[bytes], object]
     seeds: Callable[[], Sequence[bytes]]  # inputs to begin with, as the project writes them
@@ -89,7 +87,6 @@ class Target:
 
 
 def path_of(suffix: str) -> Path:
-    """Return where an input is written, of which there is only one at a time in a process."""
     return Path(_FOLDER.name) / f'{os.getpid()}{suffix}'
 
 

@@ -45,15 +45,12 @@ class StepClock:
         self.now, self.set_by, self.ros = 1000.0, 0.0, ros
 
     def steady(self):
-        """Return the steady clock, s."""
         return self.now
 
     def date(self):
-        """Return the clock of the host, s since 1970."""
         return BEGIN - 1000.0 + self.now + self.set_by
 
     def simulated(self):
-        """Return the time of a simulation, s."""
         return self.ros
 
 
@@ -113,13 +110,11 @@ class Rig:
             self.robot.command(rate)
 
     def set(self, **parameters):  # noqa: A003
-        """Set parameters while it runs."""
         names = {each.attribute: each.name for each in PARAMETERS}
         self._given.update({names[attribute]: value for attribute, value in parameters.items()})
         self.pipeline.use_parameters(parameter_values(PARAMETERS, self._given))
 
     def stamp(self, reading):
-        """Return the stamp of a reading, ns."""
         if self.clock.ros is not None:
             if not self.robot.stamps_stand:
                 self._stamp = round(1e9 * self.clock.ros)
@@ -127,7 +122,6 @@ class Rig:
         return BEGIN * NSEC_PER_SEC + round(1e9 * (reading.stamp - 1000.0 + self.clock.set_by))
 
     def step(self):
-        """Let everything go on by the interval of the samples."""
         self._steps += 1
         self.clock.now += INTERVAL / self.speed
         if self.clock.ros:
@@ -145,12 +139,10 @@ class Rig:
         self.guards()
 
     def odometry(self, stamp, reading):
-        """Let the odometry arrive."""
         heading = math.remainder(reading.heading, math.tau)
         self.pipeline.add_odometry(stamp, heading, Velocity(angular=(0.0, 0.0, reading.rate)))
 
     def sample(self, stamp, output, heading=math.nan):
-        """Let a sample arrive, and return what comes out."""
         self.truth[stamp] = heading
         found = self.pipeline.add_sample(stamp, output, receivers=self.receivers)
         if found is not None:

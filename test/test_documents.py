@@ -42,7 +42,6 @@ def found_in_documents(pattern):
 
 
 def anchors(document):
-    """Return the anchors of the headings of a Markdown file."""
     titles = re.findall(r'^#+ (.+)$', document.read_text(), re.MULTILINE)
     return {re.sub(r'[^\w\- ]', '', title.lower()).replace(' ', '-') for title in titles}
 

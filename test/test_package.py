@@ -187,7 +187,6 @@ def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
 
 
 def check_metadata(wheel):
-    """Compare the metadata of a wheel with package.xml."""
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     metadata, = importlib.metadata.distributions(path=[str(wheel)])
     assert metadata.version == manifest.findtext('version')

@@ -41,12 +41,10 @@ FEW, MANY = 25, 200
 
 @cache
 def reproduced(source, runs=FEW):
-    """Return the output of the verb for a source."""
     return SOURCES[source](np.random.default_rng(0), runs)
 
 
 def ours(source, quantity, runs=FEW):
-    """Return the comparison of that name."""
     found = [each for each in reproduced(source, runs).comparisons if each.quantity == quantity]
     assert len(found) == 1, [each.quantity for each in reproduced(source, runs).comparisons]
     return found[0]

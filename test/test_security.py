@@ -37,7 +37,6 @@ ENCLAVES = {enclave.get('path').rpartition('/')[2]: enclave for enclave in POLIC
 
 
 def belongs(name, roots):
-    """Tell whether a dotted name is one of the roots or below one."""
     return any(name == root or name.startswith(f'{root}.') for root in roots)
 
 
@@ -166,7 +165,6 @@ ONLY_THEN = {('subscriber', '/clock')}
 
 
 def node_of(enclave):
-    """Return the class of an enclave's node."""
     from gyro_calibration.ros.compensation_node import CompensationNode
     from gyro_calibration.ros.driver_node import DriverNode
     name = next(ENCLAVES[enclave].iter('profile')).get('node')

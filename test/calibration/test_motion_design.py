@@ -261,7 +261,6 @@ def test_the_impossible_is_refused_in_a_sentence(ability, seconds, reason):
 
 @pytest.fixture
 def limits(tmp_path):
-    """Return a function that writes limits and returns the file."""
     def write(**values):
         path = tmp_path / 'limits.yaml'
         path.write_text(

@@ -48,7 +48,6 @@ RARE = 1e-4
 
 
 def dwells(rate, error, temperature=None, deviation=None, sweep=None):
-    """Return dwells with rates and errors in rad/s."""
     rate = np.asarray(rate, dtype=float)
     return Dwells(rate, rate + error, temperature, np.full(len(rate), np.nan) if deviation is None
                   else deviation, np.zeros(len(rate), int) if sweep is None else sweep,
@@ -56,12 +55,10 @@ def dwells(rate, error, temperature=None, deviation=None, sweep=None):
 
 
 def alike(table, size=1.0):
-    """Return a scatter that is the same for all dwells."""
     return Scatter(size, 0.0, 0.0, 0.0, np.ones(len(table), bool))
 
 
 def measured(terms=LINEAR, seed=1, **table):
-    """Return a simulated table."""
     return Table(**table).measure(GyroModel(terms), np.random.default_rng(seed))
 
 

@@ -47,7 +47,6 @@ def names(selection):
 
 
 def measured(table, terms, seed=1):
-    """Return a simulated table."""
     return table.measure(GyroModel(terms), np.random.default_rng(seed))
 
 

@@ -179,7 +179,6 @@ def test_a_robot_that_follows_each_turn_otherwise_is_calibrated_within_its_inter
 
 
 def run(seed=0, true=RATE, s=XV3500_S):
-    """Return the output of the XV3500 on this true rate."""
     return (1 + s) * true + XV3500_B + simulate_noise(
         XV3500, len(true), 0.01, np.random.default_rng(seed))
 

@@ -195,7 +195,6 @@ def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_te
 
 @pytest.fixture
 def run(run):
-    """Return a function that runs the verb and returns exit code, output and error."""
     return partial(run, 'turn')
 
 

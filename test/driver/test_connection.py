@@ -39,7 +39,6 @@ NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of 
 
 
 def turning(rate=0.5, frequency=100.0):
-    """Return the samples of a gyro that turns for ever."""
     return (Sample(rate, 31.5, k / frequency) for k in itertools.count())
 
 
@@ -343,7 +342,6 @@ def test_a_bad_line_is_survived_and_counted(name, share):
 
 @pytest.fixture
 def terminal():
-    """Return the file descriptor of the device's end, and the path of the other."""
     master, slave = os.openpty()
     tty.setraw(slave)
     yield master, os.ttyname(slave)

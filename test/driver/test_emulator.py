@@ -178,8 +178,6 @@ def test_samples_are_numbered():
 
 
 class Adapter(Emulator):
-    """Sends what arrives behind an adapter, in bursts."""
-
     _BATCH_DURATION = 0.0
 
     def _timed_frames(self):

@@ -29,7 +29,6 @@ MOTIONS = {
 
 
 def frames(name, count, rate=MOTIONS['rest'], force=None):
-    """Return what a device sends, one sample after the other."""
     encode = find_protocol(name).encoder(SETTINGS[name])
     return [
         find_protocol(name).preamble,

@@ -28,12 +28,10 @@ def frame(count, number=8, data=0):
 
 
 def decoded(*frames):
-    """Return the samples of frames."""
     return PROTOCOL.decoder(ONE_COUNT).feed(b''.join(frames))
 
 
 def values(*frames):
-    """Return what the frames say of the unit itself, in their order."""
     return [(sample.temperature, dict(sample.health)) for sample in decoded(*frames)]
 
 

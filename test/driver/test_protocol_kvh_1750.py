@@ -31,7 +31,6 @@ def with_status(status, axis='z'):
 
 
 def sealed(data):
-    """Return data with its CRC, worked out bit by bit."""
     remainder = 0xFFFFFFFF
     for byte in data:
         remainder ^= byte << 24
@@ -41,7 +40,6 @@ def sealed(data):
 
 
 def decoded(data, axis='z', **settings):
-    """Return the samples of bytes."""
     return PROTOCOL.decoder(Settings(axis=axis, **settings)).feed(data)
 
 

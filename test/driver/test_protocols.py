@@ -58,7 +58,6 @@ VECTORS = [
 
 
 def stream(name, count=20, seed=1):
-    """Return samples and the bytes that a device sends for them."""
     generator = random.Random(seed)
     timed = name == 'csv'
     samples = [Sample(generator.uniform(-1.0, 1.0), generator.uniform(-40.0, 85.0) if timed

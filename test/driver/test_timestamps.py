@@ -87,13 +87,11 @@ def play(clock, times, arrivals, kept=None, **said):
 
 
 def sequence(times, modulus=128):
-    """Return the sequence that the device numbers its samples by."""
     return np.arange(times.size) % modulus
 
 
 @pytest.fixture
 def generator():
-    """Return a generator of random numbers."""
     return np.random.default_rng(6)
 
 

@@ -28,7 +28,6 @@ DEGREE = math.pi / 180.0
 
 
 def written(folder, text, name='log.csv'):
-    """Return the path of a file with this text."""
     path = folder / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path

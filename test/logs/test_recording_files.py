@@ -51,7 +51,6 @@ RATE = 100.0
 
 @pytest.fixture
 def make():
-    """Return what makes messages."""
     return Messages()
 
 
@@ -213,7 +212,6 @@ def test_bytes_that_are_no_message_are_refused():
 
 
 def write_chunks(path, compression, count, chunked=True):
-    """Write a recording of a gyro that counts, by the library mcap."""
     writing = pytest.importorskip('mcap.writer', reason='mcap is not installed')
     with open(path, 'wb') as file:
         writer = writing.Writer(file, chunk_size=10_000,
@@ -608,7 +606,6 @@ def test_blocks_of_a_recording_are_the_whole(make, tmp_path, turning):
 
 
 def numbers_of(answer):
-    """Return the numbers in the answer of a verb, at whatever depth, in their order."""
     if isinstance(answer, dict):
         return [number for value in answer.values() for number in numbers_of(value)]
     if isinstance(answer, list):

@@ -38,7 +38,6 @@ FULL = GyroModel(TERMS, np.diag(np.arange(1.0, 8.0)) * 1e-8, (-1.7, 1.7), (20.0,
 
 
 def read(folder, text):
-    """Return the model that a file with this text or these bytes holds."""
     path = folder / 'model.yaml'
     path.write_bytes(text if isinstance(text, bytes) else text.encode('utf-8', 'surrogateescape'))
     return read_model(path)

@@ -25,7 +25,6 @@ OK, ERROR = DiagnosticStatus.OK, DiagnosticStatus.ERROR
 
 @pytest.fixture
 def heard(ros):
-    """Return the list of everything that comes on /diagnostics."""
     return ros.collect(DiagnosticArray, '/diagnostics', 10)
 
 

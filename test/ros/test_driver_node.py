@@ -221,9 +221,8 @@ def test_listening_is_a_warning_and_what_was_recognized_is_reported():
 
 
 class Robot:
-    """A driver, and what it publishes."""
-
     def __init__(self, ros, start_node, wait_until, port, protocol, parameters):
+
         self._wait_until = wait_until
         self.rates = ros.collect(Imu, 'imu/data_raw')
         self.temperatures = ros.collect(Temperature, 'imu/temperature')
@@ -231,11 +230,9 @@ class Robot:
         self.node = start_node('driver_node', {'port': port, 'protocol': protocol, **parameters})
 
     def wait(self, condition, what):
-        """Wait until a condition is true."""
         self._wait_until(condition, 60.0, f'{what}; output:\n{self.node.output}')
 
     def reports(self, words, level):
-        """Wait until a diagnostic message with these words comes, and return its status."""
         def found():
             statuses = [array.status[0] for array in self.diagnostics]
             return [status for status in statuses
@@ -246,7 +243,6 @@ class Robot:
 
 @pytest.fixture
 def robot(ros, start_node, wait_until):
-    """Return a function of port, protocol and parameters that starts a driver."""
     def start(port, protocol='csv', **parameters):
         return Robot(ros, start_node, wait_until, port, protocol, parameters)
     return start

@@ -62,9 +62,8 @@ def turned(first, last):
 
 
 class Heard:
-    """What a compensation node says."""
-
     def __init__(self, ros, wait_until, namespace=''):
+
         self.numbers, self.headings, self.variances, self.arrivals, self._wait_until = (
             [], [], [], [], wait_until)
         self.reports = ros.collect(DiagnosticArray, f'{namespace}diagnostics', 10)
@@ -77,7 +76,6 @@ class Heard:
         self.arrivals.append(time.monotonic())
 
     def more(self, count, timeout=60.0):
-        """Wait for so many more rates."""
         before = len(self.numbers)
         self._wait_until(lambda: len(self.numbers) >= before + count, timeout,
                          f'{count} more rates')
@@ -100,7 +98,6 @@ class Heard:
             self.numbers[first:last], self.arrivals[first:last])]))
 
     def says(self, words):
-        """Wait until a report of the node has the words in its message or values."""
         def said():
             return any(words in text for report in self.reports for status in report.status
                        for text in (status.message,

@@ -45,7 +45,6 @@ def field(message, names):
 
 
 def check_path(path):
-    """Check a message path of Foxglove."""
     topic = re.match(r'[\w/]+', path)[0]
     assert topic in TOPICS, path
     message = TOPICS[topic]()
@@ -64,7 +63,6 @@ def check_path(path):
 
 
 def paths():
-    """Return all message paths of the Foxglove layout."""
     found = []
     for config in FOXGLOVE['configById'].values():
         found += [series['value'] for series in config.get('paths', [])]

@@ -707,7 +707,6 @@ def test_with_a_bad_model_raw_rates_go_on_and_the_problem_names_the_file(tmp_pat
 
 @pytest.fixture
 def reported():
-    """Return a function that gives level, message and values of the next report of a rig."""
     module = pytest.importorskip('gyro_calibration.ros.compensation_report')
     reports = {}
 

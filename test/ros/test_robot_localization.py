@@ -36,7 +36,6 @@ def _parameters():
 
 
 def fused(parameters, sensor):
-    """Return the names of what is fused of a sensor."""
     flags = parameters[f'{sensor}_config']
     assert len(flags) == len(STATE) and all(isinstance(flag, bool) for flag in flags)
     return [name for name, flag in zip(STATE, flags) if flag]

@@ -196,7 +196,6 @@ class Disk:
                                           folder], capture_output=True).returncode == 0
 
     def fill(self):
-        """Leave no room."""
         if not self.is_mounted:
             resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
             return
@@ -208,7 +207,6 @@ class Disk:
                 pass
 
     def free(self):
-        """Make room again."""
         if self.is_mounted:
             (self.folder / 'ballast').unlink()
         else:
@@ -218,7 +216,6 @@ class Disk:
 
 @pytest.fixture
 def disk(tmp_path):
-    """Return a `Disk`; skip where neither way works."""
     folder = tmp_path / 'disk'
     folder.mkdir()
     disk = Disk(folder)
