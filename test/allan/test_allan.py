@@ -17,7 +17,6 @@ from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.allan import allan_deviation, build_rest_record, fit_noise, NOISE_TERMS
 from gyro_calibration.cli.allan import figure_labels
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
-from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.noise import ALLAN_FLOOR_RATIO, Noise, simulate_noise
 import numpy as np
@@ -101,38 +100,6 @@ def figures(noise, runs, seed, samples=20_000, quantization=0.0, ramp=0.0):
     return {part.symbol: [fit[part.symbol] for fit in fits] for part in NOISE_TERMS}
 
 
-CASES = {'white': (WHITE, 0.0, 0.0), 'flicker': (FLICKER, 0.0, 0.0), 'walk': (WALK, 0.0, 0.0),
-         'quantization': (WHITE, 3e-5, 0.0), 'ramp': (WHITE, 0.0, 1e-4)}
-RUNS = 30
-
-
-#: The others as evidence: 30 records take some seconds.
-TRIED = 'quantization', 'walk'
-
-
-@pytest.fixture(scope='module', params=[
-    pytest.param(name, marks=[] if name in TRIED else pytest.mark.evidence) for name in CASES])
-def case(request):
-    """Return symbol -> (truth, figures of simulated records)."""
-    noise, quantization, ramp = CASES[request.param]
-    truths = dict(zip('NBKQR', (noise.angle_random_walk, noise.bias_instability,
-                                noise.rate_random_walk, quantization, ramp)))
-    found = figures(noise, RUNS, 4, quantization=quantization, ramp=ramp)
-    return {symbol: (truths[symbol], found[symbol]) for symbol in truths}
-
-
-def test_what_is_there_is_seen_and_what_is_not_there_is_not(case):
-    for symbol, (truth, records) in case.items():
-        seen = sum(figure.value > 0.0 for figure in records)
-        assert seen >= fewest(RUNS, 0.95) if truth else seen <= most(RUNS, 0.05), (symbol, seen)
-
-
-def test_the_bounds_hold_in_95_of_100_records(case):
-    for symbol, (truth, records) in case.items():
-        held = sum(figure.lower <= truth <= figure.upper for figure in records)
-        assert held >= fewest(RUNS, 0.95), (symbol, held)
-
-
 @pytest.mark.parametrize('walk, runs', [
     (2e-4, 12), *(pytest.param(walk, 200, marks=pytest.mark.evidence) for walk in (3e-5, 2e-4))])
 def test_the_bounds_hold_where_flicker_and_random_walk_hide_each_other(walk, runs):
@@ -143,11 +110,25 @@ def test_the_bounds_hold_where_flicker_and_random_walk_hide_each_other(walk, run
         assert held >= fewest(runs, 0.95), (symbol, held)
 
 
-def test_a_standard_deviation_is_the_scatter_of_its_figure(case):
-    for symbol, (truth, records) in case.items():
-        seen = [figure for figure in records if figure.value and truth]
+@pytest.mark.parametrize('noise, quantization, ramp', [
+    pytest.param(*case, id=name,  # the others as evidence: 30 records take some seconds
+                 marks=[] if name in ('quantization', 'walk') else pytest.mark.evidence)
+    for name, *case in (('white', WHITE, 0.0, 0.0), ('flicker', FLICKER, 0.0, 0.0),
+                        ('walk', WALK, 0.0, 0.0), ('quantization', WHITE, 3e-5, 0.0),
+                        ('ramp', WHITE, 0.0, 1e-4))])
+def test_what_is_there_is_seen_within_its_bounds_and_its_standard_deviation(
+        noise, quantization, ramp):
+    runs, found = 30, figures(noise, 30, 4, quantization=quantization, ramp=ramp)
+    truths = dict(zip('NBKQR', (noise.angle_random_walk, noise.bias_instability,
+                                noise.rate_random_walk, quantization, ramp)))
+    for symbol, truth in truths.items():
+        seen = [figure for figure in found[symbol] if figure.value > 0.0]
+        assert (len(seen) >= fewest(runs, 0.95) if truth
+                else len(seen) <= most(runs, 0.05)), (symbol, len(seen))
+        held = sum(figure.lower <= truth <= figure.upper for figure in found[symbol])
+        assert held >= fewest(runs, 0.95), (symbol, held)
         # One record has one ramp: it scatters by white noise alone, far less than its bounds.
-        if seen and symbol != 'R':
+        if truth and symbol != 'R':
             ratio = (np.std([figure.value for figure in seen])
                      / np.median([figure.standard_deviation for figure in seen]))
             low, high = rms_bounds(len(seen) - 1)
@@ -247,12 +228,6 @@ def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
         1e-3, rel=0.015)
 
 
-@pytest.mark.parametrize('every', [8, 20])
-def test_one_lost_sample_of_so_many_is_seen(every):
-    kept = np.arange(10_000) % every != 1
-    assert fit_stamp_grid(stamps(10_000)[kept]).lost_after.sum() == (~kept).sum()
-
-
 def test_two_records_hours_apart_are_not_taken_for_one():
     rate = (simulate_noise(WHITE, 40_000, INTERVAL, np.random.default_rng(11))
             + np.where(np.arange(40_000) < 20_000, 0.0, 0.1))
@@ -320,9 +295,6 @@ def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
         record = build_rest_record(*moved(kind))
         fit_noise(record.rate, record.interval)
-
-
-def test_figures_want_noise_and_windows_without_a_gap():
     with pytest.raises(DataRefused, match='lowest Allan deviation 0 rad/s'):
         fit_noise(np.ones(1000), INTERVAL)
     with pytest.raises(DataRefused, match='wanted 4 octaves'):

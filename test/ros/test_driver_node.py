@@ -221,6 +221,7 @@ def test_listening_is_a_warning_and_what_was_recognized_is_reported():
 
 
 class Robot:
+
     def __init__(self, ros, start_node, wait_until, port, protocol, parameters):
 
         self._wait_until = wait_until

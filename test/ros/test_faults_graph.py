@@ -62,6 +62,7 @@ def turned(first, last):
 
 
 class Heard:
+
     def __init__(self, ros, wait_until, namespace=''):
 
         self.numbers, self.headings, self.variances, self.arrivals, self._wait_until = (

@@ -41,6 +41,7 @@ HELD_UP = 'no sample came', 'this computer was busy'
 
 
 class Stage:
+
     def __init__(self, ros, wait_until, start_node, folder):
 
         self.ros, self.wait_until, self._start_node, self._folder = (
