@@ -144,20 +144,6 @@ def test_impossible_rates_in_a_row_are_in_the_variance(tmp_path, count):
     assert abs(off) < 3.0 * math.sqrt(after.heading_variance), off
 
 
-def test_a_turn_within_a_gap_that_is_bridged_is_in_the_variance(tmp_path):
-    """It rests before and after; the gap is shorter than `maximum_gap`."""
-    rig = rested(tmp_path)
-    begin, rig.robot.unplugged = len(rig.outputs) - 1, True
-    rig.robot.command(1.5)
-    rig.go(0.4)
-    rig.robot.command(0.0)
-    rig.go(0.5)
-    rig.robot.unplugged = False
-    rig.go(5.0)
-    error, deviation = rig.error(begin)
-    assert abs(error) > 0.2 and abs(error) < 3.0 * deviation, (error, deviation)
-
-
 @pytest.mark.parametrize('wheels', ['none', 'odom'])
 @pytest.mark.parametrize('value', ['at rest', 'in a turn', 'saturated'])
 def test_a_gyro_that_repeats_one_value_is_an_error_and_the_heading_claims_nothing(
