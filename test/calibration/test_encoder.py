@@ -232,14 +232,6 @@ def test_stated_intervals_hold_between_pieces_of_a_measured_log(data):
     assert (scatter < 2.0 * stated).all() and (scatter > stated / 3.0).all(), (scatter, stated)
 
 
-def test_one_half_of_a_measured_log_predicts_the_other(data):
-    first, second = (calibrate_encoder(measured(data, 'yaw_slow', start, start + 750.0)).fit
-                     for start in (0.0, 750.0))
-    apart = np.abs(
-        (first.scale_factor_error - second.scale_factor_error, first.bias - second.bias))
-    assert (apart < 2.6 * np.sqrt(np.diag(first.covariance + second.covariance))).all()
-
-
 def shaken(bias, generator):
     """
     Return 20 s of a fast swing whose heading is off by 3 deg again and again.

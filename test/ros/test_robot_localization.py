@@ -11,13 +11,10 @@
 """The robot_localization example has the parameters of that program and the published topics."""
 
 import ast
-import math
 from pathlib import Path
 import re
 
-from gyro_calibration.logs.log import DEGREE
 import pytest
-from rig import INTERVAL, rested, Robot
 import yaml
 
 CONFIG = Path(__file__).parents[2] / 'config' / 'robot_localization.yaml'
@@ -89,17 +86,3 @@ def test_the_launch_arguments_that_are_parameters_are_parameters_of_the_nodes():
                     if isinstance(each, ast.Assign) and each.targets[0].id == name)
         wanted = {value.elts[0].value for value in node.values}
         assert wanted <= {parameter.name for parameter in table}
-
-
-def test_what_is_fused_of_a_turn_is_as_good_as_the_node_claims(parameters, tmp_path):
-    """A filter for one state, the yaw, that takes the rates with their variances as they come."""
-    assert fused(parameters, 'imu0') == ['vyaw']
-    rig = rested(tmp_path, robot=Robot(scale_factor_error=0.02, bias=0.3 * DEGREE))
-    begin = len(rig.outputs) - 1
-    rig.robot.command(0.5)
-    rig.go(10.0)
-    rates = rig.outputs[begin:]
-    yaw = sum(each.rate for each in rates[1:]) * INTERVAL
-    truth = rig.truth[rates[-1].stamp] - rig.truth[rates[0].stamp]
-    systematic = sum(math.sqrt(each.rate_variance) for each in rates[1:]) * INTERVAL
-    assert abs(yaw - truth) < systematic and all(each.rate_variance > 0.0 for each in rates)
