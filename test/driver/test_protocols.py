@@ -237,11 +237,6 @@ def test_every_protocol_has_an_assumed_noise_and_a_full_scale_at_which_it_satura
     assert sample.output == pytest.approx(-protocol.effective_full_scale(settings), rel=2e-4)
 
 
-def test_a_full_scale_that_is_set_goes_before_that_of_the_protocol():
-    sample, = opened('csv', Settings(full_scale=100.0)).feed(b'0.1,5000.0,20.0\n')
-    assert sample.output == pytest.approx(5000.0 * DPS)
-
-
 @pytest.mark.parametrize(('name', 'data', 'settings'), [
     ('kvh_dsp3000', b'     501.000000   1\r\n', Settings()),  # manual of the DSP-3000, table 2
     ('kvh_ecore', find_protocol('kvh_ecore').encode(Sample(59.0 * DPS)), Settings(full_scale=0.5)),
@@ -258,29 +253,22 @@ def test_a_rate_that_the_device_cannot_mean_is_refused(name, data, settings):
     assert decoder.refused_samples == 1
 
 
-def test_the_axis_chooses_among_three():
-    line = b'!ANG:0.10,-0.20,90.00,AN:100,200,300,4,5,250,7,8,9\r\n'
-    rates = [find_protocol('minimu9').decoder(Settings(axis=axis)).feed(line)[0].output
-             for axis in 'xyz']
-    assert rates == pytest.approx([7.0 * DPS, 14.0 * DPS, 21.0 * DPS])
+AXES = b'!ANG:0.10,-0.20,90.00,AN:100,200,300,4,5,250,7,8,9\r\n'
+COARSE = Settings(sensitivity=0.00875 * DPS)  # a MinIMU-9 set to 250 deg/s still has 16 bits
 
 
-@pytest.mark.parametrize(('columns', 'sensitivity', 'line'), [
-    (('gyro_rad_s',), None, b'0.5'),
-    (('temperature_degc', 'gyro_counts', 'time_s'), 0.001, b'20,500,1'),
-    (('sequence', 'gyro_dps', 'voltage'), None, b'x,28.64788975654116,?'),
-])
-def test_csv_columns_have_the_units_of_their_names(columns, sensitivity, line):
-    sample, = opened('csv', Settings(columns=columns, sensitivity=sensitivity)).feed(line + b'\r')
-    assert sample.output == pytest.approx(0.5)
-
-
-def test_full_scale_follows_the_sensitivity():
-    """A MinIMU-9 set to 250 deg/s still has 16 bits: all its counts are good."""
-    settings = Settings(sensitivity=0.00875 * DPS)
-    sample, = find_protocol('minimu9').decoder(settings).feed(
-        find_protocol('minimu9').encode(Sample(280.0 * DPS), settings))
-    assert sample.output == pytest.approx(280.0 * DPS, rel=1e-4)
+@pytest.mark.parametrize(('name', 'settings', 'data', 'rate'), [
+    ('csv', Settings(columns=('gyro_rad_s',)), b'0.5\r', 0.5),
+    ('csv', Settings(columns=('temperature_degc', 'gyro_counts', 'time_s'), sensitivity=0.001),
+     b'20,500,1\r', 0.5),
+    ('csv', Settings(columns=('sequence', 'gyro_dps', 'voltage')), b'x,90,?\r', 90.0 * DPS),
+    ('csv', Settings(full_scale=100.0), b'0.1,5000.0,20.0\n', 5000.0 * DPS),
+    ('minimu9', COARSE, find_protocol('minimu9').encode(Sample(280.0 * DPS), COARSE), 280.0 * DPS),
+    *(('minimu9', Settings(axis=axis), AXES, rate * DPS)
+      for axis, rate in (('x', 7.0), ('y', 14.0), ('z', 21.0)))])
+def test_columns_units_scales_and_axes_are_those_of_the_settings(name, settings, data, rate):
+    sample, = opened(name, settings).feed(data)
+    assert sample.output == pytest.approx(rate, rel=1e-4)
 
 
 def test_a_lost_port_does_not_join_two_halves():

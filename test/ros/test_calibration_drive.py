@@ -304,29 +304,27 @@ def test_a_stop_is_not_repeated_once_another_node_commands(tmp_path, cancelled):
 # What a drive does not begin over
 
 
-@pytest.mark.parametrize('prepare, reason', [
-    (lambda rig: setattr(rig, 'other', 0.3), 'odom or cmd_vel shows that the robot moves'),
-    (lambda rig: setattr(rig, 'other', 0.0), 'another node sends commands on cmd_vel'),
-    (lambda rig: setattr(rig.robot, 'unplugged', True), 'no sample comes'),
-    (lambda rig: rig.publishers.append('/b'), '2 publishers'),
-], ids=['teleop', 'a soft stop', 'unplugged', 'two publishers'])
-def test_a_drive_begins_only_when_the_robot_rests_and_is_free(tmp_path, prepare, reason):
-    rig = rested(tmp_path, calibration_drive=True)
+OBSTACLES = {
+    'teleop': ({}, lambda rig: setattr(rig, 'other', 0.3),
+               'odom or cmd_vel shows that the robot moves'),
+    'a soft stop': ({}, lambda rig: setattr(rig, 'other', 0.0),
+                    'another node sends commands on cmd_vel'),
+    'unplugged': ({}, lambda rig: setattr(rig.robot, 'unplugged', True), 'no sample comes'),
+    'two publishers': ({}, lambda rig: rig.publishers.append('/b'), '2 publishers'),
+    'no /clock': ({'ros': 0.0}, lambda rig: None, 'ROS time stands still'),
+    '/clock stands': ({'ros': 1000.0}, lambda rig: setattr(rig, 'ros_speed', 0.0),
+                      'ROS time stands still'),
+}
+
+
+@pytest.mark.parametrize('given, prepare, reason', OBSTACLES.values(), ids=OBSTACLES)
+def test_a_drive_begins_only_when_the_robot_rests_and_is_free(tmp_path, given, prepare, reason):
+    rig = rested(tmp_path, calibration_drive=True, **given)
     prepare(rig)
     rig.go(2.0)
-    refusal = rig.begin()
-    assert reason in refusal and not rig.session.run
+    assert reason in rig.begin() and not rig.session.run
     rig.go(1.0)
     assert not rig.commands
-
-
-@pytest.mark.parametrize('ros', [0.0, 1000.0], ids=['absent', 'paused'])
-def test_a_drive_does_not_begin_while_ros_time_stands(tmp_path, ros):
-    rig = Rig(tmp_path, calibration_drive=True, ros=ros)
-    rig.go(3.0)
-    rig.ros_speed = 0.0
-    rig.go(2.0)
-    assert 'ROS time stands still' in rig.begin() and not rig.commands
 
 
 def test_a_drive_begins_after_a_pause_of_the_node_though_the_clock_waits_behind_it(tmp_path):
@@ -371,7 +369,7 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
 # After a drive
 
 
-def test_a_robot_that_turns_on_after_the_stop_is_reported(tmp_path):
+def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_late_is_not(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
     rig.drive_to()
     rig.robot.deaf = True
@@ -385,15 +383,12 @@ def test_a_robot_that_turns_on_after_the_stop_is_reported(tmp_path):
     rig.robot.command(0.0)
     rig.go(5.0)
     assert not rig.begin() and not rig.session.warning, 'a new run has a new chance'
-
-
-def test_a_robot_that_stops_late_but_stops_is_not_reported(tmp_path):
-    rig = rested(tmp_path, robot=Robot(lag=0.3), calibration_drive=True)
-    rig.drive_to()
-    rig.session.cancel()
-    rig.session.conclude()
-    rig.go(5.0)
-    assert not rig.session.warning
+    late = rested(tmp_path, robot=Robot(lag=0.3), calibration_drive=True)
+    late.drive_to()
+    late.session.cancel()
+    late.session.conclude()
+    late.go(5.0)
+    assert not late.session.warning
 
 
 # Load
