@@ -260,7 +260,10 @@ def test_the_impossible_is_refused_in_a_sentence(ability, seconds, reason):
 
 
 @pytest.fixture
-def limits(tmp_path):
+def limits(tmp_path, monkeypatch):
+    monkeypatch.setattr('gyro_calibration.cli.plan.find_best_motion',
+                        lambda *given: find_best_motion(*given[:4], generations=5))
+
     def write(**values):
         path = tmp_path / 'limits.yaml'
         path.write_text(

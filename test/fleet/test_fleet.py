@@ -52,9 +52,9 @@ from scipy import stats
 DEGREE = np.pi / 180.0
 
 
-def drive(bias, seed, seconds=90.0):
+def drive(bias, seed):
     generator = np.random.default_rng(seed)
-    time = np.arange(0.0, seconds, 0.05)
+    time = np.arange(0.0, 45.0, 0.05)
     heading = 2.0 * np.sin(2.0 * np.pi * time / 15.0)
     output = np.gradient(heading, time) * 1.01 + bias + 2e-3 * generator.standard_normal(len(time))
     return Log(time=time, output=output, reference_heading=heading)
