@@ -121,16 +121,12 @@ def test_what_the_driver_sends_is_ignored():
     assert decoder.discarded_bytes == 0
 
 
-def test_the_link_is_replaced_and_removed(tmp_path):
+def test_the_link_is_replaced_and_removed_unless_another_gyro_has_taken_it(tmp_path):
     link = tmp_path / 'gyro'
     link.symlink_to('/nonexistent')
     with Emulator(find_protocol('csv'), samples(), link=link) as emulator:
         assert os.readlink(link) == emulator.path
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_link_that_another_gyro_has_taken_is_left_alone(tmp_path):
-    link = tmp_path / 'gyro'
     with Emulator(find_protocol('csv'), samples(), link=link):
         second = Emulator(find_protocol('csv'), samples(), link=link)
         second.open()

@@ -110,18 +110,15 @@ def test_stamps_are_right_where_samples_come_in_bursts_on_a_busy_host(rate, off,
     assert before > 0.005 > 0.001 > after
 
 
-def test_a_host_without_bursts_costs_nothing_but_its_latency(generator):
-    times = true_times(1000, 0.01, 20.0)
-    assert (play(SampleClock(1000.0), times, arrivals_of(times, generator, burst=0.0)).error()
-            < 5e-5)
-
-
-def test_nothing_drifts_in_an_hour(generator):
+def test_nothing_drifts_in_an_hour_and_a_host_without_bursts_costs_its_latency_only(generator):
     times = true_times(10, 0.03, HOUR)
     run = play(SampleClock(10.0), times, arrivals_of(times, generator))
     error = run.stamps - times
     assert abs(error[-600:].mean() - error[600:1200].mean()) < 0.001
     assert run.error() < 0.002
+    times = true_times(1000, 0.01, 20.0)
+    run = play(SampleClock(1000.0), times, arrivals_of(times, generator, burst=0.0))
+    assert run.error() < 5e-5
 
 
 def lose(times, runs):
@@ -133,7 +130,7 @@ def lose(times, runs):
     return kept
 
 
-RUNS = ((10.0, 1), (11.0, 2), (20.0, 50), (40.0, 300))
+RUNS = ((10.0, 1), (11.0, 2), (15.0, 127), (20.0, 50), (40.0, 300))
 
 
 @pytest.mark.parametrize('rate', [100, 1000])
@@ -162,13 +159,6 @@ def test_a_sequence_that_stands_still_loses_no_sample(rate, begin, generator):
     late = (run.times > 13.0) | (run.times < 12.0)  # a loss without a trace shows after 0.3 s
     assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < BURST
     assert (np.diff(run.stamps) > 0.0).all()
-
-
-def test_a_loss_of_one_round_of_the_sequence_is_no_standstill(generator):
-    times = true_times(1000, 0.01, 20.0)
-    run = play(SampleClock(1000.0, 128), times, arrivals_of(times, generator),
-               lose(times, ((10.0, 127),)), sequence=sequence(times))
-    assert run.clock.lost_count == 127
 
 
 @pytest.mark.parametrize('rate', [10, 100, 1000])
