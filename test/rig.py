@@ -228,7 +228,16 @@ class Rig:
         """Calibrate while the robot goes on, and return success and message."""
         if refusal := self.begin(kind):
             return False, refusal
+        return self.end(seconds)
+
+    def end(self, seconds=60.0):
+        """Go on until the run has ended, and return success and message."""
         assert self.go(seconds, lambda: self.ended), 'no end of the run'
+        return self.session.conclude()
+
+    def stop(self):
+        """Cancel the run, and return success and message."""
+        assert self.session.cancel()[0]
         return self.session.conclude()
 
     def drive_to(self, rate=0.7):
@@ -255,4 +264,11 @@ def rested(*arguments, seconds=3.0, **parameters):
     """Return a rig whose robot has rested for a while."""
     rig = Rig(*arguments, **parameters)
     rig.go(seconds)
+    return rig
+
+
+def driven(*arguments, **parameters):
+    """Return a rig whose robot is in the midst of a calibration that drives it."""
+    rig = rested(*arguments, calibration_drive=True, **parameters)
+    rig.drive_to()
     return rig

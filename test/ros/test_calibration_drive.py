@@ -27,7 +27,7 @@ from gyro_calibration.ros.calibration_session import (
 from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 import pytest
-from rig import INTERVAL, MODEL, PROFILE, rested, Rig, Robot
+from rig import driven, INTERVAL, MODEL, PROFILE, rested, Rig, Robot
 
 SCALE, BIAS = 0.0373, 0.01  # of the robot's gyro
 FULL = 45.0 * DEGREE
@@ -104,13 +104,11 @@ def faults():
                          [(fault, ros) for fault in faults()
                           for ros in (None, 1000.0) if ros or 'ROS time' not in fault])
 def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault, ros):
-    rig = rested(tmp_path, calibration_drive=True, ros=ros)
-    rig.drive_to()
+    rig = driven(tmp_path, ros=ros)
     act, reason = faults()[fault]
     begin, heading = rig.clock.now, rig.robot.heading
     act(rig)
-    assert rig.go(2.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(2.0)
     assert not success and reason in message, message
     assert rig.stopped_after(begin) < 0.5
     rig.go(2.0)
@@ -123,8 +121,7 @@ def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault
 
 @pytest.mark.parametrize('back', [0.03, 0.5, 10.0])
 def test_commands_go_on_where_ros_time_jumps_back_and_the_stamps_do_not(tmp_path, back):
-    rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
-    rig.drive_to()
+    rig = driven(tmp_path, ros=1000.0)
     stamp, begin = rig.stamp, rig.clock.now
     rig.clock.ros -= back
     rig.stamp = lambda reading: stamp(reading) + round(1e9 * back)
@@ -178,19 +175,16 @@ def test_what_is_no_fault_does_not_keep_a_drive_from_its_calibration(tmp_path, g
 
 
 def test_a_clock_of_the_host_that_is_set_by_an_hour_in_mid_run_ends_nothing(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     rig.clock.set_by = -3600.0
-    rig.go(60.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end()
     assert success, message
 
 
 @pytest.mark.parametrize('linear, rate', [(0.0, 0.0), (0.0, 0.3), (0.2, None)],
                          ids=['stop', 'turn', 'drive ahead'])
 def test_one_command_of_another_node_is_enough(tmp_path, linear, rate):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     rate = rig.commands[-1][1] if rate is None else rate
     rig.pipeline.add_command(Velocity(linear=(linear, 0.0, 0.0), angular=(0.0, 0.0, rate)))
     assert rig.ended and rig.commands[-1] == (rig.clock.now, 0.0)
@@ -224,8 +218,7 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
 @pytest.mark.parametrize('simulated', [{}, {'ros': 1000.0}], ids=['no /clock', '/clock'])
 def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers(
         tmp_path, simulated):
-    rig = rested(tmp_path, calibration_drive=True, **simulated)
-    rig.drive_to()
+    rig = driven(tmp_path, **simulated)
     rig.pipeline.poll(1)
     rig.clock.now += 0.4
     rig.pipeline.poll(1)
@@ -238,8 +231,7 @@ def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers
 @pytest.mark.parametrize('pace', [1e-6, 0.3, 3.0])
 def test_stamps_that_leave_the_clock_end_a_drive(tmp_path, pace, ros, within):
     """The motion goes on by them: where they all but stand, it would never end."""
-    rig = rested(tmp_path, calibration_drive=True, ros=ros)
-    rig.drive_to()
+    rig = driven(tmp_path, ros=ros)
     begin = rig.clock.now
     paced(rig, pace)
     assert rig.go(5.0, lambda: rig.ended)
@@ -274,8 +266,7 @@ def test_a_node_that_was_stopped_in_a_drive_does_not_go_on_with_it(tmp_path, tim
 
 
 def test_a_stop_that_is_lost_on_the_way_is_repeated(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     command, rig.robot.command = rig.robot.command, lambda rate: None
     assert rig.session.cancel()[0] and not rig.session.conclude()[0]
     rig.robot.command = command
@@ -286,11 +277,9 @@ def test_a_stop_that_is_lost_on_the_way_is_repeated(tmp_path):
 
 @pytest.mark.parametrize('cancelled', [True, False])
 def test_a_stop_is_not_repeated_once_another_node_commands(tmp_path, cancelled):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     if cancelled:
-        rig.session.cancel()
-        rig.session.conclude()
+        rig.stop()
     sent, rig.other = len(rig.commands), 0.3
     rig.go(1.0)
     last = len(rig.commands)
@@ -358,8 +347,7 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
     rig.go(0.5 * DISCOVERY_TIMEOUT)
     assert rig.session.run.elapsed == 0.0 and not rig.ended
     rig.receivers = int(comes)
-    assert rig.go(40.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(40.0)
     assert success == comes
     if not comes:
         assert 'no other node receives cmd_vel' in message
@@ -370,11 +358,9 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
 
 
 def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_late_is_not(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     rig.robot.deaf = True
-    rig.session.cancel()
-    rig.session.conclude()
+    rig.stop()
     rig.go(1.4)
     assert not rig.session.warning, 'it may still be slowing down'
     rig.go(1.0)
@@ -383,10 +369,8 @@ def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_lat
     rig.robot.command(0.0)
     rig.go(5.0)
     assert not rig.begin() and not rig.session.warning, 'a new run has a new chance'
-    late = rested(tmp_path, robot=Robot(lag=0.3), calibration_drive=True)
-    late.drive_to()
-    late.session.cancel()
-    late.session.conclude()
+    late = driven(tmp_path, robot=Robot(lag=0.3))
+    late.stop()
     late.go(5.0)
     assert not late.session.warning
 
@@ -448,8 +432,7 @@ def test_a_slip_without_load_is_named_as_one(tmp_path):
     rig.robot.step = slipping
     rig.go(0.3)
     rig.robot.step = step
-    rig.go(30.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(30.0)
     assert not success and 'busy' not in message and 'a slip or a bump' in message
     assert not rig.calibration_file.exists()
 
@@ -462,7 +445,7 @@ def test_a_second_calibration_is_refused_and_leaves_the_first_alone(tmp_path):
     rig.begin()
     rig.go(3.0)
     assert 'is in progress' in rig.begin(REST) and 'is in progress' in rig.begin()
-    assert rig.go(40.0, lambda: rig.ended) and rig.session.conclude()[0]
+    assert rig.end(40.0)[0]
 
 
 def test_cancel_keeps_the_calibration_in_use_and_there_is_nothing_left_to_cancel(tmp_path):
@@ -555,7 +538,7 @@ def test_odometry_may_be_finished_early(tmp_path):
     assert rig.session.finish() == (True, 'leave the robot at rest for 4.0 s more')
     rig.go(1.0)
     assert rig.session.finish() == (True, 'leave the robot at rest for 3.0 s more')
-    assert rig.go(5.0, lambda: rig.ended) and rig.session.conclude()[0]
+    assert rig.end(5.0)[0]
 
 
 def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
@@ -570,8 +553,7 @@ def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
     rig.go(4.0)
     assert rig.robot.heading == pytest.approx(2.0 * math.tau, abs=0.02), 'two turns'
     assert rig.session.finish()[0]
-    assert rig.go(5.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(5.0)
     assert success and '2 whole turns' in message, message
     kept = stored(rig)
     assert kept.method == 'turns' and kept.scale_factor_error == pytest.approx(SCALE, abs=2e-3)
