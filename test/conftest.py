@@ -80,19 +80,16 @@ def _profile(name, choice='', transport=''):
     return {_PROFILES_FILE: str(path)}
 
 
-def _prepare_environment():
-    os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-    os.environ['PYTHONPATH'] = os.pathsep.join(
-        filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
-    os.environ.update({
-        'ROS_LOG_DIR': str(_FOLDER),
-        'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        **_profile('patient.xml', _BY_PATIENT, _PATIENT),
-    })
-
-
-_prepare_environment()  # before any test module imports rclpy
+# before any test module imports rclpy
+os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+os.environ['PYTHONPATH'] = os.pathsep.join(
+    filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
+os.environ.update({
+    'ROS_LOG_DIR': str(_FOLDER),
+    'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
+    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    **_profile('patient.xml', _BY_PATIENT, _PATIENT),
+})
 
 
 _TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch'
@@ -290,15 +287,12 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             code = 'none: it had to be killed'
         finally:
-            self._kill()
+            if self.process.poll() is None:
+                os.killpg(self.process.pid, signal.SIGKILL)
+                self.process.wait()
         assert code in (None, 0), (
             f'{" ".join(self._command)} ended with code {code}:\n{self.output}')
         assert 'Traceback' not in self.output, self.output
-
-    def _kill(self):
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait()
 
 
 @pytest.fixture
@@ -323,10 +317,6 @@ def start_node(ros_domain, request):
     if request.session.testsfailed > failures or any('Traceback' in node.output for node in nodes):
         for node in nodes:
             print(f'--- output of {" ".join(node._command)}\n{node.output}')
-    _close_all(nodes)
-
-
-def _close_all(nodes):
     problems = []
     for node in nodes:
         try:
