@@ -374,12 +374,11 @@ class Ros:
         """Return a publisher with the quality of a sensor, if nothing else is said."""
         return self.node.create_publisher(message_type, topic, quality or _sensor_quality())
 
-    def call(self, service_type, name, request=None, timeout=30.0):
+    def call(self, service_type, name):
+        """Call a service, and return the future of its response."""
         client = self.node.create_client(service_type, name)
-        assert client.wait_for_service(timeout), f'no service {name} within {timeout} s'
-        future = client.call_async(request or service_type.Request())
-        wait_until(future.done, timeout, f'response of {name}')
-        return future.result()
+        assert client.wait_for_service(30.0), f'no service {name} within 30 s'
+        return client.call_async(service_type.Request())
 
     def close(self):
         """Join the thread and leave nothing behind."""

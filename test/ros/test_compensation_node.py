@@ -85,13 +85,13 @@ class FakeGyro:
                 break
         self.wait_until(lambda: len(self.imu) >= received + sent, what=f'{sent} samples')
 
-    def call(self, name):
+    def call_later(self, name):
         return self.ros.call(Trigger, f'/compensation_node/{name}')
 
-    def call_later(self, name):
-        client = self.ros.node.create_client(Trigger, f'/compensation_node/{name}')
-        assert client.wait_for_service(30.0)
-        return client.call_async(Trigger.Request())
+    def call(self, name):
+        response = self.call_later(name)
+        self.wait_until(response.done, what=f'the response of {name}')
+        return response.result()
 
     def calibrating(self):
         return bool(self.status) and self.status[-1].status[0].message.startswith('calibrating')

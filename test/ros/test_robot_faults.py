@@ -70,9 +70,7 @@ class Stage:
         return self.process
 
     def call(self, name='calibrate'):
-        client = self.ros.node.create_client(Trigger, f'/compensation_node/{name}')
-        assert client.wait_for_service(30.0)
-        return client.call_async(Trigger.Request())
+        return self.ros.call(Trigger, f'/compensation_node/{name}')
 
     def is_held_up(self, message):
         """Tell whether a refusal is the fault of a busy machine, on which /clock comes late."""
