@@ -27,33 +27,19 @@ OF_A_SENSOR = {'', '_config', '_queue_size', '_differential', '_relative',
                '_remove_gravitational_acceleration'}
 
 
-@pytest.fixture(name='parameters')
-def _parameters():
-    return yaml.safe_load(CONFIG.read_text())['ekf_filter_node']['ros__parameters']
-
-
 def fused(parameters, sensor):
     flags = parameters[f'{sensor}_config']
     assert len(flags) == len(STATE) and all(isinstance(flag, bool) for flag in flags)
     return [name for name, flag in zip(STATE, flags) if flag]
 
 
-def test_it_names_parameters_that_exist(parameters):
+def test_it_names_parameters_that_exist_and_fuses_one_thing_of_a_gyro_and_nothing_twice():
+    parameters = yaml.safe_load(CONFIG.read_text())['ekf_filter_node']['ros__parameters']
     known = PARAMETERS | {sensor + end for sensor in ('odom0', 'imu0') for end in OF_A_SENSOR}
     assert set(parameters) <= known and all(isinstance(parameters[name], float)
                                             for name in ('frequency', 'sensor_timeout'))
-
-
-def test_of_one_gyro_only_one_thing_is_fused_and_nothing_twice(parameters):
     assert parameters['imu0'] == 'imu/data' and parameters['two_d_mode'] is True
     assert fused(parameters, 'imu0') == ['vyaw'] and fused(parameters, 'odom0') == ['vx', 'vy']
-
-
-def test_the_launch_file_in_the_documentation_can_be_read():
-    page = (CONFIG.parents[1] / 'docs/how_to/nav2.md').read_text()
-    code = page.partition('```python\n')[2].partition('```')[0]
-    assert ('generate_launch_description' in compile(code, 'launch', 'exec').co_names
-            and CONFIG.name in code)
 
 
 def arguments_of(launch_file):
@@ -73,6 +59,9 @@ def test_the_launch_arguments_that_the_documents_name_are_those_of_the_launch_fi
     rows = [line.split('|')[1] for line in table.splitlines()[2:]]
     assert {name for row in rows for name in re.findall(r'`(\w+)`', row)} == declared
     other = (CONFIG.parents[1] / 'docs/how_to/nav2.md').read_text()
+    code = other.partition('```python\n')[2].partition('```')[0]
+    assert ('generate_launch_description' in compile(code, 'launch', 'exec').co_names
+            and CONFIG.name in code)
     used = set(re.findall(r"'(\w+)': '", other)) | set(re.findall(r'`(\w+):=', other))
     assert used <= declared
 
