@@ -132,8 +132,8 @@ def test_joined_logs_keep_their_sweeps_and_places_apart():
     assert list(whole.sweep) == [0, 1, 2, 3, 4, 5]
     assert whole.location[0] == 'a.csv: row 1' and whole.location[3] == 'b.csv: row 1'
     assert len(whole.temperature) == len(whole) == 6
-    whole = join_dwells([parts[0], replace(parts[1], temperature=None)])
-    assert whole.temperature is None and '1 of 2 logs hold no temperature' in whole.remarks[-1]
+    whole = join_dwells([*parts, replace(parts[1], temperature=None)])
+    assert whole.temperature is None and '1 of 3 logs hold no temperature' in whole.remarks[-1]
 
 
 # Logs in time
