@@ -80,22 +80,19 @@ def _profile(name, choice='', transport=''):
     return {_PROFILES_FILE: str(path)}
 
 
-def _prepare_environment():
-    os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-    os.environ['PYTHONPATH'] = os.pathsep.join(
-        filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
-    os.environ.update({
-        'ROS_LOG_DIR': str(_FOLDER),
-        'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        **_profile('patient.xml', _BY_PATIENT, _PATIENT),
-    })
+# before any test module imports rclpy
+os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+os.environ['PYTHONPATH'] = os.pathsep.join(
+    filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
+os.environ.update({
+    'ROS_LOG_DIR': str(_FOLDER),
+    'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
+    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    **_profile('patient.xml', _BY_PATIENT, _PATIENT),
+})
 
 
-_prepare_environment()  # before any test module imports rclpy
-
-
-_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch', 'test_serial_port'
+_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch'
 
 # Of those that only compute, what takes longest comes first: the last files, which one of several
 # processes may have to itself, are then short ones.
@@ -129,7 +126,6 @@ def pytest_collection_modifyitems(config, items):
 
 
 def pytest_unconfigure(config):
-    """Remove the folder of this run."""
     shutil.rmtree(_FOLDER, ignore_errors=True)
 
 
@@ -151,13 +147,11 @@ def wait_until(predicate, timeout=30.0, what=None):
 
 @pytest.fixture(name='wait_until')
 def _wait_until():
-    """Return the function `wait_until(predicate, timeout=30.0, what=None)`."""
     return wait_until
 
 
 @pytest.fixture
 def data():
-    """Return the folder with recordings of real gyros; skip where it is missing."""
     folder = Path(os.environ.get('GYRO_CALIBRATION_DATA', '/nonexistent'))
     if not folder.is_dir():
         pytest.skip('no recordings: set GYRO_CALIBRATION_DATA to the folder that holds them')
@@ -274,7 +268,6 @@ class NodeProcess:
         return Path(self._output).read_text(errors='replace')
 
     def wait(self, timeout=30.0):
-        """Wait until it ends by itself and return its exit code."""
         self.waited = True
         return self.process.wait(timeout)
 
@@ -284,7 +277,6 @@ class NodeProcess:
         return self.wait(timeout)
 
     def interrupt(self, number=signal.SIGINT):
-        """Send a signal to its process group, if it still runs."""
         if self.process.poll() is None:
             os.killpg(self.process.pid, number)
 
@@ -295,15 +287,12 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             code = 'none: it had to be killed'
         finally:
-            self._kill()
+            if self.process.poll() is None:
+                os.killpg(self.process.pid, signal.SIGKILL)
+                self.process.wait()
         assert code in (None, 0), (
             f'{" ".join(self._command)} ended with code {code}:\n{self.output}')
         assert 'Traceback' not in self.output, self.output
-
-    def _kill(self):
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait()
 
 
 @pytest.fixture
@@ -328,10 +317,6 @@ def start_node(ros_domain, request):
     if request.session.testsfailed > failures or any('Traceback' in node.output for node in nodes):
         for node in nodes:
             print(f'--- output of {" ".join(node._command)}\n{node.output}')
-    _close_all(nodes)
-
-
-def _close_all(nodes):
     problems = []
     for node in nodes:
         try:
@@ -380,7 +365,6 @@ class Ros:
             self._executor.spin_once(timeout_sec=0.05)
 
     def collect(self, message_type, topic, quality=None):
-        """Subscribe, and return the list that the messages go to."""
         messages = []
         self.node.create_subscription(message_type, topic, messages.append,
                                       quality or _sensor_quality())
@@ -390,13 +374,11 @@ class Ros:
         """Return a publisher with the quality of a sensor, if nothing else is said."""
         return self.node.create_publisher(message_type, topic, quality or _sensor_quality())
 
-    def call(self, service_type, name, request=None, timeout=30.0):
-        """Call a service and return its response."""
+    def call(self, service_type, name):
+        """Call a service, and return the future of its response."""
         client = self.node.create_client(service_type, name)
-        assert client.wait_for_service(timeout), f'no service {name} within {timeout} s'
-        future = client.call_async(request or service_type.Request())
-        wait_until(future.done, timeout, f'response of {name}')
-        return future.result()
+        assert client.wait_for_service(30.0), f'no service {name} within 30 s'
+        return client.call_async(service_type.Request())
 
     def close(self):
         """Join the thread and leave nothing behind."""

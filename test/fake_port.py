@@ -41,7 +41,6 @@ class World:
         return self.now
 
     def at(self, seconds, action):
-        """Do something at a time after the beginning."""
         heapq.heappush(self._events, (BEGIN + seconds, next(self._number), action))
 
     def sleep(self, seconds):
@@ -88,11 +87,9 @@ class World:
                    for output, number in zip(outputs, numbers)), rate=rate, **when)
 
     def plug(self):
-        """Plug all in."""
         self.plugged = True
 
     def unplug(self):
-        """Unplug all; who reads notices at once."""
         self.plugged = False
         return True
 

@@ -17,7 +17,6 @@ several lines. `benchmarks/fuzz.py` runs them, guided by coverage.
 
 """
 
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
@@ -32,6 +31,7 @@ from pathlib import Path
 import random
 import struct
 import tempfile
+from typing import Any
 import zlib
 
 from gyro_calibration.cli.main import _make_parser
@@ -78,8 +78,6 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 @dataclass(frozen=True)
 class Target:
-    """Something that reads bytes."""
-
     #: Takes any bytes, raises where a claim is broken, and tells whether they were read.
     check: Callable[[bytes], object]
     seeds: Callable[[], Sequence[bytes]]  # inputs to begin with, as the project writes them
@@ -89,7 +87,6 @@ class Target:
 
 
 def path_of(suffix: str) -> Path:
-    """Return where an input is written, of which there is only one at a time in a process."""
     return Path(_FOLDER.name) / f'{os.getpid()}{suffix}'
 
 
@@ -105,6 +102,15 @@ def _check_message(error: Exception | str, path: object = '') -> None:
     assert text.startswith(str(path)), text
     assert len(text.splitlines()) == 1 and len(text.replace(str(path), '')) <= MESSAGE, (
         text[:2 * MESSAGE])
+
+
+def _read(read: Callable[[Path], Any], error: type[Exception], path: Path) -> Any:
+    """Return what is read, or None where it is refused in a line."""
+    try:
+        return read(path)
+    except error as refused:
+        _check_message(refused, path)
+        return None
 
 
 # Decoders
@@ -271,18 +277,11 @@ def _full_model() -> GyroModel:
 def check_log(data: bytes, suffix: str = '.csv') -> bool:
     """Check that a log is refused in a line, or read the same whole, in blocks, and rewritten."""
     path = _file(data, suffix)
-    try:
-        log = read_log(path)
-    except LogError as error:
-        _check_message(error, path)
-        log = None
-    try:
-        blocks = list(read_log_blocks(path, rows=2))
-    except LogError as error:
-        _check_message(error, path)
-        assert log is None, 'refused in blocks only'
+    log = _read(read_log, LogError, path)
+    blocks = _read(lambda path: list(read_log_blocks(path, rows=2)), LogError, path)
+    assert (log is None) == (blocks is None), 'refused as a whole or in blocks only'
+    if log is None:
         return False
-    assert log is not None, 'refused as a whole only'
     assert np.array_equal(np.concatenate([_values(block) for block in blocks], axis=1),
                           _values(log), equal_nan=True)
     assert not (np.abs(_values(log)) > MAX_MAGNITUDE).any()
@@ -319,11 +318,8 @@ def _log_seeds(suffix: str = '.csv') -> list[bytes]:
 
 def check_model(data: bytes) -> bool:
     """Refuse a model in a line, or compensate with it and find it the same once written."""
-    path = _file(data, '.yaml')
-    try:
-        model = read_model(path)
-    except ModelError as error:
-        _check_message(error, path)
+    model = _read(read_model, ModelError, _file(data, '.yaml'))
+    if model is None:
         return False
     noise, values = (vars(model.noise).values(),
                      [value for term in model.terms for value in term.values])
@@ -384,11 +380,8 @@ def _bias_table_seeds() -> list[bytes]:
 
 
 def check_profile(data: bytes) -> bool:
-    path = _file(data, '.csv')
-    try:
-        motion = read_motion(path)
-    except MotionError as error:
-        _check_message(error, path)
+    motion = _read(read_motion, MotionError, _file(data, '.csv'))
+    if motion is None:
         return False
     times = np.linspace(-1.0, motion.duration + 1.0, 9)
     assert (np.isfinite(motion.heading_at(times)).all()
@@ -403,11 +396,8 @@ def _profile_seeds() -> list[bytes]:
 
 
 def check_limits(data: bytes) -> bool:
-    path = _file(data, '.yaml')
-    try:
-        ability = read_limits(str(path))
-    except UsageError as error:
-        _check_message(error, path)
+    ability = _read(lambda path: read_limits(str(path)), UsageError, _file(data, '.yaml'))
+    if ability is None:
         return False
     assert all(not math.isnan(value) for value in vars(ability).values())
     return True
@@ -420,15 +410,10 @@ def _limits_seeds() -> list[bytes]:
 
 def check_recording(suffix: str, data: bytes) -> bool:
     path = _file(data, suffix)
-    try:
-        with np.errstate(all='ignore'):
-            log = read_recording(path, Topics(reference='table'))
-    except LogError as error:
-        _check_message(error, path)
-    try:
-        log = read_recording(path)
-    except LogError as error:
-        _check_message(error, path)
+    with np.errstate(all='ignore'):
+        _read(lambda path: read_recording(path, Topics(reference='table')), LogError, path)
+    log = _read(read_recording, LogError, path)
+    if log is None:
         return False
     assert log.time is not None and (np.diff(log.time) > 0.0).all() and np.isfinite(log.time).all()
     assert not np.isinf(log.output).any()

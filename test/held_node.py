@@ -62,27 +62,22 @@ class HeldNode:
         self.sent[publisher.topic_name].append(copy.deepcopy(message))
 
     def send(self, topic, message):
-        """Let a message arrive."""
         heard = {each.topic_name: each.callback for each in self.node.subscriptions}
         heard[topic](message)
 
     def tick(self, times=1):
-        """Let the timers fall due."""
         for _ in range(times):
             for timer in list(self.node.timers):
                 timer.callback()
 
     def call(self, name, kind):
-        """Call a service, and return its response, or a future of it."""
         offered = {self.node.resolve_service_name(each.srv_name): each.callback
                    for each in self.node.services}
         return offered[name](kind.Request(), kind.Response())
 
     def put(self, name, value):
-        """Set a parameter, as a client does, and return the result."""
         return self.node.set_parameters([Parameter(name, value=value)])[0]
 
     def close(self):
-        """End it."""
         self.node.destroy_node()
         rclpy.shutdown()

@@ -38,7 +38,6 @@ BEGIN, STEP = 1.7e9, 86400.0  # s since 1970, and from one run of the robot to t
 
 
 def opened(folder):
-    """Return the memory of a robot that starts."""
     return StateStore('', folder / KEPT[0], folder / KEPT[1], Prior())
 
 
@@ -69,7 +68,6 @@ def lines_of(memory, number, on_line=lambda line: None):
 
 
 def write_killed(memory, number, line):
-    """Write in a child that is killed before this line, or ends."""
     child = os.fork()
     if child == 0:
         lines_of(memory, number,
@@ -79,7 +77,6 @@ def write_killed(memory, number, line):
 
 
 def contents(folder):
-    """Return what the files hold."""
     return [(folder / name).read_bytes() if (folder / name).exists() else b'' for name in KEPT]
 
 
@@ -93,7 +90,6 @@ def taught(folder):
 
 
 def main():
-    """Kill, look, and print what was found."""
     folder, kills, moments = Path(sys.argv[1]), int(sys.argv[2]), random.Random(1)
     robot, unharmed = taught(folder / 'robot'), taught(folder / 'unharmed')
     found = {'old': [0, 0], 'new': [0, 0], 'torn': 0, 'half_written': 0}

@@ -28,7 +28,6 @@ from sensor_msgs.msg import Imu
 
 
 def listener(number):
-    """Return an executor with a subscriber of its own context."""
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(f'listener_{number}', context=context)
@@ -40,7 +39,6 @@ def listener(number):
 
 
 def main():
-    """Listen until a signal comes."""
     stop = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: stop.set())
     executors = [listener(number) for number in range(int(sys.argv[1]))]

@@ -147,12 +147,10 @@ MCAP = b'\x89MCAP0\r\n'
 
 
 def text(words):
-    """Return a text as MCAP holds it."""
     return struct.pack('<I', len(words.encode())) + words.encode()
 
 
 def record(code, body):
-    """Return a record of MCAP."""
     return struct.pack('<BQ', code, len(body)) + body
 
 

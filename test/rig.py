@@ -45,15 +45,12 @@ class StepClock:
         self.now, self.set_by, self.ros = 1000.0, 0.0, ros
 
     def steady(self):
-        """Return the steady clock, s."""
         return self.now
 
     def date(self):
-        """Return the clock of the host, s since 1970."""
         return BEGIN - 1000.0 + self.now + self.set_by
 
     def simulated(self):
-        """Return the time of a simulation, s."""
         return self.ros
 
 
@@ -113,13 +110,11 @@ class Rig:
             self.robot.command(rate)
 
     def set(self, **parameters):  # noqa: A003
-        """Set parameters while it runs."""
         names = {each.attribute: each.name for each in PARAMETERS}
         self._given.update({names[attribute]: value for attribute, value in parameters.items()})
         self.pipeline.use_parameters(parameter_values(PARAMETERS, self._given))
 
     def stamp(self, reading):
-        """Return the stamp of a reading, ns."""
         if self.clock.ros is not None:
             if not self.robot.stamps_stand:
                 self._stamp = round(1e9 * self.clock.ros)
@@ -127,7 +122,6 @@ class Rig:
         return BEGIN * NSEC_PER_SEC + round(1e9 * (reading.stamp - 1000.0 + self.clock.set_by))
 
     def step(self):
-        """Let everything go on by the interval of the samples."""
         self._steps += 1
         self.clock.now += INTERVAL / self.speed
         if self.clock.ros:
@@ -145,12 +139,10 @@ class Rig:
         self.guards()
 
     def odometry(self, stamp, reading):
-        """Let the odometry arrive."""
         heading = math.remainder(reading.heading, math.tau)
         self.pipeline.add_odometry(stamp, heading, Velocity(angular=(0.0, 0.0, reading.rate)))
 
     def sample(self, stamp, output, heading=math.nan):
-        """Let a sample arrive, and return what comes out."""
         self.truth[stamp] = heading
         found = self.pipeline.add_sample(stamp, output, receivers=self.receivers)
         if found is not None:
@@ -236,7 +228,16 @@ class Rig:
         """Calibrate while the robot goes on, and return success and message."""
         if refusal := self.begin(kind):
             return False, refusal
+        return self.end(seconds)
+
+    def end(self, seconds=60.0):
+        """Go on until the run has ended, and return success and message."""
         assert self.go(seconds, lambda: self.ended), 'no end of the run'
+        return self.session.conclude()
+
+    def stop(self):
+        """Cancel the run, and return success and message."""
+        assert self.session.cancel()[0]
         return self.session.conclude()
 
     def drive_to(self, rate=0.7):
@@ -263,4 +264,11 @@ def rested(*arguments, seconds=3.0, **parameters):
     """Return a rig whose robot has rested for a while."""
     rig = Rig(*arguments, **parameters)
     rig.go(seconds)
+    return rig
+
+
+def driven(*arguments, **parameters):
+    """Return a rig whose robot is in the midst of a calibration that drives it."""
+    rig = rested(*arguments, calibration_drive=True, **parameters)
+    rig.drive_to()
     return rig

@@ -216,7 +216,6 @@ class RosRobot:
         return sum(abs(b - a) for a, b in zip(after, after[1:]))
 
     def close(self):
-        """End the thread."""
         self._stop.set()
         self._thread.join()
 
@@ -254,6 +253,5 @@ class SecondCommander:
                 self._publisher.publish(message)
 
     def close(self):
-        """Say nothing any more."""
         self._stop.set()
         self._thread.join()

@@ -8,9 +8,8 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Faults of a serial line: bytes lost, doubled and flipped, late and in pieces."""
+"""Faults of a serial line: bytes lost, doubled and flipped."""
 
-from math import ceil
 
 import numpy as np
 
@@ -23,15 +22,3 @@ def damaged(data, generator, lost=0.0, doubled=0.0, flipped=0.0):
     arrived[struck] ^= (1 << generator.integers(8, size=int(struck.sum()))).astype(np.uint8)
     times = np.where(drawn < lost, 0, np.where(drawn < lost + doubled, 2, 1))
     return np.repeat(arrived, times).tobytes()
-
-
-def bursts(sent, interval=0.016):
-    """Gather what is sent, (s, bytes), in each interval; it comes at its end, as from USB."""
-    end, gathered = 0.0, b''
-    for due, data in sent:
-        own_end = interval * ceil(due / interval - 1e-6)  # rounding must not miss its own interval
-        if own_end > end and gathered:
-            yield end, gathered
-            gathered = b''
-        end, gathered = own_end, gathered + data
-    yield end, gathered

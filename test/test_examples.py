@@ -27,7 +27,6 @@ FOLDER = Path(__file__).parents[1] / 'docs/examples'
 
 @pytest.fixture(scope='module')
 def ran(tmp_path_factory):
-    """Return a function that runs an example, and gives its folder and what it prints."""
     @cache
     def ran(name):
         paths = [str(FOLDER.parents[1]), *filter(None, [os.environ.get('PYTHONPATH')])]

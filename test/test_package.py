@@ -19,7 +19,6 @@ import sys
 from xml.etree import ElementTree
 import zipfile
 
-import conftest
 import gyro_calibration
 import pytest
 from test_layers import imports
@@ -100,23 +99,6 @@ def test_the_manifest_names_exactly_what_is_imported():
         'mcap', 'distributed', 'pyarrow'}
 
 
-def test_pytest_takes_a_launch_test_that_has_no_fixtures(pytestconfig):
-    """As launch_testing makes it, where a ROS 2 is installed."""
-    class LaunchTestItem:
-        location = 'test/ros/test_launch.py', 0, ''
-        markers = ()
-
-        def add_marker(self, name):
-            self.markers += name,
-
-        def get_closest_marker(self, name):
-            return name in self.markers
-
-    item = LaunchTestItem()
-    conftest.pytest_collection_modifyitems(pytestconfig, [item])
-    assert item.markers == ('timed',)
-
-
 def test_every_launcher_is_the_same_and_can_be_executed():
     launchers = list((ROOT / 'lib/gyro_calibration').iterdir())
     assert {file.name for file in launchers} == EXECUTABLES
@@ -187,7 +169,6 @@ def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
 
 
 def check_metadata(wheel):
-    """Compare the metadata of a wheel with package.xml."""
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     metadata, = importlib.metadata.distributions(path=[str(wheel)])
     assert metadata.version == manifest.findtext('version')

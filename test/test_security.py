@@ -37,7 +37,6 @@ ENCLAVES = {enclave.get('path').rpartition('/')[2]: enclave for enclave in POLIC
 
 
 def belongs(name, roots):
-    """Tell whether a dotted name is one of the roots or below one."""
     return any(name == root or name.startswith(f'{root}.') for root in roots)
 
 
@@ -132,27 +131,19 @@ def test_the_policy_has_the_form_that_the_tools_read():
     forms = {'policy': {'enclaves'}, 'enclaves': {'enclave'}, 'enclave': {'profiles'},
              'profiles': {'profile'}, 'profile': {'topics', 'services'}, 'topics': {'topic'},
              'services': {'service'}, 'topic': set(), 'service': set()}
-    assert all(child.tag in forms[element.tag] for element in POLICY.iter() for child in element)
-    assert all(profile.get('ns') and profile.get('node') for profile in POLICY.iter('profile'))
-    rules = [(element.tag, key, value) for element in POLICY.iter()
-             for key, value in element.items() if element.tag in ('topics', 'services')]
-    assert rules and all((tag, key) in ACCESS and value == 'ALLOW' for tag, key, value in rules)
-
-
-def test_among_the_enclaves_stands_nothing_else():
-    """The tools of sros2 take a comment there for an enclave, and give up."""
+    # with comments, which the tools of sros2 take for an enclave, and give up
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
-    enclaves, = ElementTree.parse(ROOT / 'config/sros2/policy.xml', parser).getroot().iter(
-        'enclaves')
+    whole = ElementTree.parse(ROOT / 'config/sros2/policy.xml', parser).getroot()
+    enclaves, = whole.iter('enclaves')
     assert {child.tag for child in enclaves} == {'enclave'}
-
-
-def test_no_rule_is_a_pattern_or_stands_twice():
-    for enclave in ENCLAVES.values():
-        for profile in enclave.iter('profile'):
-            rules = [(tuple(kind.attrib), rule.text) for kind in profile for rule in kind]
-            assert len(rules) == len(set(rules))
-            assert not [text for _, text in rules if set(text) & set('*?[]')]
+    assert all(child.tag in forms[element.tag] for element in POLICY.iter() for child in element)
+    for profile in POLICY.iter('profile'):
+        assert profile.get('ns') and profile.get('node') and len(profile)
+        kinds = [(kind.tag, key, value) for kind in profile for key, value in kind.items()]
+        assert all((tag, key) in ACCESS and value == 'ALLOW' for tag, key, value in kinds)
+        rules = [(tuple(kind.attrib), rule.text) for kind in profile for rule in kind]
+        assert len(rules) == len(set(rules)), 'one stands twice'
+        assert not [text for _, text in rules if set(text) & set('*?[]')], 'a pattern'
 
 
 #: Parameters of each enclave's node that together bring every end point that it may have.
@@ -166,7 +157,6 @@ ONLY_THEN = {('subscriber', '/clock')}
 
 
 def node_of(enclave):
-    """Return the class of an enclave's node."""
     from gyro_calibration.ros.compensation_node import CompensationNode
     from gyro_calibration.ros.driver_node import DriverNode
     name = next(ENCLAVES[enclave].iter('profile')).get('node')

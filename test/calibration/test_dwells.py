@@ -65,56 +65,46 @@ def errors(found):
 
 # Rate tables
 
-def test_the_rows_of_a_rate_table_are_its_dwells(data):
-    found = extract_dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
-    assert len(found) == 695
-    assert found.sweep.max() + 1 == 24
-
-
-def test_the_order_of_the_rates_tells_the_sweeps_that_the_file_names(data):
+def test_the_rows_of_a_rate_table_are_its_dwells_and_their_order_tells_the_named_sweeps(data):
     log = read_log(data / 'fog_rate_table' / 'table.csv')
-    assert (extract_dwells(replace(log, others={})).sweep == extract_dwells(log).sweep).all()
+    found = extract_dwells(log)
+    assert (len(found), found.sweep.max() + 1) == (695, 24)
+    assert (extract_dwells(replace(log, others={})).sweep == found.sweep).all()
 
 
-def test_a_column_names_the_sweeps():
-    found = dwells_from_table(
-        table([1, 2, 3, 4], others={'sweep': ('cold', 'warm', 'cold', 'warm')}))
-    assert list(found.sweep) == [0, 1, 0, 1]
+TENS = range(10, 101, 10)
+SWEEPS = {
+    'one direction': list(range(-100, 101, 20)),
+    'both signs in turn': [0, *(sign * rate for rate in TENS for sign in (1, -1))],
+    'rests between': [rate for size in TENS for rate in (0, size)],
+    'rests between, both signs in turn': [rate for size in TENS for rate in (0, size, 0, -size)],
+}
 
 
-@pytest.mark.parametrize('sweep', [
-    list(range(-100, 101, 20)),
-    [0, *(sign * rate for rate in range(10, 101, 10) for sign in (1, -1))],
-    [rate for size in range(10, 101, 10) for rate in (0, size)],
-    [rate for size in range(10, 101, 10) for rate in (0, size, 0, -size)],
-], ids=['one direction', 'both signs in turn', 'rests between',
-        'rests between, both signs in turn'])
+@pytest.mark.parametrize('sweep', SWEEPS.values(), ids=SWEEPS)
 def test_sweeps_are_found_by_the_order_of_the_rates(sweep):
     found = dwells_from_table(table(sweep * 3))
     turning = found.rate != 0.0  # a rest is near to both the sweep before and the one after
     assert list(found.sweep[turning]) == list(np.repeat([0, 1, 2], len(sweep))[turning])
 
 
-def test_a_sweep_ends_where_the_travel_through_the_rates_turns_back():
-    found = dwells_from_table(table([-100, -50, 0, 50, 100, 50, 0, -50, -100]))
-    assert list(found.sweep) == [0] * 5 + [1] * 4
+@pytest.mark.parametrize('rates, more, sweeps', [
+    ([1, 2, 3, 4], {'sweep': ('cold', 'warm', 'cold', 'warm')}, [0, 1, 0, 1]),
+    ([-100, -50, 0, 50, 100, 50, 0, -50, -100], {}, [0] * 5 + [1] * 4),
+    (np.random.default_rng(3).permutation(np.linspace(-100.0, 100.0, 90)), {},
+     [block for block in range(9) for _ in range(10)])],
+    ids=['named by a column', 'where the rates turn back', 'rates in random order'])
+def test_sweeps_end_where_a_column_or_the_rates_say(rates, more, sweeps):
+    assert list(dwells_from_table(table(rates, others=more)).sweep) == sweeps
 
 
-def test_rates_in_random_order_make_nine_blocks(generator):
-    found = dwells_from_table(table(generator.permutation(np.linspace(-100.0, 100.0, 90))))
-    assert list(found.sweep) == [block for block in range(9) for _ in range(10)]
-
-
-def test_rows_without_output_or_reference_are_left_out_and_reported():
-    log = table([10, 20, math.nan, 40, 50], temperature=np.arange(5.0))
+def test_rows_without_output_or_reference_are_left_out_and_a_column_gives_deviations():
+    log = table([10, 20, math.nan, 40, 50], temperature=np.arange(5.0),
+                others={'deviation_dps': ('0.5', 'nan', '1', '1', '0')})
     found = dwells_from_table(replace(log, output=np.where(np.arange(5) == 3, np.nan, log.output)))
     assert found.location == ('row 1', 'row 2', 'row 5')
     assert list(found.temperature) == [0.0, 1.0, 4.0]
     assert found.remarks == ('2 rows without output or reference are left out: 3, 4',)
-
-
-def test_a_table_may_say_how_well_its_means_are_known():
-    found = dwells_from_table(table([10, 20, 30], others={'deviation_dps': ('0.5', 'nan', '0')}))
     assert found.deviation[0] == 0.5 * DEGREE and np.isnan(found.deviation[1:]).all()
 
 
@@ -136,17 +126,14 @@ def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
 
 
 def test_joined_logs_keep_their_sweeps_and_places_apart():
-    whole = join_dwells([extract_dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
-                         for name in ('a.csv', 'b.csv')])
+    parts = [extract_dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
+             for name in ('a.csv', 'b.csv')]
+    whole = join_dwells(parts)
     assert list(whole.sweep) == [0, 1, 2, 3, 4, 5]
     assert whole.location[0] == 'a.csv: row 1' and whole.location[3] == 'b.csv: row 1'
     assert len(whole.temperature) == len(whole) == 6
-
-
-def test_a_log_without_temperature_takes_it_from_those_that_it_is_joined_with():
-    whole = join_dwells([table_dwells := extract_dwells(table([1, 2, 3])),
-                         replace(table_dwells, temperature=np.ones(3))])
-    assert whole.temperature is None and '1 of 2 logs hold no temperature' in whole.remarks[-1]
+    whole = join_dwells([*parts, replace(parts[1], temperature=None)])
+    assert whole.temperature is None and '1 of 3 logs hold no temperature' in whole.remarks[-1]
 
 
 # Logs in time
@@ -157,13 +144,19 @@ def references(generator):
             'coarse encoder': {'reference_heading': encoder(2.0, generator)}}
 
 
+@pytest.mark.parametrize('every, sign', [(1, 1.0), (10, 1.0), (100, -1.0)])
 @pytest.mark.parametrize('reference', ['rate', 'heading', 'fine encoder', 'coarse encoder'])
-def test_every_rate_of_a_table_is_found(reference, generator):
-    found = find_dwells(run(generator, **references(generator)[reference]))
+def test_every_rate_of_a_table_is_found(reference, every, sign, generator):
+    """At 100, 10 and 1 Hz, also by a gyro that runs the other way."""
+    (name, given), = references(generator)[reference].items()
+    log = run(generator)
+    found = find_dwells(Log(output=sign * log.output[::every], time=TIME[::every],
+                            **{name: given[::every]}))
     assert np.allclose(found.rate / DEGREE, RATES, atol=0.01)
-    assert (np.abs(errors(found)) < 5.0).all()
+    assert (np.abs(errors(replace(found, output=sign * found.output))) < 5.0).all()
     lengths = [float(place.split()[2]) - float(place.split()[0]) for place in found.location]
-    assert min(lengths) > 12.5 and np.median(lengths) > 14.0
+    ends = 0.04 * (every - 1)  # two samples at each end, s
+    assert min(lengths) > 12.5 - ends and np.median(lengths) > 14.0 - ends
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
@@ -218,14 +211,6 @@ def test_a_table_that_vibrates_and_rings_gives_its_dwells_all_the_same(step, gen
     assert (np.abs(errors(found)) < 5.0).all()
 
 
-@pytest.mark.parametrize('every', [10, 100])
-def test_slow_samples_are_enough(every, generator):
-    log = run(generator)
-    found = find_dwells(
-        Log(output=log.output[::every], time=TIME[::every], reference_rate=RATE[::every]))
-    assert np.allclose(found.rate / DEGREE, RATES) and (np.abs(errors(found)) < 5.0).all()
-
-
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
 def test_a_reference_that_is_slower_than_the_gyro_is_enough_and_only_true_losses_are_reported(
         reference, generator):
@@ -237,12 +222,6 @@ def test_a_reference_that_is_slower_than_the_gyro_is_enough_and_only_true_losses
     assert len(found) == len(RATES) and (np.abs(errors(found)) < 5.0).all()
     assert [remark for remark in found.remarks if 'lost' in remark] == [
         'the reference was lost once, for 44 samples, at 249.96 s; they are left out']
-
-
-def test_a_gyro_that_runs_the_other_way_is_averaged_as_well(generator):
-    log = run(generator)
-    found, same = find_dwells(replace(log, output=-log.output)), find_dwells(log)
-    assert np.allclose(found.output, -same.output) and np.allclose(found.deviation, same.deviation)
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
@@ -290,17 +269,12 @@ def test_a_dwell_that_warms_is_divided(generator):
             and 'divided' in ' '.join(warm.remarks))
 
 
-def test_a_rate_made_of_coarse_steps_gives_way_to_their_heading(generator):
-    heading = encoder(2.0, generator)
-    found = find_dwells(run(generator, reference_rate=np.gradient(heading, TIME),
-                            reference_heading=heading))
-    assert np.allclose(found.rate / DEGREE, RATES, atol=0.02)
-
-
-def test_a_rate_that_was_never_there_gives_way_to_the_heading(generator):
-    found = find_dwells(run(generator, reference_rate=np.full(len(TIME), np.nan),
-                            reference_heading=HEADING))
-    assert np.allclose(found.rate / DEGREE, RATES)
+def test_a_rate_of_coarse_steps_or_of_no_values_gives_way_to_the_heading(generator):
+    coarse = encoder(2.0, generator)
+    for rate, heading, off in ((np.gradient(coarse, TIME), coarse, 0.02),
+                               (np.full(len(TIME), np.nan), HEADING, 1e-6)):
+        found = find_dwells(run(generator, reference_rate=rate, reference_heading=heading))
+        assert np.allclose(found.rate / DEGREE, RATES, atol=off)
 
 
 def test_a_simulation_without_noise_claims_nothing(generator):
@@ -343,18 +317,15 @@ def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
 
 # Deviations
 
-def test_variances_that_differ_by_chance_become_one(generator):
-    found = [shrink_variances(generator.chisquare(11, 40) / 11.0, np.full(40, 11))
-             for _ in range(200)]
+def test_variances_that_differ_by_chance_become_one_and_others_stay(generator):
+    chance = [shrink_variances(generator.chisquare(11, 40) / 11.0, np.full(40, 11))
+              for _ in range(200)]
     # Without shrinkage, each would have an error of 43 %.
-    assert np.sqrt(np.mean((np.array(found) - 1.0) ** 2)) < 0.15
-    assert np.mean(found) == pytest.approx(1.0, abs=0.02)
-
-
-def test_variances_that_really_differ_stay_so(generator):
+    assert np.sqrt(np.mean((np.array(chance) - 1.0) ** 2)) < 0.15
+    assert np.mean(chance) == pytest.approx(1.0, abs=0.02)
     truth = np.repeat([1.0, 100.0], 20)
     found = np.mean([shrink_variances(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11))
-                    for _ in range(200)], axis=0)
+                     for _ in range(200)], axis=0)
     assert np.allclose(found / truth, 1.0, atol=0.25)
 
 

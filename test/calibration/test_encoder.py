@@ -58,19 +58,6 @@ SWING = swing(120.0)
 CLEAN = log_of(SWING, 100.0)
 
 
-def test_a_late_gyro_is_found_late_and_nothing_else():
-    found = calibrate_encoder(log_of(SWING, 100.0, late=0.0117))
-    assert found.fit.time_offset == pytest.approx(0.0117, abs=1e-4)
-    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=2e-5)
-
-
-def test_a_reference_rate_is_integrated():
-    log = replace(CLEAN, reference_heading=None, reference_rate=SWING.rate_at(CLEAN.time))
-    found = calibrate_encoder(log)
-    assert found.method == 'likelihood'
-    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=2e-5)
-
-
 def test_bounds_of_the_angle_random_walk_hold_it_and_are_written_beside_a_fine_reference_alone():
     noise, held = Noise(angle_random_walk=5e-4), 0
     for seed in range(12):
@@ -99,11 +86,17 @@ def test_the_model_has_the_angle_random_walk_that_is_stated_and_it_is_right():
 
 
 def test_the_model_holds_what_was_found():
-    found = calibrate_encoder(CLEAN)
+    found = calibrate_encoder(
+        replace(CLEAN, temperature=np.linspace(20.0, 30.0, len(CLEAN))))
     assert {term.effect.name: term.values[0] for term in found.model.terms} == {
         'bias': found.fit.bias, 'scale_factor_error': found.fit.scale_factor_error}
     assert found.model.rate_range == (CLEAN.output.min(), CLEAN.output.max())
     assert found.model.covariance[0, 0] == found.fit.covariance[1, 1]
+    assert (found.model.temperature_range, found.model.reference_temperature) == (
+        (20.0, 30.0), pytest.approx(25.0))
+    after = found.residual_after
+    assert found.residual_before.largest > 10 * DEGREE > 0.05 * DEGREE > after.rms
+    assert after.rms < after.largest == np.abs(after.heading).max()
 
 
 LATE = np.arange(len(CLEAN)) < 9990
@@ -128,26 +121,29 @@ def test_what_cannot_be_calibrated_is_refused_with_its_reason(log, reason, metho
     assert reason in str(refused.value) and '\n' not in str(refused.value)
 
 
-def test_lost_samples_are_counted_and_do_not_look_like_bias():
-    """
-    A hundred samples lost while turning one way would be 60 deg/s * 1 s over 100 s.
+BRIDGED = (CLEAN.time > 30.0) & (CLEAN.time < 34.0) | (CLEAN.time > 70.0) & (CLEAN.time < 71.0)
+# A hundred samples lost while turning one way would be 60 deg/s * 1 s over 100 s, which is
+# 0.6 deg/s, were the stamps not believed.
+KEPT = ~((SWING.rate_at(CLEAN.time) > 1.0) & (np.arange(len(CLEAN)) % 40 == 7))
+FOUND = {  # log, time offset, lost samples, values of the reference
+    'late': (log_of(SWING, 100.0, late=0.0117), 0.0117, 0, 10_000),
+    'by a reference rate': (replace(CLEAN, reference_heading=None,
+                                    reference_rate=SWING.rate_at(CLEAN.time)), 0.0, 0, 10_000),
+    'lost samples': (replace(CLEAN, **{name: getattr(CLEAN, name)[KEPT] for name in (
+        'time', 'output', 'reference_heading')}), 0.0, np.sum(~KEPT), np.sum(KEPT)),
+    'a reference that is lost at times': (
+        replace(CLEAN, reference_heading=np.where(BRIDGED, np.nan, CLEAN.reference_heading)), 0.0,
+        0, np.sum(~BRIDGED)),
+}
 
-    0.6 deg/s, were the stamps not believed.
-    """
-    kept = ~((SWING.rate_at(CLEAN.time) > 1.0) & (np.arange(len(CLEAN)) % 40 == 7))
-    log = replace(CLEAN, **{name: getattr(CLEAN, name)[kept]
-                            for name in ('time', 'output', 'reference_heading')})
+
+@pytest.mark.parametrize('log, late, lost, count', FOUND.values(), ids=FOUND)
+def test_scale_bias_and_delay_are_found(log, late, lost, count):
     found = calibrate_encoder(log)
-    assert found.lost_samples == np.sum(~kept) > 80
+    assert (found.method, found.lost_samples, len(found.reference.time)) == (
+        'likelihood', lost, count)
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
-
-
-def test_a_reference_that_is_lost_at_times_is_bridged_by_the_gyro():
-    lost = (CLEAN.time > 30.0) & (CLEAN.time < 34.0) | (CLEAN.time > 70.0) & (CLEAN.time < 71.0)
-    found = calibrate_encoder(
-        replace(CLEAN, reference_heading=np.where(lost, np.nan, CLEAN.reference_heading)))
-    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
-    assert len(found.reference.time) == np.sum(~lost)
+    assert found.fit.time_offset == pytest.approx(late, abs=1e-4)
 
 
 def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
@@ -161,21 +157,6 @@ def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
     found = calibrate_encoder(log)
     assert found.fit.scale_factor_error == pytest.approx(360 / 351 - 1, abs=5e-5)
     assert '351.0' in found.remarks[0]
-
-
-def test_the_temperature_of_the_log_is_that_of_the_model():
-    model = calibrate_encoder(replace(CLEAN,
-                                      temperature=np.linspace(20.0, 30.0, len(CLEAN)))).model
-    assert (model.temperature_range, model.reference_temperature) == (
-        (20.0, 30.0), pytest.approx(25.0))
-
-
-def test_the_residual_heading_is_what_the_calibration_leaves():
-    found = calibrate_encoder(CLEAN)
-    assert found.residual_before.largest > 10 * DEGREE
-    after = found.residual_after
-    assert after.rms < 0.05 * DEGREE
-    assert after.rms < after.largest == np.abs(after.heading).max()
 
 
 @pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
@@ -249,14 +230,6 @@ def test_stated_intervals_hold_between_pieces_of_a_measured_log(data):
     scatter = np.std([(fit.scale_factor_error, fit.bias) for fit in fits], axis=0, ddof=1)
     stated = np.sqrt(np.mean([np.diag(fit.covariance) for fit in fits], axis=0))
     assert (scatter < 2.0 * stated).all() and (scatter > stated / 3.0).all(), (scatter, stated)
-
-
-def test_one_half_of_a_measured_log_predicts_the_other(data):
-    first, second = (calibrate_encoder(measured(data, 'yaw_slow', start, start + 750.0)).fit
-                     for start in (0.0, 750.0))
-    apart = np.abs(
-        (first.scale_factor_error - second.scale_factor_error, first.bias - second.bias))
-    assert (apart < 2.6 * np.sqrt(np.diag(first.covariance + second.covariance))).all()
 
 
 def shaken(bias, generator):

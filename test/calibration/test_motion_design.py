@@ -71,23 +71,28 @@ def planned(name):
 
 
 @pytest.mark.parametrize('name', ABILITIES)
-def test_a_planned_motion_is_one_that_the_robot_can_do(name):
+def test_a_planned_motion_can_be_driven_tells_the_scale_better_and_calibrates(name, tmp_path):
     motion, ability = planned(name).motion, ABILITIES[name]
-    assert (can_follow(ability, motion) and motion.duration == pytest.approx(20.0, abs=1e-9)
-            and abs(motion.heading[-1]) < 1e-12)
+    simple = plain_motion(ability, 20.0)
+    for each in (motion, simple):
+        assert (can_follow(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
+                and abs(each.heading[-1]) < 1e-12)
     for begin in (0.0, 20.0 - ability.rest):
         assert not motion.rate_at(np.linspace(begin + 1e-6, begin + ability.rest - 1e-6, 50)).any()
     steady = np.abs(motion.rate[:-1][np.diff(motion.rate) == 0.0])
     assert (steady[steady > 0.0] >= ability.slowest * (1.0 - 1e-9)).all()
-
-
-def test_the_jerk_keeps_its_limit():
-    """The rate is linear between points, so that accelerations are known at their middles."""
-    motion = planned('limited jerk').motion
+    # the rate is linear between points, so that accelerations are known at their middles
     step = np.diff(motion.time)
-    acceleration = np.diff(motion.rate) / step
-    assert (np.abs(np.diff(acceleration) / (0.5 * (step[1:] + step[:-1]))).max()
-            <= 600 * DEGREE * 1.01)
+    jerk = np.diff(np.diff(motion.rate) / step) / (0.5 * (step[1:] + step[:-1]))
+    assert np.abs(jerk).max() <= 1.01 * ability.jerk
+    forecast = CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
+    assert (planned(name).prediction.scale_deviation
+            < 0.75 * forecast.predict(simple).scale_deviation)
+    write_motion(tmp_path / 'profile.csv', motion)
+    noise = simulate_noise(XV3500, len(TIME), 0.01, np.random.default_rng(0))
+    fit = self_calibrate(TIME, 1.03 * motion.rate_at(TIME) + 0.001 + noise,
+                         read_motion(tmp_path / 'profile.csv'), noise=XV3500)
+    assert abs(fit.scale_factor_error - 0.03) < 4.0 * math.sqrt(fit.covariance[0, 0])
 
 
 SLUGGISH = {'hardly any acceleration': RobotLimits(60 * DEGREE, 1 * DEGREE),
@@ -107,16 +112,6 @@ def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
     assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
     assert (ability.max_turn_angle(9.0) == pytest.approx(4.5 * fastest)
             and ability.max_turn_rate(4.5 * fastest) == pytest.approx(fastest))
-
-
-@pytest.mark.parametrize('name', ABILITIES)
-def test_it_tells_the_scale_better_than_a_plain_motion(name):
-    forecast = CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
-    simple = plain_motion(ABILITIES[name], 20.0)
-    assert (can_follow(ABILITIES[name], simple) and abs(simple.heading[-1]) < 1e-12
-            and simple.duration == pytest.approx(20.0, abs=1e-9))
-    assert (planned(name).prediction.scale_deviation
-            < 0.75 * forecast.predict(simple).scale_deviation)
 
 
 def test_no_random_motion_that_the_robot_can_do_is_better():
@@ -243,16 +238,6 @@ def test_where_the_drive_turns_round_and_round_the_motion_gains_heading():
             < 0.85 * forecast.predict(plain_motion(ABILITIES['free'], 20.0)).heading_error)
 
 
-@pytest.mark.parametrize('name', ABILITIES)
-def test_the_file_is_read_and_a_run_of_it_calibrates(name, tmp_path):
-    write_motion(tmp_path / 'profile.csv', planned(name).motion)
-    motion = read_motion(tmp_path / 'profile.csv')
-    noise = simulate_noise(XV3500, len(TIME), 0.01, np.random.default_rng(0))
-    fit = self_calibrate(TIME, 1.03 * planned(name).motion.rate_at(TIME) + 0.001 + noise,
-                         motion, noise=XV3500)
-    assert abs(fit.scale_factor_error - 0.03) < 4.0 * math.sqrt(fit.covariance[0, 0])
-
-
 IMPOSSIBLE = {
     'no time': (RobotLimits(1.0, 2.0, rest=10.0), 20.0, '20 s are too short for rests of 10 s'),
     'no time at the slowest rate': (RobotLimits(1.0, 0.5, slowest=0.5,
@@ -275,8 +260,10 @@ def test_the_impossible_is_refused_in_a_sentence(ability, seconds, reason):
 
 
 @pytest.fixture
-def limits(tmp_path):
-    """Return a function that writes limits and returns the file."""
+def limits(tmp_path, monkeypatch):
+    monkeypatch.setattr('gyro_calibration.cli.plan.find_best_motion',
+                        lambda *given: find_best_motion(*given[:4], generations=5))
+
     def write(**values):
         path = tmp_path / 'limits.yaml'
         path.write_text(
@@ -328,14 +315,12 @@ def test_wrong_limits_are_wrong_use(run, limits, values, reason):
     assert code == 2 and reason in said and said.count('\n') == 1 and not text
 
 
-@pytest.mark.parametrize('options', [('--seconds', 301), ('--seconds', 0),
-                                     ('--model', 'quiet.yaml'), ('--motion', 'nowhere.csv')])
-def test_wrong_options_are_wrong_use(run, limits, tmp_path, monkeypatch, options):
+@pytest.mark.parametrize('options, rest, wanted', [
+    (('--seconds', 301), 1, 2), (('--seconds', 0), 1, 2), (('--model', 'quiet.yaml'), 1, 2),
+    (('--motion', 'nowhere.csv'), 1, 2), (('--seconds', 20), 10, 1)])
+def test_wrong_options_are_wrong_use_and_limits_that_leave_no_motion_no_answer(
+        run, limits, tmp_path, monkeypatch, options, rest, wanted):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'quiet.yaml').write_text('effects: {bias: {bias: 0.01}}')
-    assert run('plan', '--limits', limits(), *options)[0] == 2
-
-
-def test_limits_that_leave_no_motion_are_no_answer(run, limits):
-    code, _, said = run('plan', '--limits', limits(rest_s=10), '--seconds', 20)
-    assert code == 1 and 'give more seconds' in said
+    code, _, said = run('plan', '--limits', limits(rest_s=rest), *options)
+    assert code == wanted and ('give more seconds' in said) == (wanted == 1)

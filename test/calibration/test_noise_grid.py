@@ -41,7 +41,6 @@ def headings(generator, count=240, walk=0.2 * DEGREE, reference=0.5 * DEGREE, mo
 
 
 def fitted(time, rate, turned, seen, **options):
-    """Return the fit of scale and bias to increments."""
     cosines, wanders = bias_wander_columns(time)
     columns = np.column_stack([np.diff(seen), np.diff(time)])
     return fit_noise_grid(np.diff(turned), columns, heading_noise(time, rate, **options), cosines,

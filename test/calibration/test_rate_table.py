@@ -14,11 +14,7 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
-from gyro_calibration.calibration.rate_table import (
-    bin_errors,
-    channels_of,
-    fit_effects,
-)
+from gyro_calibration.calibration.rate_table import bin_errors, channels_of, fit_effects
 from gyro_calibration.calibration.scatter import (
     _restricted_log_likelihood,
     _smooth_surface,
@@ -52,7 +48,6 @@ RARE = 1e-4
 
 
 def dwells(rate, error, temperature=None, deviation=None, sweep=None):
-    """Return dwells with rates and errors in rad/s."""
     rate = np.asarray(rate, dtype=float)
     return Dwells(rate, rate + error, temperature, np.full(len(rate), np.nan) if deviation is None
                   else deviation, np.zeros(len(rate), int) if sweep is None else sweep,
@@ -60,12 +55,10 @@ def dwells(rate, error, temperature=None, deviation=None, sweep=None):
 
 
 def alike(table, size=1.0):
-    """Return a scatter that is the same for all dwells."""
     return Scatter(size, 0.0, 0.0, 0.0, np.ones(len(table), bool))
 
 
 def measured(terms=LINEAR, seed=1, **table):
-    """Return a simulated table."""
     return Table(**table).measure(GyroModel(terms), np.random.default_rng(seed))
 
 
@@ -126,19 +119,15 @@ def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_sca
                                covariance / np.outer(sizes, sizes), atol=1e-5)
 
 
-def test_given_deviations_weigh_the_dwells():
+def test_given_deviations_weigh_the_dwells_and_one_that_is_unknown_counts_like_the_others():
     table = measured(LINEAR, sweeps=3, told=True)
     fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR), alike(table, 0.0))
     (scale, bias) = np.polyfit(table.rate, table.output - table.rate, 1, w=1.0 / table.deviation)
     assert [term.values[0] for term in fit.terms] == pytest.approx([bias, scale], rel=1e-9)
-
-
-def test_a_dwell_of_unknown_deviation_counts_like_the_others():
-    table = measured(LINEAR, told=True)
     unknown = replace(table,
                       deviation=np.where(np.arange(len(table)) == 5, np.nan, table.deviation))
-    deviation = alike(unknown, 0.0).deviation(unknown)
-    assert deviation[5] == pytest.approx(np.sqrt(np.nanmean(unknown.deviation ** 2)))
+    assert alike(unknown, 0.0).deviation(unknown)[5] == pytest.approx(
+        np.sqrt(np.nanmean(unknown.deviation ** 2)))
 
 
 def test_the_matrix_of_the_paper_is_the_polynomial():
@@ -287,28 +276,34 @@ def test_rates_beyond_the_top_of_a_sine_are_reported():
 
 # refusals
 
-def test_a_symmetric_swing_at_one_speed_cannot_part_asymmetry_from_bias():
-    table = dwells(np.tile([0.5, -0.5], 10),
-                   0.01 + 1e-4 * np.random.default_rng(0).standard_normal(20))
-    with pytest.raises(DataRefused, match='^bias, scale_factor_asymmetry look alike .* '
-                       'many speeds, slow ones and rest too'):
-        fit_effects(table, (BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY))
+ASCENDING = np.linspace(-1.0, 1.0, 20)
+REFUSED = {
+    'a swing at one speed does not part asymmetry from bias': (
+        dwells(np.tile([0.5, -0.5], 10),
+               0.01 + 1e-4 * np.random.default_rng(0).standard_normal(20)),
+        (BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY),
+        'bias, scale_factor_asymmetry look alike .* many speeds, slow ones and rest too'),
+    'no temperature': (dwells(ASCENDING, 0.01), (BIAS, BIAS_TEMPERATURE),
+                       'bias_temperature cannot be seen: .*no temperature; record'),
+    'one temperature': (dwells(ASCENDING, 0.01, np.full(20, 25.0)), (BIAS, BIAS_TEMPERATURE),
+                        'bias_temperature cannot be seen: .*varies by 0 K'),
+    'two temperatures show no curve': (
+        dwells(np.tile(ASCENDING[::2], 2), 0.01, np.repeat([20.0, 40.0], 10)),
+        (BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC),
+        'bias, .*bias_temperature_quadratic look alike.*three temperatures'),
+    'a polynomial of too high an order': (
+        dwells(np.repeat([-1.0, 0.0, 1.0], 8), 0.0), (rate_temperature_polynomial(4, 0),),
+        r'.*cannot be determined from these dwells; \w'),
+    'fewer dwells than values': (
+        dwells([0.0, 1.0], 0.0, np.array([20.0, 40.0])), tuple(STATIC_EFFECTS.values()),
+        '2 dwells do not determine 9 values; add dwells, or fit fewer'),
+}
 
 
-@pytest.mark.parametrize('temperature, said',
-                         [(None, 'no temperature; record'), (np.full(20, 25.0), 'varies by 0 K')])
-def test_one_temperature_gives_no_slope_over_temperature(temperature, said):
-    table = dwells(np.linspace(-1.0, 1.0, 20), 0.01, temperature)
-    with pytest.raises(DataRefused, match=f'^bias_temperature cannot be seen: .*{said}'):
-        fit_effects(table, (BIAS, BIAS_TEMPERATURE))
-
-
-def test_two_temperatures_give_no_curve_over_temperature():
-    table = dwells(np.tile(np.linspace(-1.0, 1.0, 10), 2), 0.01, np.repeat([20.0, 40.0], 10))
-    with pytest.raises(DataRefused,
-                       match='^bias, .*bias_temperature_quadratic look alike.*three temperatures'):
-        fit_effects(table,
-                    (BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC))
+@pytest.mark.parametrize('table, effects, said', REFUSED.values(), ids=REFUSED)
+def test_what_the_dwells_do_not_determine_is_refused_with_the_remedy(table, effects, said):
+    with pytest.raises(DataRefused, match=f'^{said}'):
+        fit_effects(table, effects)
 
 
 def test_a_polynomial_over_the_output_alone_needs_no_temperature():
@@ -317,18 +312,6 @@ def test_a_polynomial_over_the_output_alone_needs_no_temperature():
     assert fit.residual == pytest.approx(
         fit_effects(table, [rate_temperature_polynomial(3, 0)]).residual,
         abs=0.1 * fit.residual_rms)
-
-
-def test_a_polynomial_of_too_high_an_order_is_refused_in_a_whole_sentence():
-    with pytest.raises(DataRefused, match=r'cannot be determined from these dwells; \w'):
-        fit_effects(dwells(np.repeat([-1.0, 0.0, 1.0], 8), 0.0),
-                    [rate_temperature_polynomial(4, 0)])
-
-
-def test_fewer_dwells_than_values_are_refused():
-    with pytest.raises(DataRefused,
-                       match='2 dwells do not determine 9 values; add dwells, or fit fewer'):
-        fit_effects(dwells([0.0, 1.0], 0.0, np.array([20.0, 40.0])), list(STATIC_EFFECTS.values()))
 
 
 # a polynomial of the output

@@ -97,22 +97,23 @@ def test_noise_beyond_the_models_is_reported_and_more_of_it_refused():
     assert (goodness.probability < MIN_FIT_PROBABILITY
             and goodness.noise_ratio == pytest.approx(3.0, rel=0.4))
     assert 'more than the noise explains' in str(goodness)
+    assert self_calibrate(TIME, output(), CALIBRATION_MOTION).goodness is None, 'no figures'
     with pytest.raises(DataRefused, match='times as noisy as the model states|a slip or a bump'):
         self_calibrate(TIME, output(level=15.0), CALIBRATION_MOTION, noise=XV3500.noise,
                        limits=RunLimits(max_scale_deviation=1.0))
 
 
-def test_an_early_end_is_reported_by_when():
-    motion = constant_rate_motion([(1, 0), (4, 45), (1, 0), (2, -45), (20, 0)])
-    with pytest.raises(DataRefused,
-                       match=r'stopped at about (7\.[5-9]|8\.[0-5]) s of the profile\'s 20\.0 s'):
-        self_calibrate(TIME, output(motion=motion), CALIBRATION_MOTION, noise=XV3500.noise)
+LONG = np.arange(2301) / 100.0
 
 
-def test_a_robot_that_begins_too_late_is_reported_by_how_much():
-    time = np.arange(2301) / 100.0
-    with pytest.raises(DataRefused, match=r'began (2\.4|2\.5|2\.6) s after the profile'):
-        self_calibrate(time, output(time=time - 2.5), CALIBRATION_MOTION, noise=XV3500.noise)
+@pytest.mark.parametrize('time, moved, said', [
+    (TIME, output(motion=constant_rate_motion([(1, 0), (4, 45), (1, 0), (2, -45), (20, 0)])),
+     r"stopped at about (7\.[5-9]|8\.[0-5]) s of the profile's 20\.0 s"),
+    (LONG, output(time=LONG - 2.5), r'began (2\.4|2\.5|2\.6) s after the profile')],
+    ids=['an early end', 'a late beginning'])
+def test_a_motion_that_ends_early_or_begins_late_is_reported_by_when(time, moved, said):
+    with pytest.raises(DataRefused, match=said):
+        self_calibrate(time, moved, CALIBRATION_MOTION, noise=XV3500.noise)
 
 
 def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_length():
@@ -186,18 +187,15 @@ def test_a_rest_after_the_run_refuses_no_more_good_calibrations_than_it_says():
     assert fewest(200, 0.1) <= refused <= most(200, 0.1)
 
 
-@pytest.mark.parametrize('change, words', [(0.3 * DEGREE, 'the corrected rate is 0.'),
-                                           (-1.0 * DEGREE, 'the corrected rate is -'),
-                                           (np.linspace(0.0, 10.0 * DEGREE, 201), 'still moved')])
-def test_a_rest_after_the_run_refuses_a_drift_and_a_motion(change, words):
+@pytest.mark.parametrize('change, count, words', [
+    (0.3 * DEGREE, 201, 'the corrected rate is 0.'),
+    (-1.0 * DEGREE, 201, 'the corrected rate is -'),
+    (np.linspace(0.0, 10.0 * DEGREE, 201), 201, 'still moved'),
+    (0.0, 50, 'after the run 0.5 s of rest came')])
+def test_a_rest_after_the_run_refuses_a_drift_and_a_motion_and_must_be_there(change, count, words):
+    time, rate = rested(0, change)
     with pytest.raises(DataRefused, match=words):
-        check_rest(*rested(0, change), calibrated(0), XV3500.noise)
-
-
-def test_a_rest_after_the_run_must_be_there():
-    time, rate = rested(0)
-    with pytest.raises(DataRefused, match='after the run 0.5 s of rest came'):
-        check_rest(time[:50], rate[:50], calibrated(0))
+        check_rest(time[:count], rate[:count], calibrated(0), XV3500.noise)
 
 
 def test_the_rest_after_a_run_is_found_and_a_drive_is_none():
@@ -322,13 +320,10 @@ def test_whole_turns_give_scale_and_bias_with_their_deviations(number):
         sizes.append(np.abs([found.fit.scale_factor_error - S, found.fit.bias - B])
                      / np.sqrt(np.diag(found.fit.covariance)))
     assert ((np.array(sizes) < 1.96).sum(axis=0) >= fewest(40, 0.95)).all()
+    assert calibrate_turns(*turned(number), noise=XV3500.noise).turns == number, 'counted'
 
 
-def test_turns_are_counted_where_that_can_be():
-    assert calibrate_turns(*turned(2), noise=XV3500.noise).turns == 2
-    assert calibrate_turns(*turned(-3), noise=XV3500.noise).turns == -3
-
-
+CLOCK, TURNED = turned(2)
 NO_TURNS = {
     'half a turn too much': (turned(2.5), 2, 'counts 2.5'),
     'half a turn, uncounted': (turned(2.5), None, 'counts 2.5'),
@@ -340,6 +335,12 @@ NO_TURNS = {
     'no rest after': (turned(2, after=0.2), 2, 's after the turns'),
     'scale and count': (turned(5, s=0.1), 5, 'one whole number'),
     'a large scale': (turned(1, s=0.33), 1, 'beyond 30 %'),
+    'deg/s': ((CLOCK, TURNED / DEGREE), 2, 'is in deg/s and read as rad/s'),
+    'saturated': ((CLOCK, np.clip(TURNED, -0.6, 0.6)), 2, 'saturated'),
+    'a bias that moves': ((CLOCK, TURNED + np.where(CLOCK > 15.0, 0.02, 0.0)), 2,
+                          'rests before and after'),
+    'dead': ((CLOCK, B + 0.0 * TURNED), 2, 'same value'),
+    'no motion': ((CLOCK, -S * TURNED + 1e-3 * np.sin(97.0 * CLOCK)), 2, 'did the robot move'),
 }
 
 
@@ -347,18 +348,6 @@ NO_TURNS = {
 def test_what_cannot_be_whole_turns_is_refused(log, number, words):
     with pytest.raises(DataRefused, match=words):
         calibrate_turns(*log, number, noise=XV3500.noise)
-
-
-def test_turns_are_refused_that_other_causes_spoil():
-    time, rate = turned(2)
-    for spoiled, words in ((rate / DEGREE, 'is in deg/s and read as rad/s'),
-                           (np.clip(rate, -0.6, 0.6), 'saturated'),
-                           (rate + np.where(time > 15.0, 0.02, 0.0), 'rests before and after'),
-                           (B + 0.0 * rate, 'same value'),
-                           (rate - (1 + S) * rate + 1e-3 * np.sin(97.0 * time),
-                            'check that the robot moved')):
-        with pytest.raises(DataRefused, match=words):
-            calibrate_turns(time, spoiled, 2, noise=XV3500.noise)
 
 
 def write_log(path, time, rate, name='gyro_rad_s'):
@@ -411,10 +400,3 @@ def test_the_verb_calibrates_by_turns(tmp_path, run):
 def test_the_verb_refuses_options_that_exclude_each_other(tmp_path, run, words, said):
     code, _, error = run('self-calibrate', write_log(tmp_path / 'log.csv', *turned(1)), *words)
     assert code == 2 and said in error
-
-
-def test_a_fit_without_figures_claims_no_goodness():
-    assert ScaleBiasFit(0.0, 0.0, np.zeros((2, 2))).goodness is None
-    assert self_calibrate(TIME, output(),
-                          motion_from_rates(CALIBRATION_MOTION.time,
-                                            CALIBRATION_MOTION.rate)).goodness is None

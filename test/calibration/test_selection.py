@@ -12,7 +12,8 @@
 
 from dataclasses import replace
 
-from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells
+from campaigns import judge, least_squares_error, simulated
+from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells, select_dwells
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE,
     MIN_DISTINGUISHING_SIGMAS,
@@ -20,7 +21,7 @@ from gyro_calibration.calibration.selection import (
     select_effects,
     TECHNOLOGY_EFFECTS,
 )
-from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.logs.log import DEGREE, Log, read_log
 from gyro_calibration.model.effects import (
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -46,7 +47,6 @@ def names(selection):
 
 
 def measured(table, terms, seed=1):
-    """Return a simulated table."""
     return table.measure(GyroModel(terms), np.random.default_rng(seed))
 
 
@@ -177,3 +177,31 @@ def test_on_the_recorded_table_sine_and_cubic_are_hardly_distinguished_and_a_rat
     assert (pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < MIN_DISTINGUISHING_SIGMAS
             and 110.0 < pair.distinguishing_rate / DEGREE < 200.0)
     assert selection.calibration.left_out_rms < 0.05 * DEGREE
+
+
+# Another campaign
+
+
+@pytest.mark.parametrize('sine', [True, False], ids=['open-loop', 'MEMS'])
+@pytest.mark.parametrize('gyros', [4, pytest.param(40, marks=pytest.mark.evidence)])
+def test_the_stated_deviation_is_that_of_another_campaign(sine, gyros):
+    """The 12 sweeps of a gyro are correlated, so z² scatters as that of a few numbers."""
+    errors, z, peers = [], [], []
+    for seed in range(100, 100 + gyros):
+        cool, hot = (simulated(np.random.default_rng(seed), sine, each) for each in (False, True))
+        found = judge(select_effects(cool).calibration.model, hot)
+        errors.append(found[0])
+        z.append(found[1])
+        peers.append(least_squares_error(cool, hot))
+    assert np.mean(errors) < 1.1 * np.mean(peers)
+    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 2.0
+
+
+def test_on_the_recorded_table_the_cooler_half_predicts_the_hotter_one(data):
+    dwells = dwells_from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
+    first, second = (select_dwells(dwells, (dwells.sweep < 12) == part) for part in (True, False))
+    error, z = judge(select_effects(first).calibration.model, second)
+    assert error < 0.065 and z < 1.6
+    slow = select_dwells(first, np.abs(first.rate) < 60.0 * DEGREE)
+    error, z = judge(select_effects(slow).calibration.model, second)
+    assert error < 0.08 and z < 1.6

@@ -51,22 +51,14 @@ def table(rates, errors, temperature=None, sweep=None):
                   tuple(f'row {place + 1}' for place in range(len(rate))))
 
 
-def static(found):
-    """Return the errors with the static bias only, deg per turn; the model is the identity."""
-    return compute_turn_errors(found, found.output).static / DEGREE
-
-
 # the published formulas, by hand
 
 HAND = table([0.0, 10.0, -20.0], [0.1, 0.15, 0.06])
 
 
 def test_a_turn_at_10_deg_s_takes_36_s_and_one_at_20_takes_18():
-    assert static(HAND) == pytest.approx([0.05 * 36.0, -0.04 * 18.0])
-
-
-def test_the_static_bias_after_the_model_is_that_of_the_compensated_rest():
     errors = compute_turn_errors(HAND, HAND.rate + np.array([0.02, 0.03, 0.01]) * DEGREE)
+    assert errors.static / DEGREE == pytest.approx([0.05 * 36.0, -0.04 * 18.0])
     assert errors.modelled / DEGREE == pytest.approx([0.01 * 36.0, -0.01 * 18.0])
 
 
@@ -203,7 +195,6 @@ def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_te
 
 @pytest.fixture
 def run(run):
-    """Return a function that runs the verb and returns exit code, output and error."""
     return partial(run, 'turn')
 
 
@@ -238,12 +229,6 @@ def test_the_data_hold_every_turn_in_si(run, log, model):
             == sum(each['turns'] for each in answer['by_temperature']) == 48)
 
 
-def test_turns_beyond_the_range_of_the_model_are_reported(run, log, model):
-    code, text, _ = run(log, '--model', model)
-    assert code == 0 and '24 of 52 dwells are beyond the calibrated rates' in text
-    assert '26 of 52 dwells are outside the calibrated temperatures' in text
-
-
 @pytest.mark.parametrize(
     'origin, said', [('{}', 'if it was fitted to this log'),
                      ('{files: [{name: table.csv, sha256: THIS}]}', 'it was fitted to this log'),
@@ -264,13 +249,15 @@ def test_two_dwells_are_enough_for_a_given_model(run, model, tmp_path):
     assert code == 0 and json.loads(text)['static_rad_per_turn'] == pytest.approx([3.6 * DEGREE])
 
 
-def test_the_table_gives_degrees_and_per_cent(run, log, model):
-    lines = run(log, '--model', model)[1].splitlines()
-    row = next(line.split()
-               for line in lines if line.startswith('5 to 10 ') or line.startswith('10 to 20 '))
-    assert [float(cell) for cell in row[4:8]] == [3.6, 1.0, 3.6, 1.0]
-    assert (any(line.startswith('rate [deg/s]') for line in lines)
-            and any(line.startswith('temperature [degC]') for line in lines))
+def test_the_table_gives_degrees_and_per_cent_and_what_is_beyond_the_range_of_the_model(
+        run, log, model):
+    code, text, _ = run(log, '--model', model)
+    row = next(line.split() for line in text.splitlines()
+               if line.startswith('5 to 10 ') or line.startswith('10 to 20 '))
+    assert code == 0 and [float(cell) for cell in row[4:8]] == [3.6, 1.0, 3.6, 1.0]
+    assert '\nrate [deg/s]' in text and '\ntemperature [degC]' in text
+    assert '24 of 52 dwells are beyond the calibrated rates' in text
+    assert '26 of 52 dwells are outside the calibrated temperatures' in text
 
 
 def test_without_a_model_one_is_fitted_that_has_not_seen_the_sweep(run, tmp_path):

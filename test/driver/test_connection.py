@@ -10,13 +10,22 @@
 
 """A gyro on a port that is found, recognized, lost, and found again, by an injected clock."""
 
+import contextlib
 import itertools
 import os
 import random
+import termios
 import threading
+import tty
 
 from fake_port import BEGIN, Reading, World
-from gyro_calibration.driver.connection import Connection, PortError, resolve_port
+from gyro_calibration.driver.connection import (
+    Connection,
+    Decimator,
+    PortError,
+    resolve_port,
+    SerialPort,
+)
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import numpy as np
@@ -30,11 +39,10 @@ NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of 
 
 
 def turning(rate=0.5, frequency=100.0):
-    """Return the samples of a gyro that turns for ever."""
     return (Sample(rate, 31.5, k / frequency) for k in itertools.count())
 
 
-# On a pseudo-terminal
+# With real ports
 
 
 def test_samples_come_with_stamps_that_increase():
@@ -153,19 +161,15 @@ def test_a_gyro_is_found_again_under_another_name(tmp_path):
                for problem in reading.problems)
 
 
-def test_several_ports_that_match_are_named(tmp_path):
+def test_several_ports_that_match_are_named_and_several_names_of_one_are_no_question(tmp_path):
     for name in ('gyro_a', 'gyro_b'):
         (tmp_path / name).touch()
     with pytest.raises(PortError,
                        match=r'2 ports match .*: .*gyro_a, .*gyro_b; set port to one of them'):
         resolve_port(str(tmp_path / 'gyro_?'))
-
-
-def test_several_names_of_one_port_are_no_question(tmp_path):
-    (tmp_path / 'tty').touch()
-    for name in ('gyro_a', 'gyro_b'):
-        (tmp_path / name).symlink_to(tmp_path / 'tty')
-    assert resolve_port(str(tmp_path / 'gyro_*')) == str(tmp_path / 'gyro_a')
+    (tmp_path / 'gyro_b').unlink()
+    (tmp_path / 'gyro_b').symlink_to(tmp_path / 'gyro_a')
+    assert resolve_port(str(tmp_path / 'gyro_?')) == str(tmp_path / 'gyro_a')
 
 
 def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
@@ -331,3 +335,121 @@ def test_a_bad_line_is_survived_and_counted(name, share):
     outputs = [sample.output for sample in reading.samples]
     assert all(abs(output) <= protocol.effective_full_scale(SETTINGS[name]) for output in outputs)
     assert name != 'kvh_1750' or set(outputs) == {exact}, 'a CRC lets nothing wrong through'
+
+
+# The port alone
+
+
+@pytest.fixture
+def terminal():
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    for descriptor in (master, slave):
+        with contextlib.suppress(OSError):  # the test may have unplugged it
+            os.close(descriptor)
+
+
+def holds(port, count):
+    """Return whether so many bytes wait; a terminal passes them on with a delay."""
+    return port._port.in_waiting == count
+
+
+def test_what_is_there_is_read_at_once(terminal, wait_until):
+    master, path = terminal
+    port = SerialPort(path, 115200, timeout=0.01)
+    port.open()
+    assert port.read() == port.read() == b''
+    os.write(master, b'x' * 1000)
+    wait_until(lambda: holds(port, 1000))
+    assert port.read() == b'x' * 1000
+    port.close()
+
+
+def test_an_unplugged_port_is_lost_and_closed(terminal):
+    master, path = terminal
+    port = SerialPort(path, 115200)
+    port.open()
+    os.close(master)
+    with pytest.raises(PortError, match=f'^lost {path}: the device was disconnected: plug it '
+                                        'in again$'):
+        port.read()
+    with pytest.raises(PortError, match='is not open'):
+        port.read()
+
+
+def test_a_port_is_for_one_program(terminal):
+    first, second = SerialPort(terminal[1], 115200), SerialPort(terminal[1], 115200)
+    first.open()
+    with pytest.raises(PortError, match='another program has opened it'):
+        second.open()
+    first.close()
+    second.open()
+    second.close()
+
+
+@pytest.mark.parametrize(('path', 'reason'), [
+    ('/nonexistent/tty', 'does not exist'),
+    ('', 'does not exist'),
+    ('/', 'is a folder'),
+    (__file__, 'no serial port'),
+])
+def test_a_port_that_cannot_be_opened_says_why(path, reason):
+    with pytest.raises(PortError, match=f'^cannot open .*: .*{reason}.*: .*'):
+        SerialPort(path, 115200).open()
+
+
+def test_the_speed_changes_without_opening_the_port_anew(terminal, wait_until):
+    """What came at the other speed is dropped."""
+    master, path = terminal
+    port = SerialPort(path, 9600, timeout=0.01)
+    port.open()
+    os.write(master, b'garbage')
+    wait_until(lambda: holds(port, 7))
+    port.set_baud(115200)
+    speed = termios.tcgetattr(master)[4]
+    os.write(master, b'sense')
+    wait_until(lambda: holds(port, 5))
+    assert (speed, port.baud, port.read()) == (termios.B115200, 115200, b'sense')
+    port.close()
+
+
+# The mean of several samples in place of each
+
+
+PERIOD = 1e-3
+EPOCH = 1.7e9
+
+
+def means(size, numbers, temperatures=25 * (30.0,)):
+    """Return what becomes of samples that hold their numbers, as many periods after 1970."""
+    decimation = Decimator(size)
+    samples = [Sample(1e-4 * number, temperature, specific_force=9.81)
+               for number, temperature in zip(numbers, temperatures)]
+    complete = list(decimation.add(samples,
+                                   [EPOCH + PERIOD * number for number in numbers], PERIOD))
+    rest = list(decimation.flush())
+    assert not list(decimation.flush()), 'what has begun is given once'
+    return complete, rest
+
+
+def test_a_mean_has_the_mean_time_and_values_of_its_samples():
+    complete, rest = means(10, range(25))
+    assert [mean.sample.output for mean in complete] == pytest.approx([4.5e-4, 14.5e-4])
+    assert [mean.stamp - EPOCH for mean in complete] == pytest.approx([4.5e-3, 14.5e-3], abs=1e-6)
+    assert ({(mean.sample.temperature, round(mean.sample.specific_force, 9)) for mean in complete}
+            == {(30.0, 9.81)})
+    assert [mean.sample_count for mean in [*complete, *rest]] == [10, 10, 5]
+    complete, rest = means(1, range(5))
+    assert [(mean.sample.output, mean.sample_count) for mean in complete] == [
+        (1e-4 * number, 1) for number in range(5)] and not rest
+    (mean,), _ = means(3, range(3), (20.0, None, 30.0))
+    assert mean.sample.temperature == 25.0
+
+
+@pytest.mark.parametrize('numbers, sizes', [([*range(4), *range(50, 60)], [4, 10]),
+                                            ([100, 101, 50, 51], [2, 2])],
+                         ids=['a gap', 'stamps that are set back'])
+def test_a_jump_of_the_stamps_ends_a_group(numbers, sizes):
+    complete, rest = means(10, numbers)
+    assert [mean.sample_count for mean in [*complete, *rest]] == sizes

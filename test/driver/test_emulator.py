@@ -21,7 +21,6 @@ from gyro_calibration.driver.connection import PortError, SerialPort
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import pytest
-from serial_faults import bursts
 
 
 def samples(count=None, rate=100.0):
@@ -122,16 +121,12 @@ def test_what_the_driver_sends_is_ignored():
     assert decoder.discarded_bytes == 0
 
 
-def test_the_link_is_replaced_and_removed(tmp_path):
+def test_the_link_is_replaced_and_removed_unless_another_gyro_has_taken_it(tmp_path):
     link = tmp_path / 'gyro'
     link.symlink_to('/nonexistent')
     with Emulator(find_protocol('csv'), samples(), link=link) as emulator:
         assert os.readlink(link) == emulator.path
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_link_that_another_gyro_has_taken_is_left_alone(tmp_path):
-    link = tmp_path / 'gyro'
     with Emulator(find_protocol('csv'), samples(), link=link):
         second = Emulator(find_protocol('csv'), samples(), link=link)
         second.open()
@@ -175,29 +170,6 @@ def test_samples_are_numbered():
     with Emulator(protocol, samples(100, 1e4)) as gyro:
         gyro._thread.join()
     assert sent == list(range(100))
-
-
-class Adapter(Emulator):
-    """Sends what arrives behind an adapter, in bursts."""
-
-    _BATCH_DURATION = 0.0
-
-    def _timed_frames(self):
-        return bursts(super()._timed_frames())
-
-
-def test_an_adapter_hands_over_in_bursts():
-    """Sixteen samples of 1 ms each come together; a busy machine may take several at once."""
-    gyro = Adapter(find_protocol('csv'), samples(320, 1000.0), wait_for_reader=True)
-    with gyro:
-        port, decoder = SerialPort(gyro.path, 9600, timeout=0.5), find_protocol('csv').decoder()
-        port.open()
-        chunks = [port.read()]
-        while chunks[-1] or gyro._thread.is_alive():
-            chunks.append(port.read())
-        port.close()
-    counts = [len(decoder.feed(chunk)) for chunk in chunks]
-    assert sum(counts) == 320 and sum(count for count in counts if count % 16 == 0) > 160
 
 
 def test_eleven_thousand_samples_a_second_are_sent_in_time():

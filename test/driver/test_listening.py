@@ -29,7 +29,6 @@ MOTIONS = {
 
 
 def frames(name, count, rate=MOTIONS['rest'], force=None):
-    """Return what a device sends, one sample after the other."""
     encode = find_protocol(name).encoder(SETTINGS[name])
     return [
         find_protocol(name).preamble,
@@ -114,21 +113,6 @@ def test_a_device_of_another_kind_is_no_format_at_any_baud():
             assert recognition.protocol is None, (ratio, content, recognition.summary)
 
 
-def test_frames_that_are_always_the_same_must_be_almost_all_there_is():
-    """Zeros pass the check of the E-Core."""
-    zeros = b'\x80' + bytes(7)
-    assert recognize_protocol((4 * zeros + b'\xff' * 8) * 10).protocol is None
-    assert (recognize_protocol((39 * zeros + b'\xff' * 8) * 10).protocol
-            is find_protocol('kvh_ecore'))
-
-
-def test_a_few_frames_in_much_noise_are_not_enough():
-    recognition = recognize_protocol(
-        random.Random(8).randbytes(4000) + b''.join(frames('fizoptika', 50)))
-    assert (recognition.protocol is None
-            and 'of which too few are frames of fizoptika' in recognition.summary)
-
-
 def test_noise_is_no_format():
     generator = random.Random(3)
     for _ in range(50):
@@ -137,41 +121,45 @@ def test_noise_is_no_format():
         assert 'no known format' in recognition.summary or 'too few' in recognition.summary
 
 
-def test_one_byte_again_and_again_is_no_format():
-    for byte in (0x00, 0x55, 0x80, 0xDD, 0xFE, 0xFF, 0x0A, 0x20, 0x30):
-        assert recognize_protocol(bytes([byte]) * 8192).protocol is None, byte
+def joined(name, count):
+    return b''.join(frames(name, count))
 
 
-def test_few_bytes_or_none_are_reported_as_such():
-    assert (recognize_protocol(b'').summary
-            == 'nothing came: check the power and the wires of the gyro')
-    recognition = recognize_protocol(frames('kvh_1750', 1)[1])
-    assert recognition.protocol is None and 'listen longer' in recognition.summary
+ZEROS = b'\x80' + bytes(7)  # which pass the check of the E-Core
+FOUR = b'0.1,2.0,3.0,4.0\r\n' * 5
+DSP3000 = b'       0.015733   1\r\n' * 8
+CASES = {  # bytes, columns if not the default ones, protocol, part of the summary
+    'nothing': (b'', None, None, 'nothing came: check the power and the wires of the gyro'),
+    'a single frame': (frames('kvh_1750', 1)[1], None, None, 'listen longer'),
+    'as many bytes of two formats': (joined('fizoptika', 11) + joined('witmotion', 8), None, None,
+                                     'may be '),
+    'a tenth of another format': (joined('kvh_1750', 20) + joined('fizoptika', 9), None,
+                                  'kvh_1750', 'next is fizoptika with 9%'),
+    'a few frames in much noise': (random.Random(8).randbytes(4000) + joined('fizoptika', 50),
+                                   None, None, 'of which too few are frames of fizoptika'),
+    'noise long ago': (random.Random(4).randbytes(1_000_000) + joined('minimu9', 300), None,
+                       'minimu9', ''),
+    'some frames of zeros': ((4 * ZEROS + b'\xff' * 8) * 10, None, None, ''),
+    'nearly all frames of zeros': ((39 * ZEROS + b'\xff' * 8) * 10, None, 'kvh_ecore', ''),
+    'more numbers than columns': (FOUR, None, None,
+                                  'lines of 4 numbers came, but columns names 3'),
+    'as many numbers as columns': (FOUR, ('time_s', 'gyro_dps', 'a', 'b'), 'csv', ''),
+    'one number a line': (b'17\r\n' * 5, ('gyro_dps',), 'csv', ''),
+    'a DSP-3000, where one column is wanted': (DSP3000, ('gyro_dps',), 'kvh_dsp3000', ''),
+    'a DSP-3000, where two are wanted': (DSP3000, ('gyro_dps', 'valid'), 'kvh_dsp3000', ''),
+    'a Razor that was not yet asked for rates': (b'#YPR=-142.28,-5.38,33.52\r\n' * 5, None,
+                                                 'razor', ''),
+    **{f'{byte:#x} again and again': (bytes([byte]) * 8192, None, None, '')
+       for byte in (0x00, 0x55, 0x80, 0xDD, 0xFE, 0xFF, 0x0A, 0x20, 0x30)},
+}
 
 
-def test_two_formats_at_once_are_reported_as_ambiguous():
-    """Eleven frames of 8 bytes are as many bytes as eight frames of 11."""
-    recognition = recognize_protocol(b''.join(frames('fizoptika', 11) + frames('witmotion', 8)))
-    assert recognition.protocol is None
-    assert ('may be fizoptika or witmotion' in recognition.summary
-            or 'may be witmotion or fizoptika' in recognition.summary)
-
-
-def test_a_format_in_which_a_tenth_looks_like_another_is_recognized():
-    recognition = recognize_protocol(b''.join(frames('kvh_1750', 20) + frames('fizoptika', 9)))
-    assert recognition.protocol is find_protocol('kvh_1750')
-    assert 'next is fizoptika with 9%' in recognition.summary
-
-
-def test_lines_of_numbers_that_do_not_fit_the_columns_are_explained():
-    recognition = recognize_protocol(b'0.1,2.0,3.0,4.0\r\n' * 5)
-    assert (recognition.protocol is None
-            and 'lines of 4 numbers came, but columns names 3' in recognition.summary)
-    assert recognize_protocol(
-        b'0.1,2.0,3.0,4.0\r\n' * 5,
-        Settings(columns=('time_s', 'gyro_dps', 'a', 'b'))).protocol is find_protocol('csv')
-    assert (recognize_protocol(b'17\r\n' * 5, Settings(columns=('gyro_dps',))).protocol
-            is find_protocol('csv'))
+@pytest.mark.parametrize('data, columns, name, words', CASES.values(), ids=CASES)
+def test_what_comes_is_recognized_or_explained(data, columns, name, words):
+    settings = Settings(columns=columns) if columns else Settings()
+    recognition = recognize_protocol(data, settings)
+    assert recognition.protocol is (name and find_protocol(name)), recognition.summary
+    assert words in recognition.summary
 
 
 def test_columns_that_do_not_fit_are_reported_although_another_baud_shows_some_frames():
@@ -183,14 +171,6 @@ def test_columns_that_do_not_fit_are_reported_although_another_baud_shows_some_f
     assert recognize_protocol(data).explained_share > max(each.explained_share for each in wrong)
 
 
-def test_lines_of_a_dsp3000_are_no_columns():
-    """Two numbers in a line, and with one column a line is one number."""
-    data = b'       0.015733   1\r\n' * 8
-    for columns in (('gyro_dps',), ('gyro_dps', 'valid')):
-        assert (recognize_protocol(data, Settings(columns=columns)).protocol
-                is find_protocol('kvh_dsp3000'))
-
-
 def test_a_gyro_that_counts_is_recognized_before_its_sensitivity_is_set():
     for name in ('fizoptika', 'csv'):
         settings = Settings(columns=('time_s', 'gyro_counts', 'temperature_degc'))
@@ -198,13 +178,3 @@ def test_a_gyro_that_counts_is_recognized_before_its_sensitivity_is_set():
         assert protocol is find_protocol(name)
         with pytest.raises(ValueError, match='sensitivity is not set'):
             protocol.check_settings(settings)
-
-
-def test_a_razor_that_was_not_yet_asked_for_rates_is_recognized():
-    assert (recognize_protocol(b'#YPR=-142.28,-5.38,33.52\r\n' * 5).protocol
-            is find_protocol('razor'))
-
-
-def test_what_came_long_ago_does_not_count():
-    data = random.Random(4).randbytes(1_000_000) + b''.join(frames('minimu9', 300))
-    assert recognize_protocol(data).protocol is find_protocol('minimu9')

@@ -11,7 +11,6 @@
 """Fizoptika: signs, and values that are spread over two frames."""
 
 import itertools
-import math
 
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
 import pytest
@@ -29,30 +28,24 @@ def frame(count, number=8, data=0):
 
 
 def decoded(*frames):
-    """Return the samples of frames."""
     return PROTOCOL.decoder(ONE_COUNT).feed(b''.join(frames))
 
 
 def values(*frames):
-    """Return what the frames say of the unit itself, in their order."""
     return [(sample.temperature, dict(sample.health)) for sample in decoded(*frames)]
 
 
-@pytest.mark.parametrize('raw, degrees',
-                         [(0, -50.0), (9830, 25.0), (1311, -40.0), (-1, -50.0), (0x7FFF, 200.0)])
-def test_the_temperature_comes_in_two_frames(raw, degrees):
+@pytest.mark.parametrize('number, raw, temperature, health', [
+    *((0, raw, degrees, {}) for raw, degrees in (
+        (0, -50.0), (9830, 25.0), (1311, -40.0), (-1, -50.0), (0x7FFF, 200.0))),
+    (2, 16384, None, {'supply_v': 5.0}), (2, -16384, None, {'supply_v': -5.0}),
+    (4, 13107, None, {'source_current_a': 0.1}), (6, 13107, None, {'diagnostic_v': 1.0})])
+def test_each_value_comes_in_two_frames(number, raw, temperature, health):
     high, low = raw.to_bytes(2, 'big', signed=True)
-    (first, _), (second, _) = values(frame(1, 0, high), frame(2, 1, low))
-    assert first is None and second == pytest.approx(degrees, abs=0.01)
-
-
-@pytest.mark.parametrize('number, name, raw, value',
-                         [(2, 'supply_v', 16384, 5.0), (4, 'source_current_a', 13107, 0.1),
-                          (6, 'diagnostic_v', 13107, 1.0), (2, 'supply_v', -16384, -5.0)])
-def test_each_other_value_comes_in_two_frames(number, name, raw, value):
-    high, low = raw.to_bytes(2, 'big', signed=True)
-    (_, first), (temperature, second) = values(frame(1, number, high), frame(2, number + 1, low))
-    assert first == {} and temperature is None and second == {name: pytest.approx(value, abs=1e-4)}
+    first, second = values(frame(1, number, high), frame(2, number + 1, low))
+    assert first == (None, {})
+    assert second == (temperature if temperature is None else pytest.approx(temperature, abs=0.01),
+                      pytest.approx(health, abs=1e-4))
 
 
 def test_all_values_come_round_and_are_good():
@@ -106,11 +99,3 @@ def test_an_emulated_unit_says_of_itself_what_the_sample_says():
     currents = [sample.health['source_current_a']
                 for sample in samples if 'source_current_a' in sample.health]
     assert currents == pytest.approx([0.2], abs=1e-4)
-
-
-def test_a_sensitivity_is_asked_for():
-    with pytest.raises(ValueError, match='sensitivity is not set.*rad/s of one count'):
-        PROTOCOL.decoder()
-    sample, = PROTOCOL.decoder(Settings(sensitivity=math.radians(1.0) / 27880.0)).feed(
-        frame(27880))
-    assert sample.output == pytest.approx(math.radians(1.0))

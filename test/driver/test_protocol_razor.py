@@ -19,7 +19,6 @@ LINE = b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n'
 
 
 def decoded(data, axis='z'):
-    """Return the samples of bytes."""
     return PROTOCOL.decoder(Settings(axis=axis)).feed(data)
 
 

@@ -21,13 +21,11 @@ GRAVITY = 9.80665
 
 
 def frame(kind, *numbers):
-    """Return a frame of four numbers."""
     data = bytes([0x55, kind]) + struct.pack('<4h', *numbers)
     return data + bytes([sum(data) % 256])
 
 
 def decoded(*frames, axis='z'):
-    """Return the samples of frames."""
     return PROTOCOL.decoder(Settings(axis=axis)).feed(b''.join(frames))
 
 

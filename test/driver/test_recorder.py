@@ -38,7 +38,6 @@ def samples(count=300):
 
 
 def recorders(folder):
-    """Return one recorder of each kind."""
     logs = [CsvRecorder(str(folder / name), notes) for name in ('a.csv', 'a.csv.gz')]
     return *logs, McapRecorder(str(folder / 'a.mcap'), notes)
 

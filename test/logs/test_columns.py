@@ -14,7 +14,6 @@ import json
 import math
 
 from gyro_calibration.logs.log import (
-    Log,
     log_from_table,
     LogError,
     read_log,
@@ -59,6 +58,11 @@ def test_a_named_column_goes_before_one_of_the_format_and_the_rest_is_kept(tmp_p
                    columns={'gyro': 'wz'})
     assert log.output.tolist() == [1.0, 2.0] and log.others == {'note': ('a', 'b')}
     assert log.time.tolist() == [0.0, 1.0]
+    part = select_rows(log, log.time > 0.5)
+    assert part.output.tolist() == [2.0] and part.others == {'note': ('b',)}
+    log = read_log(written(tmp_path, 't;gz;yaw\n0;1;5\n1;1; \n2;1;\n3;1;8\n'),
+                   columns={'time': 't', 'gyro': 'gz', 'heading': 'yaw'})
+    assert np.isfinite(log.reference_heading).tolist() == [True, False, False, True]
 
 
 @pytest.mark.parametrize('text', [
@@ -161,12 +165,6 @@ def test_over_a_gap_the_gyro_says_by_how_many_turns_the_heading_went_on():
     np.testing.assert_allclose(found[known] - found[0], heading[known] - heading[0], atol=1e-9)
 
 
-def test_a_data_frame_is_a_log():
-    pandas = pytest.importorskip('pandas')
-    log = log_from_table(pandas.DataFrame({'time_s': [0.0, 1.0], 'gyro_rad_s': [1.0, 2.0]}))
-    assert log.output.tolist() == [1.0, 2.0]
-
-
 @pytest.mark.parametrize(('table', 'wanted'), [
     ({'w': [1.0, 2.0]}, 'no gyro column'), ({'gyro_dps': ['a', 'b']}, 'is no log'),
     ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 2.0, 3.0]}, 'one shape'),
@@ -176,12 +174,6 @@ def test_a_data_frame_is_a_log():
 def test_a_table_that_is_no_log_is_refused_in_a_sentence(table, wanted):
     with pytest.raises(LogError, match=wanted):
         log_from_table(table)
-
-
-def test_a_part_holds_all_columns():
-    log = Log(output=np.arange(4.0), time=np.arange(4.0), others={'a': ('w', 'x', 'y', 'z')})
-    found = select_rows(log, log.time > 1.0)
-    assert found.output.tolist() == [2.0, 3.0] and found.others == {'a': ('y', 'z')}
 
 
 def test_an_attitude_gives_the_angle_that_the_gyro_turned_though_its_axis_tilts(tmp_path):
@@ -234,3 +226,9 @@ def test_an_empty_cell_of_a_reference_is_a_lost_value(tmp_path):
     log = read_log(written(tmp_path, 't;gz;yaw\n0;1;5\n1;1; \n2;1;\n3;1;8\n'),
                    columns={'time': 't', 'gyro': 'gz', 'heading': 'yaw'})
     assert np.isfinite(log.reference_heading).tolist() == [True, False, False, True]
+
+
+def test_a_data_frame_is_a_log():
+    pandas = pytest.importorskip('pandas')
+    log = log_from_table(pandas.DataFrame({'time_s': [0.0, 1.0], 'gyro_rad_s': [1.0, 2.0]}))
+    assert log.output.tolist() == [1.0, 2.0]

@@ -13,12 +13,14 @@
 import contextlib
 from dataclasses import replace
 import hashlib
+import io
 import json
 import shutil
 import sys
 import tracemalloc
 
 from gyro_calibration.logs.cdr import (
+    DEFINITIONS,
     IMU,
     LAYOUTS,
     MessageError,
@@ -29,21 +31,10 @@ from gyro_calibration.logs.cdr import (
 )
 from gyro_calibration.logs.log import LogError, read_log, write_log
 from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
-from gyro_calibration.logs.ros_bag import is_recording
+from gyro_calibration.logs.ros_bag import is_recording, McapWriter
 import numpy as np
 import pytest
-from recordings import (
-    BEGIN,
-    chunk,
-    database,
-    DELAY,
-    file_of,
-    KINDS,
-    MCAP,
-    Messages,
-    of_log,
-    write,
-)
+from recordings import BEGIN, chunk, database, DELAY, file_of, KINDS, MCAP, Messages, of_log, write
 import yaml
 
 RATE = 100.0
@@ -51,7 +42,6 @@ RATE = 100.0
 
 @pytest.fixture
 def make():
-    """Return what makes messages."""
     return Messages()
 
 
@@ -121,6 +111,11 @@ def test_messages_of_any_alignment_are_parsed_as_rosbags_writes_them_and_read_by
     assert message.linear_acceleration_covariance[8] == 36.0
     assert (parse(serialize(BEGIN, frame, [20.5, 0.0]), LAYOUTS[TEMPERATURE])
             == (BEGIN, (20.5, 0.0)))
+    good = serialize(BEGIN, frame, 37 * [0.0])
+    for data in (b'', good[:3], good[:15], good[:-1], b'\0\x07' + good[2:],
+                 good[:12] + b'\xff' * 4 + good[16:]):
+        with pytest.raises(MessageError):
+            parse(data, LAYOUTS[IMU])
 
 
 CUSTOM = """# a gyro of its own maker
@@ -204,16 +199,7 @@ def test_other_kinds_serve_where_they_are_named(make, tmp_path, turning, storage
         read_recording(path, Topics('pose'))
 
 
-def test_bytes_that_are_no_message_are_refused():
-    good = serialize(BEGIN, 'gyro', 37 * [0.0])
-    for data in (b'', good[:3], good[:20], good[:-1], b'\0\x07' + good[2:],
-                 good[:12] + b'\xff' * 4 + good[16:]):
-        with pytest.raises(MessageError):
-            parse(data, LAYOUTS[IMU])
-
-
 def write_chunks(path, compression, count, chunked=True):
-    """Write a recording of a gyro that counts, by the library mcap."""
     writing = pytest.importorskip('mcap.writer', reason='mcap is not installed')
     with open(path, 'wb') as file:
         writer = writing.Writer(file, chunk_size=10_000,
@@ -358,8 +344,7 @@ def test_a_compressed_file_may_not_grow_without_bound(tmp_path, monkeypatch):
 
 def test_a_sentence_shows_no_text_of_a_file_that_a_terminal_would_obey(make, tmp_path):
     bad = '/imu\x1b[2J\n' + 300 * 'x'
-    topics = {bad: [(0.0, make.temperature(0.0, 20.0))],
-              **{f'/t{n}': [(0.0, make.temperature(0.0, 20.0))] for n in range(30)}}
+    topics = {name: degc(make) for name in (bad, *(f'/t{n}' for n in range(30)))}
     for storage in ('MCAP', 'SQLITE3'):
         with pytest.raises(LogError) as caught:
             read_recording(write(tmp_path / storage, topics, storage=storage))
@@ -379,11 +364,15 @@ def test_a_compressed_recording_says_which_package_it_needs(make, tmp_path, monk
         read_recording(packed)
 
 
-def test_only_recordings_are_taken_for_recordings(tmp_path):
+def test_only_recordings_are_taken_for_recordings_and_one_that_is_not_there_is_not_made(tmp_path):
     assert not any(map(is_recording, ['log.csv', 'log.csv.gz', '/dev/stdin', 'a.mcap.csv']))
     assert all(map(is_recording, ['a.mcap', 'a.db3', 'a.mcap.zstd', 'a.db3.zstd', tmp_path]))
     with pytest.raises(LogError, match=r'a folder without an \.mcap or \.db3 file'):
         read_recording(tmp_path)
+    for name in ('missing.mcap', 'missing.db3', 'missing.db3.zstd'):
+        with pytest.raises(LogError, match=f'{name}: cannot be read .no such file or directory.'):
+            read_recording(tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_database_that_asks_for_more_memory_than_there_may_be_is_refused(tmp_path):
@@ -395,13 +384,6 @@ def test_a_database_that_asks_for_more_memory_than_there_may_be_is_refused(tmp_p
     (tmp_path / 'a.db3').write_bytes(page[:412])
     with pytest.raises(LogError, match='it needs more memory than the limit'):
         read_recording(tmp_path / 'a.db3')
-
-
-@pytest.mark.parametrize('name', ['missing.mcap', 'missing.db3', 'missing.db3.zstd'])
-def test_a_recording_that_is_not_there_is_one_sentence_and_is_not_made(tmp_path, name):
-    with pytest.raises(LogError, match=f'{name}: cannot be read .no such file or directory.'):
-        read_recording(tmp_path / name)
-    assert not list(tmp_path.iterdir())
 
 
 # Topics
@@ -419,27 +401,40 @@ def test_of_several_gyros_one_has_to_be_named(make, run, tmp_path, turning):
     np.testing.assert_array_equal(read_recording(path, Topics(reference='imu/data')).output, rate)
 
 
-def test_topics_that_are_not_there_or_of_another_kind_are_reported(make, tmp_path, turning):
-    time, rate, _ = turning
-    path = write(tmp_path / 'bag',
-                 {'/imu': gyro(make, time, rate), '/t': [(0.0, make.temperature(0.0, 20.0))]})
-    with pytest.raises(LogError, match=r'no topic gyro; there are /imu \(sensor_msgs/msg/Imu\) '
-                                       r'and /t \(sensor_msgs/msg/Temp'):
-        read_recording(path, Topics('gyro'))
-    with pytest.raises(LogError, match='/t is sensor_msgs/msg/Temperature; '
-                                       '--reference-topic wants nav_msgs/msg/Odometry, '):
-        read_recording(path, Topics(reference='t'))
-    with pytest.raises(LogError, match='cannot be its own reference'):
-        read_recording(path, Topics('imu', reference='imu'))
-    with pytest.raises(LogError, match=r'no message of sensor_msgs/msg/Imu in it; there are /t'):
-        read_recording(write(tmp_path / 'other', {'/t': [(0.0, make.temperature(0.0, 20.0))]}))
+#: A Messages and times -> topics of a recording; which of them are read; words.
+REFUSED = {
+    'no such topic': (lambda make, time: {'/imu': gyro(make, time, time), '/t': degc(make)},
+                      Topics('gyro'), r'no topic gyro; there are /imu \(sensor_msgs/msg/Imu\) '
+                                      r'and /t \(sensor_msgs/msg/Temp'),
+    'no reference': (lambda make, time: {'/imu': gyro(make, time, time), '/t': degc(make)},
+                     Topics(reference='t'), '/t is sensor_msgs/msg/Temperature; '
+                                            '--reference-topic wants nav_msgs/msg/Odometry, '),
+    'its own reference': (lambda make, time: {'/imu': gyro(make, time, time)},
+                          Topics('imu', reference='imu'), 'cannot be its own reference'),
+    'no gyro': (lambda make, time: {'/t': degc(make)}, Topics(),
+                'no message of sensor_msgs/msg/Imu in it; there are /t'),
+    'no rate': (lambda make, time: {'imu': gyro(make, time, time, reports_rate=False)}, Topics(),
+                'reports no angular velocity'),
+    'a clock that was set back': (
+        lambda make, time: {'imu': [(at, make.imu(at - 3600.0 * (at >= 1.5), at))
+                                    for at in time]}, Topics(),
+        r'step back by 3599\.9\d* s at sample 151'),
+    'a reference of another time': (
+        lambda make, time: {'imu': gyro(make, time, time),
+                            'pose': [(at, make.pose(at + 3600.0, 0.0)) for at in time]},
+        Topics(reference='pose'), 'no heading and no rate at the times of the gyro'),
+}
 
 
-def test_an_imu_that_reports_no_rate_is_no_gyro(make, tmp_path, turning):
-    time, rate, _ = turning
-    path = write(tmp_path / 'bag', {'imu': gyro(make, time, rate, reports_rate=False)})
-    with pytest.raises(LogError, match='reports no angular velocity'):
-        read_recording(path)
+def degc(make, value=20.0):
+    return [(0.0, make.temperature(0.0, value))]
+
+
+@pytest.mark.parametrize('topics, chosen, words', REFUSED.values(), ids=REFUSED)
+def test_what_is_no_log_of_a_gyro_is_refused(make, tmp_path, topics, chosen, words):
+    path = write(tmp_path / 'bag', topics(make, np.arange(300) / RATE))
+    with pytest.raises(LogError, match=words):
+        read_recording(path, chosen)
 
 
 # Times
@@ -490,42 +485,30 @@ def test_stamps_that_say_nothing_are_refused_unless_the_rate_is_given(make, tmp_
     np.testing.assert_array_equal(log.time, time)
 
 
-def test_a_clock_that_was_set_back_is_refused(make, tmp_path):
-    time = np.arange(300) / RATE
-    path = write(tmp_path / 'bag', {
-        'imu': [(at, make.imu(at + (0.0 if at < 1.5 else 3600.0 * -1.0), at)) for at in time]})
-    with pytest.raises(LogError, match=r'step back by 3599\.9\d* s at sample 151'):
-        read_recording(path)
-
-
 # Temperature
 
 
-def test_a_slow_temperature_lies_on_the_line_between_readings_and_is_held_at_the_ends(
-        make, tmp_path, turning):
-    time, rate, _ = turning
-    readings = [(at, make.temperature(at, 20.0 + at)) for at in np.arange(2.5, 18.0)]
-    log = read_recording(write(tmp_path / 'bag', {'imu': gyro(make, time, rate), 't': readings}))
-    np.testing.assert_allclose(log.temperature, 20.0 + np.clip(time, 2.5, 17.5), atol=1e-9)
-    assert not any('no temperature came' in note for note in log.notes)
-
-
-def test_a_long_time_without_temperature_is_reported_and_another_time_is_not_used(make, tmp_path):
+def test_temperatures_lie_on_the_line_between_readings_and_long_gaps_are_reported(make, tmp_path):
     time = np.arange(0.0, 100.0, 0.1)
-    some = [(at, make.temperature(at, 20.0)) for at in range(10)]
-    log = read_recording(write(tmp_path / 'bag', {'imu': gyro(make, time, time), 't': some}))
-    np.testing.assert_array_equal(log.temperature, 20.0)
+    imu = gyro(make, time, time)
+
+    def read(name, readings):
+        return read_recording(write(tmp_path / name, {'imu': imu, 't': readings}))
+    log = read('slow', [(at, make.temperature(at, 20.0 + at)) for at in np.arange(2.5, 99.0)])
+    np.testing.assert_allclose(log.temperature, 20.0 + np.clip(time, 2.5, 98.5), atol=1e-9)
+    assert not any('no temperature came' in note for note in log.notes)
+    log = read('some', [(at, make.temperature(at, 20.0 + at)) for at in range(10)])
+    np.testing.assert_allclose(log.temperature, 20.0 + np.clip(time, 0.0, 9.0), atol=1e-9)
     assert any('no temperature came for up to 91 s' in note for note in log.notes)
-    other = [(0.0, make.temperature(-3600.0, 20.0)), (1.0, make.temperature(-3599.0, np.nan))]
-    log = read_recording(write(tmp_path / 'other', {'imu': gyro(make, time, time), 't': other}))
+    log = read('other', [(0.0, make.temperature(-3600.0, 20.0)),
+                         (1.0, make.temperature(-3599.0, np.nan))])
     assert log.temperature is None and any('and was left out' in note for note in log.notes)
 
 
 def test_of_several_temperatures_the_one_named_like_the_gyro_is_taken(make, tmp_path, turning):
     time, rate, _ = turning
     topics = {'gyro/imu': gyro(make, time, rate),
-              'battery/temperature': [(0.0, make.temperature(0.0, 5.0))],
-              'gyro/temperature': [(0.0, make.temperature(0.0, 30.0))]}
+              'battery/temperature': degc(make, 5.0), 'gyro/temperature': degc(make, 30.0)}
     path = write(tmp_path / 'bag', topics)
     np.testing.assert_array_equal(read_recording(path).temperature, 30.0)
     np.testing.assert_array_equal(
@@ -542,10 +525,12 @@ def test_each_kind_of_reference_gives_what_it_holds(make, tmp_path, turning):
               'other': [(at, make.imu(at, r, heading=h)) for at, r, h in zip(time, rate, heading)],
               'pose': [(at, make.pose(at, h)) for at, h in zip(time, heading)],
               'twist': [(at, make.twist(at, r)) for at, r in zip(time, rate)],
+              'without rate': [(at, make.odometry(at, h, 0.0)) for at, h in zip(time, heading)],
               'bare': gyro(make, time, rate)}
     path = write(tmp_path / 'bag', topics)
     for name, has_heading, has_rate in (('odom', 1, 1), ('other', 1, 1), ('pose', 1, 0),
-                                        ('twist', 0, 1), ('bare', 0, 1)):
+                                        ('twist', 0, 1), ('without rate', 1, 0),
+                                        ('bare', 0, 1)):
         log = read_recording(path, Topics('imu', name))
         assert ((log.reference_heading is not None, log.reference_rate is not None)
                 == (has_heading, has_rate)), name
@@ -580,22 +565,6 @@ def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path,
     assert any('more than half a turn' in note for note in log.notes)
 
 
-def test_a_reference_of_another_time_is_refused(make, tmp_path, turning):
-    time, rate, _ = turning
-    topics = {'imu': gyro(make, time, rate),
-              'pose': [(at, make.pose(at + 3600.0, 0.0)) for at in time]}
-    with pytest.raises(LogError, match='no heading and no rate at the times of the gyro'):
-        read_recording(write(tmp_path / 'bag', topics), Topics(reference='pose'))
-
-
-def test_odometry_that_never_fills_in_its_rate_gives_its_heading(make, tmp_path, turning):
-    time, rate, heading = turning
-    topics = {'imu': gyro(make, time, rate),
-              'odom': [(at, make.odometry(at, h, 0.0)) for at, h in zip(time, heading)]}
-    log = read_recording(write(tmp_path / 'bag', topics), Topics(reference='odom'))
-    assert log.reference_rate is None and log.reference_heading is not None
-
-
 # Verbs
 
 
@@ -608,7 +577,6 @@ def test_blocks_of_a_recording_are_the_whole(make, tmp_path, turning):
 
 
 def numbers_of(answer):
-    """Return the numbers in the answer of a verb, at whatever depth, in their order."""
     if isinstance(answer, dict):
         return [number for value in answer.values() for number in numbers_of(value)]
     if isinstance(answer, list):
@@ -669,3 +637,51 @@ def test_a_model_says_of_which_files_of_a_recording_it_comes(run, recorded, tmp_
     digest = hashlib.sha256(file_of(recording).read_bytes()).hexdigest()
     assert yaml.safe_load(out.read_text())['origin']['files'] == [
         {'name': 'bag.mcap', 'sha256': digest}]
+
+
+# What the project writes as MCAP is read by others
+
+
+NOTES = {'recorded by': 'a test', 'gyro': '12°'}
+TIMES = [10**18 + 10**7 * number for number in range(300)]
+
+
+def mcap_file(tmp_path):
+    """Write 300 samples in chunks of 100, each tenth with a temperature, and return the path."""
+    writer = McapWriter()
+    pieces = [writer.pack_header('a test', 'about', NOTES)]
+    for number, time in enumerate(TIMES):
+        numbers = 37 * [0.0]
+        numbers[LAYOUTS[IMU].quantities['rate']] = 0.001 * number
+        imu = serialize(time, 'gyro', numbers)
+        writer.add('/imu/data_raw', IMU, DEFINITIONS[IMU], time, imu)
+        if number % 10 == 0:
+            degc = serialize(time, 'gyro', [20.0 + number, 0.0])
+            writer.add('/imu/temperature', TEMPERATURE, DEFINITIONS[TEMPERATURE], time, degc)
+        if number % 100 == 99:
+            assert writer.pending_bytes > 0
+            pieces.append(writer.pack_chunk())
+    assert writer.pending_bytes == 0 and writer.pack_chunk() == b''
+    path = tmp_path / 'recording.mcap'
+    path.write_bytes(b''.join([*pieces, writer.pack_summary()]))
+    return path
+
+
+def test_the_library_mcap_finds_all_from_the_beginning_on_and_by_the_index(tmp_path):
+    reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
+    recording = mcap_file(tmp_path)
+    reader = reading.NonSeekingReader(io.BytesIO(recording.read_bytes()), validate_crcs=True)
+    assert [message.log_time for _, channel, message in reader.iter_messages()
+            if channel.topic == '/imu/temperature'] == TIMES[::10]
+    with open(recording, 'rb') as file:
+        reader = reading.SeekingReader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary.statistics.message_count == 330 and summary.statistics.chunk_count == 3
+        assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (
+            TIMES[0], TIMES[-1])
+        assert reader.get_header().profile == 'ros2'
+        metadata, = reader.iter_metadata()
+        assert (metadata.name, metadata.metadata) == ('about', NOTES)
+        found = list(reader.iter_messages(['/imu/data_raw']))
+        assert [message.log_time for _, _, message in found] == TIMES
+        assert {(schema.name, schema.encoding) for schema, _, _ in found} == {(IMU, 'ros2msg')}

@@ -38,12 +38,13 @@ def test_what_waited_at_a_host_is_not_lost(seconds, jitter):
     assert not inspect_record(Log(output=noise, time=time)).findings
 
 
-def test_what_is_lost_while_a_host_stands_is_counted():
-    time = np.delete(stalled(0.3), np.arange(2015, 2027))
-    assert fit_stamp_grid(time).lost_after.sum() == 12
-
-
-@pytest.mark.parametrize('missing', [1, 5, 40])
-def test_samples_are_lost_before_and_after_a_stall(missing):
-    places = np.concatenate([np.arange(500, 500 + missing), np.arange(4000, 4000 + missing)])
-    assert fit_stamp_grid(np.delete(stalled(0.3), places)).lost_after.sum() == 2 * missing
+@pytest.mark.parametrize('time, lost', [
+    (np.delete(stalled(0.3), np.arange(2015, 2027)), 12),
+    *((np.delete(stalled(0.3), [*range(500, 500 + missing), *range(4000, 4000 + missing)]),
+       2 * missing) for missing in (1, 5, 40)),
+    *((np.delete(INTERVAL * np.arange(10_000), np.s_[1::every]), len(range(1, 10_000, every)))
+      for every in (8, 20))],
+    ids=['while a host stands', *(f'{missing} before and after' for missing in (1, 5, 40)),
+         'one of 8', 'one of 20'])
+def test_what_is_lost_is_counted(time, lost):
+    assert fit_stamp_grid(time).lost_after.sum() == lost

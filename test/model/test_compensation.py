@@ -40,11 +40,18 @@ MODEL = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (0.001,))), np.
                   (-2.0, 2.0), (10.0, 40.0))
 
 
-def test_the_self_calibration_comes_after_the_model():
+def test_the_self_calibration_comes_after_the_model_within_its_ranges():
     """Eq. 13 of Ojeda et al., then eq. 3 of Hong and Park."""
     done = compensate(replace(MODEL, self_calibration=CALIBRATION), 0.5)
     assert done.model_rate == pytest.approx((0.5 - 0.01) / 1.001, abs=1e-12)
     assert done.rate == pytest.approx((done.model_rate - 0.002) / 1.04, abs=1e-12)
+    assert compensate(MODEL, np.array([-2.1, -2.0, 0.0, 2.0, 2.1])).beyond_range.tolist() == [
+        True, False, False, False, True]
+    assert (not compensate(GyroModel(), 99.0).beyond_range
+            and compensate(GyroModel(), 101.0).beyond_range)
+    warm = GyroModel((WARM,), reference_temperature=31.0)
+    assert (compensate(warm, 0.2).rate == compensate(warm, 0.2, 31.0).rate
+            != compensate(warm, 0.2, 30.0).rate), 'that of the reference where none is given'
 
 
 def test_beyond_the_calibrated_temperatures_the_correction_is_extrapolated_and_then_held():
@@ -56,19 +63,6 @@ def test_beyond_the_calibrated_temperatures_the_correction_is_extrapolated_and_t
     assert done.temperature_clipped.tolist() == [True, True, False, False, False, True, True, True]
     assert ([bool(compensate(model, 0.0, float(one)).temperature_clipped) for one in degc]
             == done.temperature_clipped.tolist())
-
-
-def test_without_a_temperature_the_reference_temperature_is_taken():
-    model = GyroModel((WARM,), reference_temperature=31.0)
-    assert (compensate(model, 0.2).rate == compensate(model, 0.2, 31.0).rate
-            != compensate(model, 0.2, 30.0).rate)
-
-
-def test_outputs_beyond_the_calibrated_rates_are_marked():
-    assert compensate(MODEL, np.array([-2.1, -2.0, 0.0, 2.0, 2.1])).beyond_range.tolist() == [
-        True, False, False, False, True]
-    assert (not compensate(GyroModel(), 99.0).beyond_range
-            and compensate(GyroModel(), 101.0).beyond_range)
 
 
 @pytest.mark.parametrize('calibration', [None, CALIBRATION],

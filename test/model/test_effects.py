@@ -70,7 +70,6 @@ GYROS = {
 
 
 def gyro(name):
-    """Return the model of that name."""
     terms = tuple(Term(CATALOGUE[effect], values) for effect, values in GYROS[name])
     return GyroModel(terms + ((Term(POLYNOMIAL, POLYNOMIAL_VALUES),)
                               if name in ('rate_temperature_polynomial', 'all') else ()))

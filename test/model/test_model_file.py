@@ -14,12 +14,7 @@ import contextlib
 from dataclasses import replace
 
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
-from gyro_calibration.model.gyro_model import (
-    GyroModel,
-    SelfCalibration,
-    Term,
-    Tolerance,
-)
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
 from gyro_calibration.model.model_file import ModelError, read_model, write_model
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -38,7 +33,6 @@ FULL = GyroModel(TERMS, np.diag(np.arange(1.0, 8.0)) * 1e-8, (-1.7, 1.7), (20.0,
 
 
 def read(folder, text):
-    """Return the model that a file with this text or these bytes holds."""
     path = folder / 'model.yaml'
     path.write_bytes(text if isinstance(text, bytes) else text.encode('utf-8', 'surrogateescape'))
     return read_model(path)
@@ -47,7 +41,14 @@ def read(folder, text):
 def test_a_file_written_by_hand_is_enough(tmp_path):
     model = read(tmp_path, 'effects: {bias: {bias: 0.01}}')
     assert (model.rate(0.5, 25.0) == 0.49 and model.covariance is None
-            and model.self_calibration is None)
+            and model.self_calibration is None and model.tolerance == Tolerance())
+    past = read(tmp_path, 'effects: {thermal_lag: {thermal_lag: 1e-4, time_constant: 120}, '
+                          'thermal_hysteresis: {thermal_hysteresis: -2E-5}}')
+    assert [term.values for term in past.terms] == [(120.0, 1e-4), (10.0, 1e-3, -2e-5)]
+    assert past.needs_history and not model.needs_history
+    calibrated = read(tmp_path, 'effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: '
+                      '0.2, standard_deviations: {bias: 0.003, scale_factor_error: 0.002}}')
+    assert calibrated.self_calibration.standard_deviations == pytest.approx((0.002, 0.003))
 
 
 def test_a_model_is_read_back_as_it_was_written(tmp_path):
@@ -59,10 +60,9 @@ def test_a_model_is_read_back_as_it_was_written(tmp_path):
     for name in ('rate_range', 'temperature_range', 'reference_temperature', 'noise', 'gyro',
                  'origin', 'self_calibration', 'tolerance', 'noise_bounds'):
         assert getattr(again, name) == getattr(FULL, name), name
-
-
-def test_a_file_without_tolerances_is_one_of_a_model_that_has_none(tmp_path):
-    assert read(tmp_path, 'effects: {}').tolerance == Tolerance()
+    shown = yaml.safe_load((tmp_path / 'model.yaml').read_text(encoding='utf-8'))
+    assert shown['self_calibration']['standard_deviations'] == {
+        'scale_factor_error': pytest.approx(1e-4), 'bias': pytest.approx(2e-4)}
     write_model(tmp_path / 'model.yaml', replace(FULL, tolerance=Tolerance()))
     assert 'tolerance' not in (tmp_path / 'model.yaml').read_text(encoding='utf-8')
 
@@ -145,13 +145,6 @@ BAD = {
 }
 
 
-def test_effects_with_a_past_are_written_by_hand(tmp_path):
-    model = read(tmp_path, 'effects: {thermal_lag: {thermal_lag: 1e-4, time_constant: 120}, '
-                           'thermal_hysteresis: {thermal_hysteresis: -2E-5}}')
-    assert [term.values for term in model.terms] == [(120.0, 1e-4), (10.0, 1e-3, -2e-5)]
-    assert model.needs_history and not read(tmp_path, 'effects: {bias: {bias: 1.0}}').needs_history
-
-
 def test_every_effect_survives_its_file(tmp_path):
     for effect in CATALOGUE.values():
         model = GyroModel(
@@ -196,20 +189,3 @@ def test_self_calibration_is_eq_3_of_hong_and_park():
     calibration = SelfCalibration(-0.1, 0.1)
     assert (round(calibration.scale, 3), round(calibration.offset, 3)) == (1.111, -0.111)
     assert calibration.correct((1 - 0.1) * 0.4 + 0.1) == pytest.approx(0.4, abs=1e-15)
-
-
-def test_a_person_may_give_the_standard_deviations_of_a_self_calibration_alone(tmp_path):
-    path = tmp_path / 'model.yaml'
-    path.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: 0.2, '
-                    'standard_deviations: {bias: 0.003, scale_factor_error: 0.002}}')
-    assert read_model(path).self_calibration.standard_deviations == pytest.approx((0.002, 0.003))
-
-
-def test_a_written_self_calibration_shows_its_standard_deviations(tmp_path):
-    calibration = SelfCalibration(0.1, 0.2, ((4e-6, 1e-9), (1e-9, 9e-6)),
-                                  '2026-01-01T00:00:00+00:00', 21.0, 'likelihood')
-    write_model(tmp_path / 'model.yaml', GyroModel(self_calibration=calibration))
-    assert read_model(tmp_path / 'model.yaml').self_calibration == calibration
-    shown = yaml.safe_load(
-        (tmp_path / 'model.yaml').read_text())['self_calibration']['standard_deviations']
-    assert shown == {'scale_factor_error': pytest.approx(0.002), 'bias': pytest.approx(0.003)}

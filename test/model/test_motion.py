@@ -36,18 +36,12 @@ def test_the_heading_is_the_integral_of_the_rate(name):
     assert motion.heading_at(time) == pytest.approx(heading, abs=1e-12)
 
 
-def test_before_and_after_a_motion_stands():
-    assert CALIBRATION_MOTION.rate_at(
-        np.array([-1.0, CALIBRATION_MOTION.duration + 1.0])).tolist() == [0.0, 0.0]
-    assert (ROBOT_MOTION.heading_at(np.array([-5.0, ROBOT_MOTION.duration + 5.0])).tolist()
-            == [0.0, ROBOT_MOTION.heading[-1]])
-
-
 def test_the_calibration_takes_20_s_turns_both_ways_at_two_speeds_and_comes_back():
-    rate = CALIBRATION_MOTION.rate_at(np.arange(2001) / 100.0) / DEGREE
+    rate = CALIBRATION_MOTION.rate_at(np.arange(-100, 2201) / 100.0) / DEGREE
     assert (CALIBRATION_MOTION.duration == 20.0
             and CALIBRATION_MOTION.heading[-1] == pytest.approx(0.0, abs=1e-12))
     assert all((np.abs(rate - speed) < 1e-9).mean() > 0.1 for speed in (-45, -30, 0, 30, 45))
+    assert not rate[:100].any() and not rate[-100:].any(), 'before and after it stands'
 
 
 def test_the_robot_drives_160_s_and_stands_for_half_of_them():
@@ -55,17 +49,16 @@ def test_the_robot_drives_160_s_and_stands_for_half_of_them():
     rate = ROBOT_MOTION.rate_at(np.arange(16001) / 100.0)
     assert (ROBOT_MOTION.duration == pytest.approx(160.0)
             and (rate == 0.0).mean() == pytest.approx(0.5, abs=0.05))
+    assert (ROBOT_MOTION.heading_at(np.array([-5.0, 165.0])).tolist()
+            == [0.0, ROBOT_MOTION.heading[-1]])
 
 
-def test_a_stretch_turns_rate_times_duration():
-    assert (constant_rate_motion([(1, 0), (4, 45), (1, 0)]).heading[-1]
-            == pytest.approx(4 * 45 * DEGREE))
-
-
-def test_known_headings_are_met_and_joined_by_lines():
+def test_known_headings_are_met_and_joined_by_lines_and_known_rates_turn_by_their_duration():
     motion = motion_from_headings(np.array([10.0, 11.0, 13.0]), np.array([5.0, 6.0, 6.5]))
     assert (motion.heading_at(np.array([0.0, 0.5, 1.0, 2.0, 3.0])).tolist()
             == [0.0, 0.5, 1.0, 1.25, 1.5])
+    assert (constant_rate_motion([(1, 0), (4, 45), (1, 0)]).heading[-1]
+            == pytest.approx(4 * 45 * DEGREE))
 
 
 @pytest.mark.parametrize('prefix', ['', 'reference_'])

@@ -28,27 +28,14 @@ GYRO = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise
                  reference_temperature=33.0)
 
 
-def test_the_output_is_equation_1_of_hong_and_park():
-    log = simulate(GYRO, CALIBRATION_MOTION, 100.0)
-    assert len(log) == 2001 and log.time[-1] == 20.0
-    assert log.output == pytest.approx(0.9 * log.reference_rate + 0.01, abs=1e-12)
-
-
-def test_the_reference_is_the_motion():
-    log = simulate(GYRO, ROBOT_MOTION, 7.0)
+def test_a_log_holds_the_motion_and_what_equation_1_of_hong_and_park_makes_of_it():
+    log = simulate(GYRO, ROBOT_MOTION, 100.0)
+    assert len(log) == 16001 and log.time[-1] == 160.0 and set(log.temperature) == {33.0}
+    assert set(simulate(GYRO, CALIBRATION_MOTION, 10.0, temperature=5.0).temperature) == {5.0}
     assert np.array_equal(log.reference_rate, ROBOT_MOTION.rate_at(log.time))
     assert np.array_equal(log.reference_heading, ROBOT_MOTION.heading_at(log.time))
-
-
-def test_the_temperature_is_the_one_given_or_the_models():
-    assert set(simulate(GYRO, CALIBRATION_MOTION, 10.0).temperature) == {33.0}
-    assert set(simulate(GYRO, CALIBRATION_MOTION, 10.0, temperature=5.0).temperature) == {5.0}
-
-
-def test_the_noise_is_that_of_the_model():
-    quiet = simulate(GYRO, ROBOT_MOTION, 100.0)
-    noisy = simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0))
-    noise = noisy.output - quiet.output
+    assert log.output == pytest.approx(0.9 * log.reference_rate + 0.01, abs=1e-12)
+    noise = simulate(GYRO, ROBOT_MOTION, 100.0, np.random.default_rng(0)).output - log.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
 
 

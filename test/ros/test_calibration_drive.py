@@ -11,10 +11,11 @@
 """Calibrations on a robot that obeys late: what they find, what ends them, and who is obeyed."""
 
 import math
+import re
 
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.model.motion import CALIBRATION_MOTION, motion_from_rates
+from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.ros.calibration_session import (
     DISCOVERY_TIMEOUT,
     Drive,
@@ -26,7 +27,7 @@ from gyro_calibration.ros.calibration_session import (
 from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 import pytest
-from rig import INTERVAL, MODEL, PROFILE, rested, Rig, Robot
+from rig import driven, INTERVAL, MODEL, PROFILE, rested, Rig, Robot
 
 SCALE, BIAS = 0.0373, 0.01  # of the robot's gyro
 FULL = 45.0 * DEGREE
@@ -41,38 +42,28 @@ def stored(rig):
 # A run that drives the robot
 
 
-def test_a_run_finds_scale_and_bias_stores_and_uses_them(tmp_path):
+def test_a_run_drives_the_profile_and_finds_stores_and_uses_scale_and_bias(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
+    begin, first = rig.clock.now, len(rig.outputs)
     success, message = rig.calibrate()
     assert success, message
+    assert 'delay of the gyro 0.3' in message and 'at rest after it' in message
     kept = stored(rig)
     assert kept.scale_factor_error == pytest.approx(SCALE, abs=5e-4)
     assert kept.bias == pytest.approx(BIAS, abs=2e-4)
     assert rig.pipeline.estimator.model.self_calibration == kept
-    assert 'delay of the gyro 0.3' in message and 'at rest after it' in message
-
-
-def test_the_commands_are_the_profile_and_end_with_one_zero(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    begin = rig.clock.now
-    assert rig.calibrate()[0]
-    rates = np.array([rate for _, rate in rig.commands])
-    times = np.array([when for when, _ in rig.commands]) - begin
+    # the commands
+    times, rates = np.array(rig.commands).T
     assert (rates.max(), rates.min()) == pytest.approx((FULL, -FULL), abs=1e-6)
-    np.testing.assert_allclose(rates[:-1], CALIBRATION_MOTION.rate_at(times[:-1] - 0.01),
-                               atol=0.06)
+    np.testing.assert_allclose(
+        rates[:-1], CALIBRATION_MOTION.rate_at(times[:-1] - begin - 0.01), atol=0.06)
     assert np.diff(times).max() < 1.5 * Drive.INTERVAL and rates[-1] == 0.0
-
-
-def test_the_heading_goes_on_with_the_old_calibration_and_does_not_jump_to_the_new_one(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    begin = len(rig.outputs)
-    assert rig.calibrate()[0]
+    # the heading goes on with the old calibration, and does not jump to the new one
     rig.go(1.0)
-    headings = np.array([each.heading for each in rig.outputs[begin:]])
+    headings = np.array([each.heading for each in rig.outputs[first:]])
     assert np.abs(np.diff(headings)).max() < 1.1 * (1 + SCALE) * FULL * 0.01
-    during = [each.rate for each in rig.outputs[begin:] if abs(each.rate) > 0.7]
-    assert max(during) == pytest.approx((1 + SCALE) * FULL, abs=0.01), 'not yet the new scale'
+    assert max(each.rate for each in rig.outputs[first:]) == pytest.approx(
+        (1 + SCALE) * FULL, abs=0.01), 'not yet the new scale'
 
 
 def test_the_next_start_uses_the_stored_calibration_and_the_heading_is_right(tmp_path):
@@ -113,13 +104,11 @@ def faults():
                          [(fault, ros) for fault in faults()
                           for ros in (None, 1000.0) if ros or 'ROS time' not in fault])
 def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault, ros):
-    rig = rested(tmp_path, calibration_drive=True, ros=ros)
-    rig.drive_to()
+    rig = driven(tmp_path, ros=ros)
     act, reason = faults()[fault]
     begin, heading = rig.clock.now, rig.robot.heading
     act(rig)
-    assert rig.go(2.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(2.0)
     assert not success and reason in message, message
     assert rig.stopped_after(begin) < 0.5
     rig.go(2.0)
@@ -132,8 +121,7 @@ def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault
 
 @pytest.mark.parametrize('back', [0.03, 0.5, 10.0])
 def test_commands_go_on_where_ros_time_jumps_back_and_the_stamps_do_not(tmp_path, back):
-    rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
-    rig.drive_to()
+    rig = driven(tmp_path, ros=1000.0)
     stamp, begin = rig.stamp, rig.clock.now
     rig.clock.ros -= back
     rig.stamp = lambda reading: stamp(reading) + round(1e9 * back)
@@ -187,19 +175,16 @@ def test_what_is_no_fault_does_not_keep_a_drive_from_its_calibration(tmp_path, g
 
 
 def test_a_clock_of_the_host_that_is_set_by_an_hour_in_mid_run_ends_nothing(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     rig.clock.set_by = -3600.0
-    rig.go(60.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end()
     assert success, message
 
 
 @pytest.mark.parametrize('linear, rate', [(0.0, 0.0), (0.0, 0.3), (0.2, None)],
                          ids=['stop', 'turn', 'drive ahead'])
 def test_one_command_of_another_node_is_enough(tmp_path, linear, rate):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     rate = rig.commands[-1][1] if rate is None else rate
     rig.pipeline.add_command(Velocity(linear=(linear, 0.0, 0.0), angular=(0.0, 0.0, rate)))
     assert rig.ended and rig.commands[-1] == (rig.clock.now, 0.0)
@@ -233,8 +218,7 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
 @pytest.mark.parametrize('simulated', [{}, {'ros': 1000.0}], ids=['no /clock', '/clock'])
 def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers(
         tmp_path, simulated):
-    rig = rested(tmp_path, calibration_drive=True, **simulated)
-    rig.drive_to()
+    rig = driven(tmp_path, **simulated)
     rig.pipeline.poll(1)
     rig.clock.now += 0.4
     rig.pipeline.poll(1)
@@ -247,8 +231,7 @@ def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers
 @pytest.mark.parametrize('pace', [1e-6, 0.3, 3.0])
 def test_stamps_that_leave_the_clock_end_a_drive(tmp_path, pace, ros, within):
     """The motion goes on by them: where they all but stand, it would never end."""
-    rig = rested(tmp_path, calibration_drive=True, ros=ros)
-    rig.drive_to()
+    rig = driven(tmp_path, ros=ros)
     begin = rig.clock.now
     paced(rig, pace)
     assert rig.go(5.0, lambda: rig.ended)
@@ -283,8 +266,7 @@ def test_a_node_that_was_stopped_in_a_drive_does_not_go_on_with_it(tmp_path, tim
 
 
 def test_a_stop_that_is_lost_on_the_way_is_repeated(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     command, rig.robot.command = rig.robot.command, lambda rate: None
     assert rig.session.cancel()[0] and not rig.session.conclude()[0]
     rig.robot.command = command
@@ -295,11 +277,9 @@ def test_a_stop_that_is_lost_on_the_way_is_repeated(tmp_path):
 
 @pytest.mark.parametrize('cancelled', [True, False])
 def test_a_stop_is_not_repeated_once_another_node_commands(tmp_path, cancelled):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+    rig = driven(tmp_path)
     if cancelled:
-        rig.session.cancel()
-        rig.session.conclude()
+        rig.stop()
     sent, rig.other = len(rig.commands), 0.3
     rig.go(1.0)
     last = len(rig.commands)
@@ -313,29 +293,27 @@ def test_a_stop_is_not_repeated_once_another_node_commands(tmp_path, cancelled):
 # What a drive does not begin over
 
 
-@pytest.mark.parametrize('prepare, reason', [
-    (lambda rig: setattr(rig, 'other', 0.3), 'odom or cmd_vel shows that the robot moves'),
-    (lambda rig: setattr(rig, 'other', 0.0), 'another node sends commands on cmd_vel'),
-    (lambda rig: setattr(rig.robot, 'unplugged', True), 'no sample comes'),
-    (lambda rig: rig.publishers.append('/b'), '2 publishers'),
-], ids=['teleop', 'a soft stop', 'unplugged', 'two publishers'])
-def test_a_drive_begins_only_when_the_robot_rests_and_is_free(tmp_path, prepare, reason):
-    rig = rested(tmp_path, calibration_drive=True)
+OBSTACLES = {
+    'teleop': ({}, lambda rig: setattr(rig, 'other', 0.3),
+               'odom or cmd_vel shows that the robot moves'),
+    'a soft stop': ({}, lambda rig: setattr(rig, 'other', 0.0),
+                    'another node sends commands on cmd_vel'),
+    'unplugged': ({}, lambda rig: setattr(rig.robot, 'unplugged', True), 'no sample comes'),
+    'two publishers': ({}, lambda rig: rig.publishers.append('/b'), '2 publishers'),
+    'no /clock': ({'ros': 0.0}, lambda rig: None, 'ROS time stands still'),
+    '/clock stands': ({'ros': 1000.0}, lambda rig: setattr(rig, 'ros_speed', 0.0),
+                      'ROS time stands still'),
+}
+
+
+@pytest.mark.parametrize('given, prepare, reason', OBSTACLES.values(), ids=OBSTACLES)
+def test_a_drive_begins_only_when_the_robot_rests_and_is_free(tmp_path, given, prepare, reason):
+    rig = rested(tmp_path, calibration_drive=True, **given)
     prepare(rig)
     rig.go(2.0)
-    refusal = rig.begin()
-    assert reason in refusal and not rig.session.run
+    assert reason in rig.begin() and not rig.session.run
     rig.go(1.0)
     assert not rig.commands
-
-
-@pytest.mark.parametrize('ros', [0.0, 1000.0], ids=['absent', 'paused'])
-def test_a_drive_does_not_begin_while_ros_time_stands(tmp_path, ros):
-    rig = Rig(tmp_path, calibration_drive=True, ros=ros)
-    rig.go(3.0)
-    rig.ros_speed = 0.0
-    rig.go(2.0)
-    assert 'ROS time stands still' in rig.begin() and not rig.commands
 
 
 def test_a_drive_begins_after_a_pause_of_the_node_though_the_clock_waits_behind_it(tmp_path):
@@ -369,8 +347,7 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
     rig.go(0.5 * DISCOVERY_TIMEOUT)
     assert rig.session.run.elapsed == 0.0 and not rig.ended
     rig.receivers = int(comes)
-    assert rig.go(40.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(40.0)
     assert success == comes
     if not comes:
         assert 'no other node receives cmd_vel' in message
@@ -380,12 +357,10 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
 # After a drive
 
 
-def test_a_robot_that_turns_on_after_the_stop_is_reported(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
-    rig.drive_to()
+def test_a_robot_that_turns_on_after_the_stop_is_reported_and_one_that_stops_late_is_not(tmp_path):
+    rig = driven(tmp_path)
     rig.robot.deaf = True
-    rig.session.cancel()
-    rig.session.conclude()
+    rig.stop()
     rig.go(1.4)
     assert not rig.session.warning, 'it may still be slowing down'
     rig.go(1.0)
@@ -394,15 +369,10 @@ def test_a_robot_that_turns_on_after_the_stop_is_reported(tmp_path):
     rig.robot.command(0.0)
     rig.go(5.0)
     assert not rig.begin() and not rig.session.warning, 'a new run has a new chance'
-
-
-def test_a_robot_that_stops_late_but_stops_is_not_reported(tmp_path):
-    rig = rested(tmp_path, robot=Robot(lag=0.3), calibration_drive=True)
-    rig.drive_to()
-    rig.session.cancel()
-    rig.session.conclude()
-    rig.go(5.0)
-    assert not rig.session.warning
+    late = driven(tmp_path, robot=Robot(lag=0.3))
+    late.stop()
+    late.go(5.0)
+    assert not late.session.warning
 
 
 # Load
@@ -462,8 +432,7 @@ def test_a_slip_without_load_is_named_as_one(tmp_path):
     rig.robot.step = slipping
     rig.go(0.3)
     rig.robot.step = step
-    rig.go(30.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(30.0)
     assert not success and 'busy' not in message and 'a slip or a bump' in message
     assert not rig.calibration_file.exists()
 
@@ -476,7 +445,7 @@ def test_a_second_calibration_is_refused_and_leaves_the_first_alone(tmp_path):
     rig.begin()
     rig.go(3.0)
     assert 'is in progress' in rig.begin(REST) and 'is in progress' in rig.begin()
-    assert rig.go(40.0, lambda: rig.ended) and rig.session.conclude()[0]
+    assert rig.end(40.0)[0]
 
 
 def test_cancel_keeps_the_calibration_in_use_and_there_is_nothing_left_to_cancel(tmp_path):
@@ -528,34 +497,22 @@ def test_an_error_in_the_fit_changes_nothing_and_the_next_run_works(tmp_path, mo
     assert rig.calibrate()[0]
 
 
-def test_a_bad_profile_is_refused_in_one_sentence_that_names_the_file(tmp_path):
-    profile = tmp_path / 'profile.csv'
-    profile.write_text('time_s,speed\n0,1\n1,2\n')
-    refusal = rested(tmp_path, calibration_profile_file=str(profile)).begin()
-    assert 'time_s and one of heading_deg' in refusal and str(profile) in refusal
-
-
-def test_without_a_readable_model_nothing_is_calibrated(tmp_path):
-    rig = rested(tmp_path, model='effects: {bias: {bias: .nan}}')
-    assert 'effects.bias.bias is nan' in rig.begin(REST)
+@pytest.mark.parametrize('kind, model, profile, words', [
+    (PROFILE, MODEL, 'time_s,speed\n0,1\n1,2\n', 'profile.csv: .*time_s and one of heading_deg'),
+    (PROFILE, MODEL + 'valid: {rate: [-2.0, 2.0]}\n',
+     'time_s,rate_rad_s\n0,0\n1,0\n2,45\n3,0\n20,0\n',
+     'the profile turns at 2578 deg/s, but the gyro measures at most'),
+    (REST, 'effects: {bias: {bias: .nan}}', '', 'effects.bias.bias is nan')],
+    ids=['no profile', 'too fast for the gyro', 'no model'])
+def test_what_cannot_be_calibrated_by_is_refused_in_one_sentence(
+        tmp_path, kind, model, profile, words):
+    (tmp_path / 'profile.csv').write_text(profile)
+    rig = rested(tmp_path, model=model, calibration_drive=True,
+                 calibration_profile_file=str(tmp_path / 'profile.csv'))
+    assert re.search(words, rig.begin(kind)) and not rig.session.run
 
 
 # Other references
-
-
-def test_a_profile_of_measured_headings_serves_as_well(tmp_path):
-    motion = motion_from_rates(np.array([0.0, 1.0, 1.5, 4.0, 4.5, 5.5, 6.0, 9.0, 9.5, 10.0]),
-                               np.array([0, 0, 0.6, 0.6, 0, 0, -0.7, -0.7, 0, 0]))
-    times = np.arange(0.0, 10.001, 0.05)
-    profile = tmp_path / 'profile.csv'
-    profile.write_text('time_s,heading_deg\n' + ''.join(
-        f'{t},{h / DEGREE}\n' for t, h in zip(times, motion.heading_at(times))))
-    rig = Rig(tmp_path, model='', calibration_profile_file=str(profile))
-    rig.begin()
-    rig.feed((1 + SCALE) * motion.rate_at(np.arange(0.0, 14.3, 0.01)) + BIAS)
-    success, message = rig.session.conclude()
-    assert success, message
-    assert stored(rig).scale_factor_error == pytest.approx(SCALE, abs=1e-5)
 
 
 def test_odometry_is_a_reference(tmp_path):
@@ -581,7 +538,7 @@ def test_odometry_may_be_finished_early(tmp_path):
     assert rig.session.finish() == (True, 'leave the robot at rest for 4.0 s more')
     rig.go(1.0)
     assert rig.session.finish() == (True, 'leave the robot at rest for 3.0 s more')
-    assert rig.go(5.0, lambda: rig.ended) and rig.session.conclude()[0]
+    assert rig.end(5.0)[0]
 
 
 def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
@@ -596,8 +553,7 @@ def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
     rig.go(4.0)
     assert rig.robot.heading == pytest.approx(2.0 * math.tau, abs=0.02), 'two turns'
     assert rig.session.finish()[0]
-    assert rig.go(5.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
+    success, message = rig.end(5.0)
     assert success and '2 whole turns' in message, message
     kept = stored(rig)
     assert kept.method == 'turns' and kept.scale_factor_error == pytest.approx(SCALE, abs=2e-3)
@@ -630,25 +586,3 @@ def test_calibrate_bias_takes_no_even_turn_for_a_bias(tmp_path, shown, words):
     rig.go(3.0)
     success, message = rig.calibrate(REST)
     assert not success and words in message, message
-
-
-def test_a_profile_that_is_too_fast_for_the_gyro_is_not_driven(tmp_path):
-    profile = tmp_path / 'profile.csv'
-    profile.write_text('time_s,rate_rad_s\n0,0\n1,0\n2,45\n3,0\n20,0\n')
-    valid = 'valid: {rate: [-2.0, 2.0]}\n'
-    rig = rested(tmp_path, model=MODEL + valid, calibration_profile_file=str(profile),
-                 calibration_drive=True)
-    assert not rig.pipeline.store.problem
-    assert 'the profile turns at 2578 deg/s, but the gyro measures at most' in rig.begin()
-
-
-def test_calibrate_bias_refuses_a_gyro_that_is_moved(tmp_path):
-    rig = rested(tmp_path)
-    rig.begin(REST)
-    rig.go(5.0)
-    rig.robot.command(0.1)
-    rig.go(1.0)
-    rig.robot.command(0.0)
-    rig.go(20.0, lambda: rig.ended)
-    success, message = rig.session.conclude()
-    assert not success and 'was moved' in message

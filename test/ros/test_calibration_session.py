@@ -24,7 +24,6 @@ from gyro_calibration.ros.calibration_session import (
     ODOMETRY,
     PROFILE,
     REST,
-    REST_AFTER_TURNS,
     TURNS,
 )
 import numpy as np
@@ -58,21 +57,6 @@ def ran(kind, motion, given, duration=None, drift=0.0):
         if run.due_end_reason is not None:
             break
     return run, run.due_end_reason
-
-
-@pytest.mark.parametrize('kind, motion, duration, takes',
-                         [(PROFILE, CALIBRATION_MOTION, None, 24.0),
-                          (ODOMETRY, CALIBRATION_MOTION, 20.0, 24.0),
-                          (ODOMETRY, CALIBRATION_MOTION, 600.0, 24.0),
-                          (TURNS, ROUND, math.inf, 18.0 + REST_AFTER_TURNS)],
-                         ids=['profile', 'odometry', 'odometry until it is finished', 'turns'])
-def test_a_run_is_complete_after_its_motion_and_the_rest(kind, motion, duration, takes):
-    run, answer = ran(kind, motion, rules(), duration)
-    assert answer == '' and run.elapsed == pytest.approx(takes, abs=0.1) and run.progress > 0.99
-    calibration, said = fit_run(run, Noise(), '2026-01-01')
-    assert ((calibration.scale_factor_error, calibration.bias)
-            == (pytest.approx(S, abs=2e-3), pytest.approx(B, abs=1e-4)) and said)
-    assert calibration.temperature == 25.0 and calibration.time == '2026-01-01'
 
 
 def test_turns_that_are_not_finished_are_given_up():

@@ -85,24 +85,20 @@ class FakeGyro:
                 break
         self.wait_until(lambda: len(self.imu) >= received + sent, what=f'{sent} samples')
 
-    def call(self, name):
-        """Call a service of the node and return its response."""
+    def call_later(self, name):
         return self.ros.call(Trigger, f'/compensation_node/{name}')
 
-    def call_later(self, name):
-        """Call a service without waiting for its answer."""
-        client = self.ros.node.create_client(Trigger, f'/compensation_node/{name}')
-        assert client.wait_for_service(30.0)
-        return client.call_async(Trigger.Request())
+    def call(self, name):
+        response = self.call_later(name)
+        self.wait_until(response.done, what=f'the response of {name}')
+        return response.result()
 
     def calibrating(self):
-        """Tell whether the node reports that a calibration is in progress."""
         return bool(self.status) and self.status[-1].status[0].message.startswith('calibrating')
 
 
 @pytest.fixture
 def start(start_node, ros, wait_until, tmp_path):
-    """Return a function that starts the node, and returns it with a gyro."""
     (tmp_path / 'model.yaml').write_text(MODEL)
 
     def start():
@@ -127,7 +123,6 @@ def with_other_axes(message):
 
 @pytest.fixture
 def hold(hold_node, tmp_path):
-    """Return a function of parameters that makes the node in this process."""
     (tmp_path / 'model.yaml').write_text(MODEL)
 
     def hold(**parameters):
@@ -138,7 +133,6 @@ def hold(hold_node, tmp_path):
 
 
 def sample(number, rate):
-    """Return a message of a gyro of 100 Hz."""
     message = Imu()
     message.header.frame_id, message.angular_velocity.z = 'gyro', rate
     message.header.stamp.sec = 1_700_000_000 + number // 100

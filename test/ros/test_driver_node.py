@@ -8,27 +8,222 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The driver as a robot runs it: its own process, a pseudo-terminal for the gyro, and DDS."""
+"""The driver: its parameters, messages and diagnostics, and as a process with DDS."""
 
 import itertools
+import math
+import re
 import subprocess
 import sys
 
+from fake_port import World
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from gyro_calibration.driver.connection import Connection, SampleMean
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import find_protocol, Sample
+from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
+from gyro_calibration.ros.driver_node import (
+    DriverReport,
+    PARAMETERS,
+    SampleMessages,
+    settings_from_parameters,
+)
+from gyro_calibration.ros.parameters import parameter_values
+from gyro_calibration.ros.runner import ERROR, OK, WARN
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
+KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
+        'device_faults', 'discarded_bytes', 'longest_gap_s', 'clock_steps', 'last_event', 'port',
+        'device', 'state', 'protocol', 'baud', 'detected', 'reopened', 'waiting_s', 'waited_s',
+        'last_error', 'period_ms', 'nominal_period_ms', 'jitter_before_ms', 'jitter_after_ms'}
+
+
+# Parameters
+
+
+@pytest.mark.parametrize(('given', 'sentence'), [
+    ({'protocol': 'bogus'},
+     r"parameter protocol is 'bogus', but must be kvh_dsp3000, .*csv or auto"),
+    ({'invert': 'maybe'}, "parameter invert is 'maybe', but must be default, always or never"),
+    ({'increments': True}, 'parameter increments is True, but must be default, always or never'),
+    ({'columns': ['time_s'], 'protocol': 'csv'}, 'exactly one must be gyro_dps'),
+    ({'baud': -1}, 'parameter baud is -1, but must be from 0 to 4000000 bit/s'),
+    ({'sample_rate': 'often'}, "parameter sample_rate is 'often', but must be a number"),
+    ({'axis': 'w'}, "parameter axis is 'w', but must be x, y or z"),
+    ({'protocol': 'fizoptika'}, 'sensitivity is not set, but this gyro sends counts'),
+])
+def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
+    with pytest.raises(ValueError, match=sentence) as refused:
+        values = parameter_values(PARAMETERS, given)
+        Connection(values.port, values.protocol, values.baud, settings_from_parameters(values))
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_parameters_become_settings():
+    given = {'sensitivity': 0.002, 'invert': 'always', 'increments': 'never', 'axis': 'y',
+             'full_scale': 2, 'columns': ['gyro_counts']}
+    assert settings_from_parameters(parameter_values(PARAMETERS, given)) == Settings(
+        0.002, True, 'y', ('gyro_counts',), 2.0, False, None)
+    assert settings_from_parameters(parameter_values(PARAMETERS)) == Settings()
+
+
+# Messages
+
+
+def filled(sample, size=1):
+    messages = SampleMessages('my_gyro')
+    messages.variance = 1e-4
+    messages.fill(SampleMean(1_700_000_000.25, sample, size))
+    return messages
+
+
+def test_a_message_holds_the_rate_about_z_and_marks_what_is_not_measured():
+    """REP-145: element 0 is -1 for a quantity that is not reported; x and y get no weight."""
+    imu = filled(Sample(0.5)).imu
+    assert (imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z) == (
+        0.0, 0.0, 0.5)
+    assert imu.orientation_covariance[0] == imu.linear_acceleration_covariance[0] == -1.0
+    assert list(imu.angular_velocity_covariance) == [1e6, 0, 0, 0, 1e6, 0, 0, 0, 1e-4]
+    assert (imu.header.frame_id, imu.header.stamp.sec, imu.header.stamp.nanosec) == (
+        'my_gyro', 1_700_000_000, 250_000_000)
+    # ten samples have a tenth of the variance; the variance of a temperature is not known
+    messages = filled(Sample(0.5, -12.25, specific_force=9.81), 10)
+    assert messages.imu.angular_velocity_covariance[8] == pytest.approx(1e-5)
+    assert messages.temperature.header == messages.imu.header
+    assert (messages.temperature.temperature, messages.temperature.variance) == (-12.25, 0.0)
+    assert messages.imu.linear_acceleration.z == 9.81
+    assert list(messages.imu.linear_acceleration_covariance) == pytest.approx(
+        [1e6, 0, 0, 0, 1e6, 0, 0, 0, 0.01])
+    messages.fill(SampleMean(0.0, Sample(0.5), 1))
+    assert messages.imu.linear_acceleration.z == 0.0
+    assert list(messages.imu.linear_acceleration_covariance) == [-1.0, *8 * [0.0]]
+
+
+@pytest.mark.parametrize(('name', 'deviation'),
+                         [('kvh_dsp3000', 0.0111), ('kvh_1750', 0.0088), ('csv', 0.5)])
+def test_the_assumed_noise_is_that_of_the_data_sheet_or_half_a_degree_a_second(name, deviation):
+    assert math.sqrt(find_protocol(name).sample_variance(Settings())) == pytest.approx(
+        math.radians(deviation), rel=0.01)
+
+
+# Diagnostics
+
+
+def reported(world, protocol, given=None,
+             monitored=lambda report, chunk: report.add(chunk.samples)):
+    """Return the reports of a driver, one a second."""
+    given, reports = given or Settings(), []
+    connection = Connection('/dev/gyro', protocol, 0, given,
+                            lambda state: state.problem and report.clear(), world, world.port)
+    report = DriverReport(connection, '/dev/gyro*', given, world)
+    for second in range(1, 60):
+        world.at(second, lambda: reports.append(report.make()))
+    for chunk in connection.chunks(world):
+        monitored(report, chunk)
+    return reports
+
+
+def test_a_good_gyro_is_reported_with_all_its_figures_in_one_vocabulary():
+    world = World(10.0)
+    world.gyro('csv')
+    level, message, values = reported(world, 'csv')[-1]
+    assert (level, message) == (OK, 'samples come') and set(values) == {*KEYS, 'temperature_degc'}
+    assert all(re.fullmatch('[a-z0-9_]+', key) for key in values)
+    assert values | {'rate_hz': '100.0', 'port': '/dev/gyro*', 'device': '/dev/gyro',
+                     'state': 'reading', 'protocol': 'csv', 'baud': 115200, 'lost_samples': 0,
+                     'temperature_degc': '31.50', 'nominal_period_ms': '10',
+                     'reopened': 0} == values
+    assert (float(values['period_ms']) == pytest.approx(10.0, rel=1e-3)
+            and float(values['jitter_after_ms']) < 0.1)
+
+
+def test_a_lost_port_is_an_error_and_what_the_gyro_reported_is_dropped():
+    world = World(20.0)
+    world.gyro('csv')
+    world.at(5.5, world.unplug)
+    world.at(15.0, world.plug)
+    reports = reported(world, 'csv')
+    assert reports[3][0] == OK and 'temperature_degc' in reports[3][2]
+    level, message, values = reports[10]
+    assert (level == ERROR and 'does not exist' in message == values['last_error']
+            and 'temperature_degc' not in values)
+    assert (values['state'], values['waiting_s']) == ('failed', '3.2')
+    level, message, values = reports[-1]
+    assert (level == OK and values['reopened'] == 1 and float(values['longest_gap_s']) > 9.5
+            and 'does not exist' in values['last_error'])
+
+
+def test_losses_of_the_last_second_are_a_warning_with_their_counts():
+    world = World(10.0)
+    lines = {50: b'       0.015733   0\r\n', 60: b'     999.000000   1\r\n',
+             70: b'       0.015733   x\r\n'}
+    world.send(lines.get(number % 300, b'       0.015733   1\r\n') for number in itertools.count())
+    reports = reported(world, 'kvh_dsp3000')
+    bad = [message for level, message, _ in reports if level == WARN]
+    assert set(bad) == {
+        'samples come, but in the last second there were: lost samples 3, refused samples 1, '
+        'device faults 1, discarded bytes 19'}
+    assert ([level for level, _, _ in reports].count(OK) > 4
+            and reports[-1][2]['refused_samples'] == 4)
+
+
+def test_supply_and_source_current_are_reported_and_checked():
+    world, given = World(10.0), Settings(sensitivity=1e-6)
+    encode = find_protocol('fizoptika').encoder(given)
+    health = {'supply_v': 5.0, 'source_current_a': 0.05, 'diagnostic_v': 1.0}
+    world.send((encode(Sample(0.1, 24.0, sequence=number, health=health))
+                for number in itertools.count()), rate=1000.0)
+    level, message, values = reported(world, 'fizoptika', given)[-1]
+    assert (level == WARN and 'source_current_a is 0.05, but should be from 0.07 to 0.15: '
+            'check the supply' in message)
+    assert [float(values[name]) for name in health] == pytest.approx(
+        list(health.values()), rel=1e-3)
+    assert float(values['temperature_degc']) == pytest.approx(24.0, abs=0.1)
+
+
+@pytest.mark.parametrize(('given', 'is_warned'), [
+    (Settings(), True), (Settings(sample_rate=250.0), False), (Settings(increments=False), False)])
+def test_angles_by_another_rate_than_the_gyro_sends_are_warned_of(given, is_warned):
+    """The unit is set to 250 Hz, and the driver is not: its rates are 4 times too high."""
+    world = World(6.0)
+    world.gyro('kvh_1750', rate=250.0)
+    level, message, _ = reported(world, 'kvh_1750', given)[-1]
+    assert (level == WARN) == is_warned
+    assert ('250 samples per second, but angles are converted to rates by 1000: set sample_rate'
+            in message) == is_warned
+
+
+def test_steps_of_the_clock_are_counted():
+    world = World(5.0)
+    world.gyro('csv')
+    steps = iter([3600.0, -7200.0])
+    reports = reported(world, 'csv',
+                       monitored=lambda report, _: [report.add_clock_step(step) for step in steps])
+    _, _, values = reports[-1]
+    assert values['clock_steps'] == '2, last by -7200.0 s'
+    assert values['last_event'].startswith('the clock of this computer was set by -7200.0 s')
+
+
+def test_listening_is_a_warning_and_what_was_recognized_is_reported():
+    world = World(30.0, baud=find_protocol('minimu9').baud)
+    world.gyro('minimu9')
+    reports = reported(world, 'auto')
+    assert reports[0][:2] == (WARN, 'listening for a protocol')
+    assert (reports[-1][2]['protocol'] == 'minimu9'
+            and 'minimu9 explains' in reports[-1][2]['detected'])
+
+
+# As a robot runs it: its own process, a pseudo-terminal for the gyro, and DDS
+
 
 class Robot:
-    """A driver, and what it publishes."""
 
     def __init__(self, ros, start_node, wait_until, port, protocol, parameters):
+
         self._wait_until = wait_until
         self.rates = ros.collect(Imu, 'imu/data_raw')
         self.temperatures = ros.collect(Temperature, 'imu/temperature')
@@ -36,11 +231,9 @@ class Robot:
         self.node = start_node('driver_node', {'port': port, 'protocol': protocol, **parameters})
 
     def wait(self, condition, what):
-        """Wait until a condition is true."""
         self._wait_until(condition, 60.0, f'{what}; output:\n{self.node.output}')
 
     def reports(self, words, level):
-        """Wait until a diagnostic message with these words comes, and return its status."""
         def found():
             statuses = [array.status[0] for array in self.diagnostics]
             return [status for status in statuses
@@ -51,7 +244,6 @@ class Robot:
 
 @pytest.fixture
 def robot(ros, start_node, wait_until):
-    """Return a function of port, protocol and parameters that starts a driver."""
     def start(port, protocol='csv', **parameters):
         return Robot(ros, start_node, wait_until, port, protocol, parameters)
     return start

@@ -158,6 +158,9 @@ def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_examin
                    for number in range(600))
     fed(check, np.zeros(2000), begin=100.0)
     assert not check.examined_count and not check.noise_alarm
+    assert check.is_enabled
+    assert not HealthMonitor(Noise(), 0.001).is_enabled, 'without noise figures'
+    assert not HealthMonitor(MEMS, 0.0).is_enabled
 
 
 def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
@@ -173,11 +176,6 @@ def test_a_stretch_whose_samples_came_nearly_all_at_once_is_not_examined():
     time = np.append(np.linspace(0.0, 0.9, 490), np.linspace(1.5, STRETCH_DURATION, 10))
     output = 7e-4 * np.random.default_rng(21).standard_normal(len(time))
     assert examine_stretch(time, output, output, MEMS, 1e-3) is None
-
-
-def test_without_noise_figures_there_is_nothing_to_check():
-    assert (not HealthMonitor(Noise(), 0.001).is_enabled
-            and not HealthMonitor(MEMS, 0.0).is_enabled and HealthMonitor(MEMS, 0.001).is_enabled)
 
 
 def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():

@@ -62,7 +62,6 @@ class TestGraph(unittest.TestCase):
     """While the nodes run."""
 
     def setUp(self):
-        """Join their domain."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         self.context = rclpy.Context()
@@ -72,7 +71,6 @@ class TestGraph(unittest.TestCase):
         self.executor.add_node(self.node)
 
     def tearDown(self):
-        """Leave it."""
         self.executor.shutdown()
         self.node.destroy_node()
         self.context.shutdown()
@@ -120,7 +118,6 @@ class TestGraph(unittest.TestCase):
         assert self.spin_until(lambda: headings), 'no heading'
 
     def headings(self, topic):
-        """Return the list that the headings go to."""
         from geometry_msgs.msg import PoseWithCovarianceStamped
         from rclpy.qos import qos_profile_sensor_data
         headings = []

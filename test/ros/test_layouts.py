@@ -45,7 +45,6 @@ def field(message, names):
 
 
 def check_path(path):
-    """Check a message path of Foxglove."""
     topic = re.match(r'[\w/]+', path)[0]
     assert topic in TOPICS, path
     message = TOPICS[topic]()
@@ -64,18 +63,11 @@ def check_path(path):
 
 
 def paths():
-    """Return all message paths of the Foxglove layout."""
     found = []
     for config in FOXGLOVE['configById'].values():
         found += [series['value'] for series in config.get('paths', [])]
         found += [config[key] for key in ('topicPath', 'topicToRender') if key in config]
     return found
-
-
-def test_each_path_of_foxglove_exists():
-    for path in paths():
-        if not path.startswith('/studio_script/'):
-            check_path(path)
 
 
 def test_the_script_of_foxglove_reads_what_exists_and_gives_what_is_plotted():
@@ -92,13 +84,13 @@ def test_the_script_of_foxglove_reads_what_exists_and_gives_what_is_plotted():
     assert plotted == given
 
 
-def test_every_panel_of_foxglove_is_shown_once():
+def test_every_panel_of_foxglove_is_shown_once_with_paths_and_statuses_that_exist():
     def panels(node):
         return [node] if isinstance(node, str) else panels(node['first']) + panels(node['second'])
     assert sorted(panels(FOXGLOVE['layout'])) == sorted(FOXGLOVE['configById'])
-
-
-def test_the_status_panels_of_foxglove_name_a_status():
+    for path in paths():
+        if not path.startswith('/studio_script/'):
+            check_path(path)
     chosen = [config['selectedName']
               for config in FOXGLOVE['configById'].values() if 'selectedName' in config]
     assert chosen and set(chosen) <= STATUSES
@@ -122,20 +114,15 @@ def series_exists(name):
     assert isinstance(field(message, names), float)
 
 
-def test_each_series_of_plotjuggler_exists():
+def test_each_series_of_plotjuggler_exists_on_a_topic_that_it_subscribes_to():
     snippets = {snippet.get('name'): snippet for snippet in PLOTJUGGLER.iter('snippet')}
     curves = {curve.get('name') for curve in PLOTJUGGLER.iter('curve')}
     assert set(snippets) <= curves
-    sources = [element.text for snippet in snippets.values() for element in snippet.iter()
-               if element.tag == 'linked_source' or re.fullmatch(r'v\d', element.tag)]
-    for name in [*(curves - set(snippets)), *sources]:
-        series_exists(name)
-
-
-def test_plotjuggler_subscribes_to_what_it_shows():
+    shown = [*(curves - set(snippets)),
+             *(element.text for snippet in snippets.values() for element in snippet.iter()
+               if element.tag == 'linked_source' or re.fullmatch(r'v\d', element.tag))]
     topics = PLOTJUGGLER.find('.//selected_topics').get('value').split(';')
     assert set(topics) <= set(TOPICS)
-    shown = [element.text for element in PLOTJUGGLER.iter('linked_source')]
-    shown += [curve.get('name')
-              for curve in PLOTJUGGLER.iter('curve') if curve.get('name').startswith('/')]
-    assert all(any(name.startswith(f'{topic}/') for topic in topics) for name in shown)
+    for name in shown:
+        series_exists(name)
+        assert any(name.startswith(f'{topic}/') for topic in topics), name

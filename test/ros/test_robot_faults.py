@@ -41,9 +41,9 @@ HELD_UP = 'no sample came', 'this computer was busy'
 
 
 class Stage:
-    """A robot, and what is known of the node under test."""
 
     def __init__(self, ros, wait_until, start_node, folder):
+
         self.ros, self.wait_until, self._start_node, self._folder = (
             ros, wait_until, start_node, folder)
         self.samples, self.reports = ros.collect(Imu, 'imu/data'), []
@@ -52,7 +52,6 @@ class Stage:
         self.closing = []
 
     def robot(self, **how):
-        """Start the robot."""
         self.base = RosRobot(self.ros.node, Robot(noise=5e-3), **how)
         self.closing.append(self.base.close)
         return self.base
@@ -71,10 +70,7 @@ class Stage:
         return self.process
 
     def call(self, name='calibrate'):
-        """Call a service, and return the future of its answer."""
-        client = self.ros.node.create_client(Trigger, f'/compensation_node/{name}')
-        assert client.wait_for_service(30.0)
-        return client.call_async(Trigger.Request())
+        return self.ros.call(Trigger, f'/compensation_node/{name}')
 
     def is_held_up(self, message):
         """Tell whether a refusal is the fault of a busy machine, on which /clock comes late."""
@@ -96,7 +92,6 @@ class Stage:
         raise AssertionError('the machine held up five drives')
 
     def refused(self, answer, words, begin):
-        """Wait for the answer and for the zero, and check the reason."""
         self.wait_until(answer.done, 30.0, 'the answer')
         message = answer.result().message
         assert not answer.result().success
@@ -106,7 +101,6 @@ class Stage:
         return max(driven, default=begin) - begin
 
     def says(self, words):
-        """Wait until the diagnostics hold the words at the level ERROR."""
         self.wait_until(lambda: any(words in each.message and each.level == each.ERROR
                                     for each in list(self.reports)), 30.0, words)
 

@@ -11,13 +11,10 @@
 """The robot_localization example has the parameters of that program and the published topics."""
 
 import ast
-import math
 from pathlib import Path
 import re
 
-from gyro_calibration.logs.log import DEGREE
 import pytest
-from rig import INTERVAL, rested, Robot
 import yaml
 
 CONFIG = Path(__file__).parents[2] / 'config' / 'robot_localization.yaml'
@@ -30,34 +27,19 @@ OF_A_SENSOR = {'', '_config', '_queue_size', '_differential', '_relative',
                '_remove_gravitational_acceleration'}
 
 
-@pytest.fixture(name='parameters')
-def _parameters():
-    return yaml.safe_load(CONFIG.read_text())['ekf_filter_node']['ros__parameters']
-
-
 def fused(parameters, sensor):
-    """Return the names of what is fused of a sensor."""
     flags = parameters[f'{sensor}_config']
     assert len(flags) == len(STATE) and all(isinstance(flag, bool) for flag in flags)
     return [name for name, flag in zip(STATE, flags) if flag]
 
 
-def test_it_names_parameters_that_exist(parameters):
+def test_it_names_parameters_that_exist_and_fuses_one_thing_of_a_gyro_and_nothing_twice():
+    parameters = yaml.safe_load(CONFIG.read_text())['ekf_filter_node']['ros__parameters']
     known = PARAMETERS | {sensor + end for sensor in ('odom0', 'imu0') for end in OF_A_SENSOR}
     assert set(parameters) <= known and all(isinstance(parameters[name], float)
                                             for name in ('frequency', 'sensor_timeout'))
-
-
-def test_of_one_gyro_only_one_thing_is_fused_and_nothing_twice(parameters):
     assert parameters['imu0'] == 'imu/data' and parameters['two_d_mode'] is True
     assert fused(parameters, 'imu0') == ['vyaw'] and fused(parameters, 'odom0') == ['vx', 'vy']
-
-
-def test_the_launch_file_in_the_documentation_can_be_read():
-    page = (CONFIG.parents[1] / 'docs/how_to/nav2.md').read_text()
-    code = page.partition('```python\n')[2].partition('```')[0]
-    assert ('generate_launch_description' in compile(code, 'launch', 'exec').co_names
-            and CONFIG.name in code)
 
 
 def arguments_of(launch_file):
@@ -77,6 +59,9 @@ def test_the_launch_arguments_that_the_documents_name_are_those_of_the_launch_fi
     rows = [line.split('|')[1] for line in table.splitlines()[2:]]
     assert {name for row in rows for name in re.findall(r'`(\w+)`', row)} == declared
     other = (CONFIG.parents[1] / 'docs/how_to/nav2.md').read_text()
+    code = other.partition('```python\n')[2].partition('```')[0]
+    assert ('generate_launch_description' in compile(code, 'launch', 'exec').co_names
+            and CONFIG.name in code)
     used = set(re.findall(r"'(\w+)': '", other)) | set(re.findall(r'`(\w+):=', other))
     assert used <= declared
 
@@ -90,17 +75,3 @@ def test_the_launch_arguments_that_are_parameters_are_parameters_of_the_nodes():
                     if isinstance(each, ast.Assign) and each.targets[0].id == name)
         wanted = {value.elts[0].value for value in node.values}
         assert wanted <= {parameter.name for parameter in table}
-
-
-def test_what_is_fused_of_a_turn_is_as_good_as_the_node_claims(parameters, tmp_path):
-    """A filter for one state, the yaw, that takes the rates with their variances as they come."""
-    assert fused(parameters, 'imu0') == ['vyaw']
-    rig = rested(tmp_path, robot=Robot(scale_factor_error=0.02, bias=0.3 * DEGREE))
-    begin = len(rig.outputs) - 1
-    rig.robot.command(0.5)
-    rig.go(10.0)
-    rates = rig.outputs[begin:]
-    yaw = sum(each.rate for each in rates[1:]) * INTERVAL
-    truth = rig.truth[rates[-1].stamp] - rig.truth[rates[0].stamp]
-    systematic = sum(math.sqrt(each.rate_variance) for each in rates[1:]) * INTERVAL
-    assert abs(yaw - truth) < systematic and all(each.rate_variance > 0.0 for each in rates)

@@ -22,7 +22,6 @@ SOAK = Path(__file__).parents[2] / 'benchmarks' / 'soak.py'
 
 
 def soaked(*words):
-    """Return what the soak found."""
     command = [sys.executable, SOAK, '--json', *words]
     result = subprocess.run(command, capture_output=True, text=True, timeout=4000, check=False)
     assert result.returncode == 0, result.stderr

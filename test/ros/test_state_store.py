@@ -8,14 +8,25 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The state files of a robot: what is read and kept, and reports on damaged or foreign files."""
+"""The state files of a robot: what is read, kept and reported, through kills and a full disk."""
 
+import json
+import os
+from pathlib import Path
+import resource
+import subprocess
+import sys
 import threading
+from types import SimpleNamespace
 
+from gyro_calibration.files import open_replacement, remove_leftovers, write_atomically
 from gyro_calibration.heading.bias_table import MIN_WRITE_INTERVAL, Prior
 from gyro_calibration.model.gyro_model import SelfCalibration
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.state_store import StateStore
 import pytest
+from rig import rested
 
 NOW = 1.7e9
 
@@ -37,14 +48,10 @@ def taught(memory, temperature=25.0):
     return memory.table.add(temperature, 0.001, 1e-9, NOW)
 
 
-def test_nothing_stored_is_an_empty_model_and_no_trouble(remember):
+def test_what_is_kept_is_there_after_a_restart(remember):
     memory = remember()
     assert memory.model.self_calibration is None and not memory.table.entries
     assert memory.problem == memory.calibration_hint == memory.table_hint == ''
-
-
-def test_what_is_kept_is_there_after_a_restart(remember):
-    memory = remember()
     assert memory.store_calibration(SelfCalibration(0.01, 0.002)) == ''
     taught(memory)
     memory.store_table(NOW, is_final=True)
@@ -86,25 +93,22 @@ def test_a_folder_that_cannot_be_written_to_is_reported_and_not_tried_each_secon
     assert not memory.table.is_write_due(NOW + 1.0) and 'NOT STORED' not in memory.calibration_hint
 
 
-def test_a_calibration_behind_another_model_is_not_used(remember):
-    memory = remember(
-        'effects: {bias: {bias: 0.1}}',
-        calibration='effects: {}\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}')
-    assert (memory.model.self_calibration is None
-            and 'belongs to another model' in memory.calibration_hint)
+SEVEN, EIGHT = (f'gyro: {{serial_number: "{number}"}}' for number in '78')
+ONE, OTHER = 'effects: {}\n', 'effects: {bias: {bias: 0.1}}\n'
 
 
-@pytest.mark.parametrize('of_model, of_calibration, used',
-                         [('7', '7', True), ('7', '8', False), ('7', '', False), ('', '8', False)])
-def test_a_calibration_of_another_gyro_is_not_used(remember, of_model, of_calibration, used):
-    model, calibration = (f'effects: {{}}\ngyro: {{serial_number: "{number}"}}\n' if number
-                          else 'effects: {}\n' for number in (of_model, of_calibration))
+@pytest.mark.parametrize('model, calibration, hint', [
+    (ONE + SEVEN, ONE + SEVEN, ''),
+    (ONE + SEVEN, ONE + EIGHT, 'and the model to 7; calibrate again'),
+    (ONE + SEVEN, ONE, 'and the model to 7; calibrate again'),
+    (ONE, ONE + EIGHT, 'and the model to one without; calibrate again'),
+    (OTHER, ONE, 'belongs to another model')])
+def test_a_calibration_of_another_gyro_or_model_is_not_used(remember, model, calibration, hint):
     memory = remember(
         model,
-        calibration=f'{calibration}self_calibration: {{scale_factor_error: 0.2, bias: 0.3}}')
-    assert (memory.model.self_calibration is not None) == used == (memory.calibration_hint == '')
-    assert (used or f'and the model to {of_model or "one without"}; calibrate again'
-            in memory.calibration_hint)
+        calibration=f'{calibration}\nself_calibration: {{scale_factor_error: 0.2, bias: 0.3}}')
+    assert (memory.model.self_calibration is None) == bool(hint) == bool(memory.calibration_hint)
+    assert hint in memory.calibration_hint
 
 
 def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path):
@@ -151,3 +155,104 @@ def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_lost_repo
     for writer in writers:
         writer.join()
     assert unknown == 0
+
+
+# Kills and a full disk
+
+
+@pytest.mark.parametrize('kills', [60, pytest.param(500, marks=pytest.mark.evidence)])
+def test_kills_leave_the_old_files_or_the_new_ones(tmp_path, kills):
+    """A process writes what the node writes, with the same code."""
+    command = [sys.executable, Path(__file__).parents[1] / 'killed_writer.py', tmp_path,
+               str(kills)]
+    found = json.loads(
+        subprocess.run(command, check=True, capture_output=True, timeout=300).stdout)
+    assert found['torn'] == 0 and found['hints'] == ''
+    assert min(*found['old'], *found['new'], found['half_written']) > kills / 50, (
+        f'kills too early or too late: {found}')
+    assert found['left'] == ['biases.yaml', 'calibration.yaml']
+
+
+def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_is_not(tmp_path):
+    path = tmp_path / 'model.yaml'
+    (tmp_path / '.model.yaml.abcd1234').write_text('half')
+    (tmp_path / '.model.yaml.swp').write_text('of an editor')
+    (tmp_path / '.other.yaml.abcd1234').write_text('of another file')
+    with open_replacement(path) as file:
+        file.write(b'new')
+        write_atomically(path, b'of another process, in between')
+        remove_leftovers(path)
+    assert path.read_bytes() == b'new'
+    assert sorted(os.listdir(tmp_path)) == ['.model.yaml.swp', '.other.yaml.abcd1234',
+                                            'model.yaml']
+
+
+class Disk:
+    """A small disk that can be filled, or, without one, a limit to the files of a process."""
+
+    def __init__(self, folder):
+        self.folder, self.process = folder, None
+        self.is_mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs',
+                                          folder], capture_output=True).returncode == 0
+
+    def fill(self):
+        if not self.is_mounted:
+            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+            return
+        with open(self.folder / 'ballast', 'wb', buffering=0) as file:
+            try:
+                while True:
+                    file.write(bytes(256))
+            except OSError:
+                pass
+
+    def free(self):
+        if self.is_mounted:
+            (self.folder / 'ballast').unlink()
+        else:
+            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE,
+                             (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+
+
+@pytest.fixture
+def disk(tmp_path):
+    folder = tmp_path / 'disk'
+    folder.mkdir()
+    disk = Disk(folder)
+    if not disk.is_mounted and not hasattr(resource, 'prlimit'):
+        pytest.skip('a disk can be filled neither by mounting a small one (that takes root) nor '
+                    'by prlimit (Linux has it)')
+    yield disk
+    if disk.is_mounted:
+        subprocess.run(['umount', '-l', folder], check=True)
+
+
+def test_on_a_full_disk_the_calibration_is_used_and_written_when_there_is_room(disk, tmp_path):
+    """As the node does it, in this process."""
+    disk.process = SimpleNamespace(pid=os.getpid())
+    calibration, biases = disk.folder / 'calibration.yaml', disk.folder / 'calibration_biases.yaml'
+    rig = rested(tmp_path, calibration_file=calibration)
+
+    def calibrated(bias):
+        rig.robot.bias = bias
+        return rig.calibrate(REST)
+    assert calibrated(0.01)[0]
+    old = calibration.read_bytes()
+    disk.fill()
+    success, message = calibrated(0.02)
+    assert success and 'NOT STORED' in message and f'make room in {disk.folder}' in message
+    assert rig.pipeline.store.calibration_hint.startswith(
+        'the calibration is in use but NOT STORED')
+    for _ in range(3000):  # rests, with a temperature, teach the table of biases
+        rig.pipeline.add_temperature(max(rig.truth), 25.0)
+        rig.step()
+    rig.pipeline.run_periodic_tasks(is_final=True)
+    assert 'cannot be written' in rig.pipeline.store.table_hint
+    assert calibration.read_bytes() == old and not biases.exists()
+    left = ['calibration.yaml'] + ['ballast'] * disk.is_mounted
+    assert sorted(os.listdir(disk.folder)) == sorted(left)
+    disk.free()
+    assert calibrated(0.03)[0] and calibration.read_bytes() != old
+    assert read_model(calibration).self_calibration.bias == pytest.approx(0.03, abs=1e-4)
+    rig.pipeline.run_periodic_tasks(is_final=True)
+    assert biases.exists(), 'what could not be written is written at the end at the latest'

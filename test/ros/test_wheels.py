@@ -23,66 +23,49 @@ from gyro_calibration.ros.wheels import (
 import pytest
 
 
-def velocity(ahead=0.0, turning=0.0):
-    return Velocity((ahead, 0.0, 0.0), (0.0, 0.0, turning))
+def wheels(*received):
+    """Return wheels of which came: source, velocity ahead, yaw rate, time."""
+    made = Wheels()
+    for source, ahead, turning, time in received:
+        made.add(source, Velocity((ahead, 0.0, 0.0), (0.0, 0.0, turning)), time)
+    return made
 
 
-@pytest.fixture
-def wheels():
-    return Wheels()
+OLD = 10.0 + MAX_VELOCITY_AGE
+STOPPED = (COMMAND, 1.0, 0.0, 10.0), (COMMAND, 0.0, 0.0, 10.1)
+CASES = {  # what was received, when it is asked, whether the robot moves
+    'nothing': ([], 10.0, None),
+    'zero': ([(ODOMETRY, 0.0, 0.0, 10.0)], 10.5, False),
+    'below the limits': ([(ODOMETRY, 9e-4, 1e-4, 10.0)], 10.5, False),
+    'back': ([(ODOMETRY, -0.01, 0.0, 10.0)], 10.5, True),
+    '0.05 deg/s': ([(ODOMETRY, 0.0, -9e-4, 10.0)], 10.5, True),
+    'a second old': ([(ODOMETRY, 1.0, 0.3, 10.0)], OLD, True),
+    'older': ([(ODOMETRY, 1.0, 0.3, 10.0)], OLD + 0.01, None),
+    'one of two': ([(ODOMETRY, 0.0, 0.0, 10.0), (COMMAND, 1.0, 0.0, 10.0)], 10.1, True),
+    'an old one of two': ([(COMMAND, 1.0, 0.0, 10.0), (ODOMETRY, 0.0, 0.0, 11.5)], 11.6, False),
+    'coasting after the last command to move': (STOPPED, 10.0 + 0.9 * COASTING_DURATION, True),
+    'no longer': (STOPPED, 10.01 + COASTING_DURATION, False),
+    'odometry, which shows coasting itself': (
+        [(ODOMETRY, 1.0, 0.0, 10.0), (ODOMETRY, 0.0, 0.0, 10.1)], 10.2, False),
+    'not a number': ([(ODOMETRY, math.nan, 0.0, 10.0)], 10.1, None),
+    'infinite': ([(ODOMETRY, math.inf, 0.0, 10.0)], 10.1, None),
+    'finite before': ([(ODOMETRY, 1.0, 0.0, 10.0), (ODOMETRY, 0.0, math.nan, 10.1)], 10.2, True),
+}
 
 
-def test_nothing_received_shows_nothing(wheels):
-    assert wheels.is_moving(10.0) is None and wheels.age(10.0) == math.inf
-    assert wheels.turn_rate(10.0) == 0.0
+@pytest.mark.parametrize('received, now, moving', CASES.values(), ids=CASES)
+def test_velocities_of_the_last_second_show_whether_the_robot_moves(received, now, moving):
+    assert wheels(*received).is_moving(now) is moving
 
 
-@pytest.mark.parametrize('given, moving', [(velocity(), False), (velocity(0.0009, 0.0001), False),
-                                           (velocity(-0.01), True), (velocity(0.0, -9e-4), True)],
-                         ids=['zero', 'below the limits', 'back', '0.05 deg/s'])
-def test_a_velocity_beyond_small_limits_is_motion(wheels, given, moving):
-    wheels.add(ODOMETRY, given, 10.0)
-    assert wheels.is_moving(10.5) is moving and wheels.age(10.5) == 0.5
+def test_age_and_yaw_rate_are_those_of_the_last_second():
+    turning = wheels((ODOMETRY, 1.0, 0.3, 10.0), (ODOMETRY, 0.0, math.inf, 10.3))
+    assert turning.age(10.5) == 0.5 and turning.turn_rate(OLD) == 0.3
+    assert turning.turn_rate(OLD + 0.01) == 0.0
+    assert wheels().age(10.0) == math.inf and wheels().turn_rate(10.0) == 0.0
 
 
-def test_what_is_older_than_a_second_shows_nothing(wheels):
-    wheels.add(ODOMETRY, velocity(1.0, 0.3), 10.0)
-    assert (wheels.is_moving(10.0 + MAX_VELOCITY_AGE) is True
-            and wheels.turn_rate(10.0 + MAX_VELOCITY_AGE) == 0.3)
-    assert (wheels.is_moving(10.01 + MAX_VELOCITY_AGE) is None
-            and wheels.turn_rate(10.01 + MAX_VELOCITY_AGE) == 0.0)
-
-
-def test_one_source_that_moves_is_enough_and_an_old_one_does_not_count(wheels):
-    wheels.add(ODOMETRY, velocity(), 10.0)
-    wheels.add(COMMAND, velocity(1.0), 10.0)
-    assert wheels.is_moving(10.1) is True
-    wheels.add(ODOMETRY, velocity(), 11.5)
-    assert wheels.is_moving(11.6) is False
-
-
-def test_only_the_sources_that_are_asked_count(wheels):
-    wheels.add(ODOMETRY, velocity(), 10.0)
-    wheels.add(COMMAND, velocity(1.0), 10.0)
-    assert (wheels.is_moving(10.1, (ODOMETRY,)) is False
-            and wheels.is_moving(10.1, (COMMAND,)) is True)
-    assert wheels.is_moving(10.1, ()) is None
-
-
-def test_a_robot_coasts_after_its_last_command_to_move(wheels):
-    wheels.add(COMMAND, velocity(1.0), 10.0)
-    wheels.add(COMMAND, velocity(), 10.1)
-    assert wheels.is_moving(10.0 + 0.9 * COASTING_DURATION) is True
-    assert wheels.is_moving(10.01 + COASTING_DURATION) is False
-    wheels.add(ODOMETRY, velocity(1.0), 20.0)
-    wheels.add(ODOMETRY, velocity(), 20.1)
-    assert wheels.is_moving(20.2) is False, 'odometry shows coasting itself'
-
-
-@pytest.mark.parametrize('value', [math.nan, math.inf])
-def test_a_velocity_that_is_not_finite_shows_nothing(wheels, value):
-    wheels.add(ODOMETRY, velocity(value), 10.0)
-    assert wheels.is_moving(10.1) is None
-    wheels.add(ODOMETRY, velocity(1.0), 10.2)
-    wheels.add(ODOMETRY, velocity(0.0, value), 10.3)
-    assert wheels.is_moving(10.4) is True and wheels.age(10.4) == pytest.approx(0.2)
+def test_only_the_sources_that_are_asked_count():
+    both = wheels((ODOMETRY, 0.0, 0.0, 10.0), (COMMAND, 1.0, 0.0, 10.0))
+    assert both.is_moving(10.1, (ODOMETRY,)) is False and both.is_moving(10.1, (COMMAND,)) is True
+    assert both.is_moving(10.1, ()) is None
