@@ -70,6 +70,8 @@ from scipy import stats
 
 #: The gyro's white noise that is possible, rad/√s, and cosines for the wander of its bias.
 _WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
+#: References on each side of a hole that the residual is continued by.
+_HOLE_EDGE = 15
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
 MIN_DWELLS = 3
 
@@ -402,8 +404,9 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidu
     error = np.interp(motion.time, time, integrate(time, rate)) - motion.heading
     for begin, end in _find_holes(time):  # the gyro's heading begins anew after it
         after = motion.time >= 0.5 * (begin + end)
-        if after.any() and not after.all():
-            error[after] -= error[after][0] - error[~after][-1]
+        if after.any() and not after.all():  # by medians, as single references may be wrong
+            error[after] -= np.median(error[after][:_HOLE_EDGE]) - np.median(
+                error[~after][-_HOLE_EDGE:])
     return HeadingResidual(error - error.mean())
 
 
