@@ -340,7 +340,8 @@ NO_TURNS = {
     'a bias that moves': ((CLOCK, TURNED + np.where(CLOCK > 15.0, 0.02, 0.0)), 2,
                           'rests before and after'),
     'dead': ((CLOCK, B + 0.0 * TURNED), 2, 'same value'),
-    'no motion': ((CLOCK, -S * TURNED + 1e-3 * np.sin(97.0 * CLOCK)), 2, 'check that the robot moved'),
+    'no motion': ((CLOCK, -S * TURNED + 1e-3 * np.sin(97.0 * CLOCK)), 2,
+                  'check that the robot moved'),
 }
 
 
