@@ -37,6 +37,7 @@ from gyro_calibration.diagnosis.expected_output import (
     identify_unit_factor,
     integrate_trapezoidal,
     is_implausible_factor,
+    MAX_GYRO_RATIO,
     model_scale_factor,
     reference_rate,
     UNIT_FACTORS,
@@ -361,17 +362,23 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     half = NORMAL_QUANTILE_975 * deviation
     known = (factor, (factor - half, factor + half))
     name = identify_unit_factor(factor, deviation)
-    slower, interval = 10.0 ** round(math.log10(abs(factor))), float(np.median(np.diff(log.time)))
+    power, interval = round(math.log10(abs(factor))), float(np.median(np.diff(log.time)))
+    slower = 10.0 ** power
+    correct_gyro = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
+                    '--sensitivity)')
     if name == '-1' or name is None and not is_implausible_factor(-factor):
         yield Gate('sense', False, f'{evidence}: the two count in opposite senses',
                    'give --invert, or change the sign of the column of the gyro', known)
-    elif (name is None and slower != 1.0 and abs(abs(factor) / slower - 1.0) < 0.3
-            and log.reference_rate is None
+    elif (name is None and power and log.reference_rate is None
+            and 1.0 / MAX_GYRO_RATIO < abs(factor) / slower < MAX_GYRO_RATIO
             and _SAMPLE_INTERVAL_RANGE[0] < interval / slower < _SAMPLE_INTERVAL_RANGE[1]):
-        yield Gate('time_unit', False, f'{evidence}: the stamps run {slower:g} times too fast, '
-                   f'{interval:.4g} s between samples where {interval / slower:.4g} s would agree',
+        yield Gate('time_unit', False, f'{evidence}, as if the stamps ran {slower:g} times too '
+                   f'fast, {interval:.4g} s between samples where {interval / slower:.4g} s would '
+                   'agree',
                    f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
-                   + ' (the stamps are in ms)' * (slower == 1e3), known)
+                   + ' (the stamps are in ms)' * (slower == 1e3)
+                   # units of time differ by powers of 1000
+                   + f'; or, if they are right, {correct_gyro}' * (power % 3 != 0), known)
     elif name is not None and '180' in name:
         fastest = float(np.nanquantile(np.abs(log.output), 0.99)) / DEGREE
         either = log.reference_heading is not None and 0.1 <= fastest <= 4000.0
@@ -381,8 +388,8 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     else:
         meaning = (', which is not plausible for a gyro' if name is None
                    else f', and {name} is {UNIT_FACTORS[name]:.5g}')
-        yield Gate('unit', False, evidence + meaning, 'correct the unit or the range of the gyro '
-                   '(gyro_dps, gyro_rad_s, --sensitivity), or that of the reference', known)
+        yield Gate('unit', False, evidence + meaning,
+                   f'{correct_gyro}, or that of the reference', known)
 
 
 def reference_angle(log: Log) -> Array:
@@ -452,7 +459,7 @@ def _regress_changes(gyro: Array, steps: Array, change: Array) -> Agreement:
 _GATE_SENTENCES = {
     'sense': 'Gyro and reference count in opposite senses.',
     'unit': 'Gyro and reference have different units.',
-    'time_unit': 'The stamps are in another unit of time.',
+    'time_unit': 'Gyro and reference differ by a power of ten, as with another unit of time.',
     'wrapped_heading': 'The reference heading is wrapped.',
     'motion': 'The reference shows another motion than the gyro, or the axis of the gyro tilts.',
     'model': 'The model has other units than the log, or belongs to another gyro.'}

@@ -54,6 +54,7 @@ WRONG = {
     'heading in deg': lambda log: replace(log, reference_heading=log.reference_heading / DEGREE),
     'heading in rad': lambda log: replace(log, reference_heading=log.reference_heading * DEGREE),
     'factor 2': lambda log: replace(log, output=2.0 * log.output),
+    'factor 8.5': lambda log: replace(log, output=8.5 * log.output),
     'factor 1e12': lambda log: replace(log, output=1e12 * log.output),
     'stamps in ms': lambda log: replace(log, time=1e3 * log.time),
     'stamps ten times too slow': lambda log: replace(log, time=10.0 * log.time),
@@ -82,6 +83,13 @@ def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
     assert finding.remedy in ' '.join(' '.join(terminal_lines(found)).split())
     with pytest.raises(DataRefused, match=re.escape(finding.remedy)):
         fit(log)
+
+
+@pytest.mark.parametrize('wrong, power, gyro', [
+    ('stamps ten times too slow', 10, True), ('stamps in ms', 1000, False)])
+def test_a_power_of_ten_below_a_thousand_may_also_be_a_factor_of_the_gyro(wrong, power, gyro):
+    remedy = check_gates(WRONG[wrong](drive()))[-1].remedy
+    assert f'divide time_s by {power}' in remedy and ('--sensitivity' in remedy) == gyro
 
 
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])
