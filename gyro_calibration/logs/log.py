@@ -485,7 +485,8 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
 
     Where the reference was lost or is slow, it may turn by more than half a turn from one value to
     the next. The integral of the gyro then gives the number of turns. Its sign and bias against
-    the reference are estimated from the values that lie close together.
+    the reference are estimated from the values that lie close together. A heading in deg instead
+    of rad is left as it is, as its unit is to be corrected first.
 
     Parameters
     ----------
@@ -500,6 +501,8 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
     if known.sum() < 2:
         return heading, False
+    if _is_in_degrees(reference_time[known], wrapped[known], time, np.nan_to_num(output)):
+        return wrapped, False
     plainly = np.unwrap(wrapped[known])
     expected, _ = _heading_by_gyro(reference_time[known], plainly, time, np.nan_to_num(output))
     heading[known] = expected + np.unwrap(wrapped[known] - expected)
@@ -522,11 +525,19 @@ def _heading_by_gyro(reference_time: Array, heading: Array, time: Array,
     return sign * turned + bias * reference_time, factor
 
 
+def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: Array) -> bool:
+    """Tell whether a heading exceeds a turn and, by the gyro, is in deg instead of rad."""
+    _, factor = _heading_by_gyro(reference_time, heading, time, output)
+    return (float(np.ptp(heading)) > (1.0 + _FULL_TURN_MARGIN) * 2.0 * math.pi
+            and 1.0 / 1.4 < DEGREE * abs(factor) < 1.4)
+
+
 def refuse_wrapped(log: Log) -> None:
     """
     Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped.
 
-    Over a gap of the reference, a jump is a full turn that the gyro does not show.
+    Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
+    heading in deg instead of rad are none.
 
     """
     if log.time is None or log.reference_heading is None:
@@ -537,7 +548,8 @@ def refuse_wrapped(log: Log) -> None:
     # vehicles do not turn faster than 35 rad/s
     jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time))
                            | _turns_without_gyro(log, known))
-    if len(jumps):
+    if len(jumps) and not (log.output is not None and _is_in_degrees(
+            time, log.reference_heading[known], log.time, np.nan_to_num(log.output))):
         first, last = known[jumps[0]], known[jumps[0] + 1]
         where = ('from one sample to the next, the first time at' if last == first + 1 else
                  'that the gyro does not show, first in the gap that ends at')

@@ -17,7 +17,7 @@ from gyro_calibration import fit
 from gyro_calibration.diagnosis.gates import check_gates
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, unwrap_heading
 import numpy as np
 import pytest
 
@@ -83,6 +83,16 @@ def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
     assert finding.remedy in ' '.join(' '.join(terminal_lines(found)).split())
     with pytest.raises(DataRefused, match=re.escape(finding.remedy)):
         fit(log)
+
+
+@pytest.mark.parametrize('wrap', [lambda heading: heading, lambda heading: heading % 360.0],
+                         ids=['continuous', 'wrapped'])
+def test_fixes_in_deg_that_are_named_rad_have_another_unit_and_are_not_wrapped(wrap):
+    log = drive(heading_noise=1.0 * DEGREE)
+    degrees = np.where(np.arange(len(TIME)) % 25, np.nan, wrap(log.reference_heading / DEGREE))
+    for heading in (degrees, unwrap_heading(TIME, degrees, TIME, log.output)[0]):
+        failed = check_gates(replace(log, reference_heading=heading))[-1]
+        assert failed.name == 'unit' and 'deg or rad' in failed.remedy, failed.evidence
 
 
 @pytest.mark.parametrize('wrong, power, gyro', [
