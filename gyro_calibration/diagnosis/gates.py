@@ -324,22 +324,40 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
         yield Gate('motion', None, 'the reference turns too little to compare it with the gyro')
         return
     best = max(by_length, key=lambda each: each.coherence)
-    yield _motion_gate(best, by_length, float(np.ptp(reference)), log)
-    if best.coherence > _MIN_UNIT_COHERENCE:
-        own = 1.0 if model is None else model_scale_factor(model, np.gradient(reference, log.time))
-        # a model with other units is refused by `check_model_units`
-        scale = best.factor * (own if 0.1 < abs(own) < 10.0 else 1.0)
-        yield from _unit_gates(1.0 / scale, best.deviation / abs(best.factor * scale), log)
+    if best.coherence < _MIN_MOTION_COHERENCE:
+        yield _motion_gate(best, by_length, float(np.ptp(reference)), log)
+        return
+    own = 1.0 if model is None else model_scale_factor(model, np.gradient(reference, log.time))
+    # a model with other units is refused by `check_model_units`
+    scale = best.factor * (own if 0.1 < abs(own) < 10.0 else 1.0)
+    relative = best.deviation / abs(best.factor)
+    is_certain, unit = best.coherence > _MIN_UNIT_COHERENCE, (1.0 / scale, relative / abs(scale))
+    is_excluded = is_implausible_factor(_nearest_scale(scale, relative, best.coherence))
+    unit_gates = [*_unit_gates(*unit, log)]
+    is_other_axis = (is_excluded and not is_certain and unit_gates[-1].name == 'unit'
+                     and identify_unit_factor(*unit) is None)
+    yield _motion_gate(best, by_length, float(np.ptp(reference)), log,
+                       is_other_axis * f', where the output is {1.0 / scale:.2g} times the '
+                       'reference')
+    if is_certain or is_excluded and not is_other_axis:
+        yield from unit_gates
+
+
+def _nearest_scale(scale: float, relative_deviation: float, coherence: float) -> float:
+    """Return the scale nearest to 1 that is not excluded; noise of the gyro reduces it."""
+    half = NORMAL_QUANTILE_975 * relative_deviation
+    return math.copysign(min(max(1.0, abs(scale) * (1.0 - half)),
+                             abs(scale) * (1.0 + half) / coherence), scale)
 
 
 def _motion_gate(best: Agreement, by_length: Sequence[Agreement], turned_angle: float,
-                 log: Log) -> Gate:
+                 log: Log, other_axis: str = '') -> Gate:
     evidence = (f'{100.0 * best.coherence:.3g} % of the variance of the heading over spans is '
-                'common to gyro and reference')
+                f'common to gyro and reference{other_axis}')
     longest = by_length[-1]
     if best.coherence - longest.coherence > 0.5 * _MIN_MOTION_COHERENCE:
         evidence += f', and {100.0 * longest.coherence:.2g} % over the longest ones'
-    elif best.coherence >= _MIN_MOTION_COHERENCE:
+    elif best.coherence >= _MIN_MOTION_COHERENCE and not other_axis:
         return Gate('motion', True, evidence)
     if longest.residual < _MIN_HEADING_DIFFERENCE or turned_angle < _MIN_TURNED_ANGLE:
         return Gate('motion', best.coherence >= _MIN_MOTION_COHERENCE or None,

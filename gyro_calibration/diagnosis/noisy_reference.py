@@ -384,6 +384,8 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
         elif plain.scale_held and _follows_the_rate(name):
             reason = ('fewer than three stretches turn, which do not distinguish it from a scale '
                       'factor error')
+        elif name == 'reference_once_per_rev':
+            reason = 'a course over ground has no shaft'
         else:
             reason = 'the errors of the reference hide it over short spans'
         shown[name] = reason
@@ -477,7 +479,8 @@ def _all_terms(done: SpanFit) -> Iterator[CauseTerm]:
     log, fine, time = done.spans.log, done.spans.treatment.is_fine, done.spans.time
     duration = float(time[-1] - time[0])
     for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
-                 'rate_ramp', 'heading_sensitivity', 'reference_once_per_rev'):
+                 'rate_ramp', 'heading_sensitivity',
+                 *(['reference_once_per_rev'] if fine else [])):
         yield CauseTerm(name)
     for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist():
         yield CauseTerm('warm_up', (constant,))
@@ -543,6 +546,9 @@ def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
     """Return the ratio of an effect to the largest plausible one; inf if it may be 0."""
     places = fit.value_slice(cause)
     values = fit.values[places]
+    if cause.cause == 'reference_once_per_rev':
+        # from 1 on, the reference would turn back
+        return float(np.hypot(*values))
     if len(values) == 1 and abs(values[0]) < fit.half_width(places.start):
         return math.inf
     if CAUSES[cause.cause].along != 'rate' or cause.cause not in CATALOGUE:

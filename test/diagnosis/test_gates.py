@@ -102,6 +102,28 @@ def test_a_power_of_ten_below_a_thousand_may_also_be_a_factor_of_the_gyro(wrong,
     assert f'divide time_s by {power}' in remedy and ('--sensitivity' in remedy) == gyro
 
 
+def tilted(seed, noise):
+    """Return a log of an axis that sees 15 % of the turns, and noise of its own."""
+    generator, log = np.random.default_rng(seed), drive(seed)
+    vibration = np.repeat(generator.standard_normal(len(TIME) // 10), 10)
+    return replace(log, output=0.15 * MOTION + noise * vibration)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_an_axis_that_follows_in_part_by_another_factor_is_another_motion(seed):
+    # half of the variance is common, which alone passes as the noise of a reference
+    gate, = (each for each in check_gates(tilted(seed, 0.2)) if each.passed is False)
+    assert gate.name == 'motion' and 'the output is 0.' in gate.evidence, gate
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_noisy_gyro_of_the_right_factor_passes(seed):
+    log = tilted(seed, 0.0)
+    noisy = replace(log, output=log.output / 0.15 + 2.0 * np.repeat(
+        np.random.default_rng(seed).standard_normal(len(TIME) // 10), 10))
+    assert not [gate for gate in check_gates(noisy) if gate.passed is False]
+
+
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])
 def test_a_gyro_that_follows_passes_all_gates(noise):
     assert all(gate.passed for gate in check_gates(drive(1, noise)))
