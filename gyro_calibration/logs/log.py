@@ -75,6 +75,7 @@ _MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 20, 1 <<
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
 
+_ROS_1_MAGIC = b'#ROSBAG V2.0'
 #: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
 _MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading')
@@ -201,6 +202,10 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig',
                 newline='') as text:
+        if file.peek(len(_ROS_1_MAGIC)).startswith(_ROS_1_MAGIC):
+            raise LogError(f'{path}: is a recording of ROS 1; wanted a log file or a ROS 2 '
+                           'recording: convert it, by pip install rosbags and '
+                           f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
         table, first_line = _read_header(path, _limit_length(lines, _MAX_HEADER_LENGTH), columns,
                                          axis)
