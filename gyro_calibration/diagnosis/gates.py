@@ -27,6 +27,7 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwell_search import (
+    few_values_remedy,
     find_lost_reference,
     interpolate_reference,
     require_output,
@@ -190,11 +191,11 @@ def _log_problems(log: Log) -> Iterator[str]:
             yield ('the log has no reference, and the gyro is not at rest: add reference_rate_dps '
                    'or reference_heading_deg, or let it rest, and add a column moving of zeros')
         covered = np.count_nonzero(known & ~find_lost_reference(has_reference))
-        if reference is not None and (both < MIN_SAMPLES
-                                      or covered < MIN_VALID_SHARE * len(known)):
+        is_lost = bool(covered < MIN_VALID_SHARE * len(known))
+        if reference is not None and (both < MIN_SAMPLES or is_lost):
             yield (f'the reference has a value in {both} of {len(known)} samples; at least '
-                   f'{MIN_SAMPLES} and a tenth are needed, or one at even intervals: repair its '
-                   'line and record again')
+                   f'{MIN_SAMPLES}{", and a tenth or at even intervals," * is_lost} are needed: '
+                   f'{few_values_remedy(log.time, known & has_reference, MIN_SAMPLES)}')
     values, counts = np.unique(log.output[known], return_counts=True)
     share = counts.max() / counts.sum()
     if share > 0.99:

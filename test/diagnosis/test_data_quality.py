@@ -448,7 +448,11 @@ REFUSED = {
     'lost gyro': (replace(GOOD, output=GOOD.output * NAN), None,
                   'the gyro has a value in 50 of 6000'),
     'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN), None,
-                       'the reference has a value in 50 of 6000'),
+                       'the reference has a value in 50 of 6000 samples; at least 100, and a '
+                       'tenth or at even intervals, are needed: repair its line'),
+    'few fixes': (Log(output=GOOD.output, time=GOOD.time, reference_heading=np.where(
+        np.arange(6000) % 100, np.nan, np.cumsum(GOOD.reference_rate) * INTERVAL)), None,
+        'in 60 of 6000 samples; at least 100 are needed: record longer, 99 s'),
     'few rows': (Log(output=GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None,
                  '5 rows'),
     'model in deg/s': (GOOD, OTHER_UNITS, 'other units'),
