@@ -305,6 +305,12 @@ def _apply_invert(given: argparse.Namespace, log: Log) -> Log:
     return replace(log, output=-require_output(given, log)) if given.invert else log
 
 
+def adapt_remedy(given: argparse.Namespace, text: str) -> str:
+    """Return the remedy for a wrong sense that fits the options given."""
+    return (text.replace('give --invert', 'leave --invert out')
+            if getattr(given, 'invert', False) else text)
+
+
 def require_output(given: argparse.Namespace, log: Log) -> Array:
     if log.output is None:
         raise UsageError(f'{given.log}: has gyro_counts only; '

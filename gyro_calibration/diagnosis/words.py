@@ -159,9 +159,9 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.verdict == 'adequate':
         suspected = join_list([readable_name(each.effect) for each in diagnosis.findings])
         reference_errs = bool(diagnosis.reference and diagnosis.reference.noise)
-        found = ('No difference is established' if reference_errs or suspected
-                 else 'Simulation and measurement differ by no more than noise')
-        return (found + ' beyond the errors of the reference' * reference_errs
+        text = ('No difference is established' if reference_errs or suspected
+                else 'Simulation and measurement differ by no more than noise')
+        return (text + ' beyond the errors of the reference' * reference_errs
                 + f'; suspected: {suspected}' * bool(suspected) + '.', _gain_sentence(diagnosis))
     parts = []
     if established := [each for each in diagnosis.findings if each.status == 'established']:
