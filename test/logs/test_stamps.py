@@ -47,3 +47,13 @@ def test_what_is_lost_while_a_host_stands_is_counted():
 def test_samples_are_lost_before_and_after_a_stall(missing):
     places = np.concatenate([np.arange(500, 500 + missing), np.arange(4000, 4000 + missing)])
     assert fit_stamp_grid(np.delete(stalled(0.3), places)).lost_after.sum() == 2 * missing
+
+
+@pytest.mark.parametrize('change', [0.0, 0.1])
+def test_an_interval_that_changes_over_the_log_is_no_burst(change):
+    generator, places = np.random.default_rng(3), np.arange(3000)
+    steps = 0.04 * (1.0 + change * np.sin(places / 500.0))
+    time = np.cumsum(steps) + 0.03 * generator.random(3000)
+    stamps = fit_stamp_grid(time)
+    assert stamps.has_bursts == (change == 0.0) == bool(stamps.burst_remarks)
+    assert change or stamps.max_deviation < 0.04
