@@ -25,6 +25,7 @@ import difflib
 import errno
 import fcntl
 import hashlib
+import io
 import os
 from pathlib import Path
 import re
@@ -104,7 +105,7 @@ def describe_os_error(error: OSError) -> str:
     return f'{to_printable(path)}: {describe_error(error)}; {remedy(error, path)}'
 
 
-def open_regular_file(path: str | Path, allow_pipes: bool = False) -> BinaryIO:
+def open_regular_file(path: str | Path, allow_pipes: bool = False) -> io.BufferedReader:
     """
     Open a regular file for reading; on request also a pipe that has a writer.
 

@@ -227,6 +227,15 @@ def find_lost_reference(known: Mask) -> Mask:
     return lost
 
 
+def few_values_remedy(time: Array, known: Mask, wanted: int) -> str:
+    """Return how to record more values of a reference: longer, where they come evenly."""
+    stamps = time[known]
+    if not 1 < len(stamps) < wanted or find_lost_reference(known).mean() > 0.5:
+        return 'repair its line and record again'
+    duration = (stamps[-1] - stamps[0]) * (wanted - 1) / (len(stamps) - 1)
+    return f'record longer, {math.ceil(duration)} s at the interval of the reference'
+
+
 def interpolate_reference(time: Array, values: Array) -> Array:
     """Return a slow reference at each sample, linear between its values; nan where it is lost."""
     known = np.isfinite(values)

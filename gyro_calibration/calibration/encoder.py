@@ -37,7 +37,7 @@ from gyro_calibration.calibration.course_over_ground import (
     MAX_FOLLOWED_RESIDUAL,
     MAX_ROUNDING_STEP,
 )
-from gyro_calibration.calibration.dwell_search import interpolate_reference
+from gyro_calibration.calibration.dwell_search import few_values_remedy, interpolate_reference
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
 from gyro_calibration.calibration.heading_regression import MAX_ENCODER_OFFSET, TECHNOLOGY_PRIORS
@@ -236,11 +236,13 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
         heading[known] = integrate(log.time[known], rate[known])
     output_known, reference_known = np.isfinite(log.output), np.isfinite(heading)
     # a reference may come far less often than the gyro
-    for known, name, fewest in ((output_known, 'gyro', max(100, len(log) // 10)),
-                                (reference_known, 'reference', 100)):
+    for known, name, fewest, remedy in (
+            (output_known, 'gyro', max(100, len(log) // 10), 'repair its line and record again'),
+            (reference_known, 'reference', 100,
+             few_values_remedy(log.time, reference_known, 100))):
         if known.sum() < fewest:
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
-                              f'at least {fewest} are needed: repair its line and record again')
+                              f'at least {fewest} are needed: {remedy}')
     start = log.time[reference_known][0]
     return (log.time[output_known] - start, log.output[output_known],
             motion_from_headings(log.time[reference_known], heading[reference_known]))

@@ -60,7 +60,12 @@ def _diagnose(given: argparse.Namespace) -> Answer:
     with show_progress('diagnosis') as on_progress:
         found = diagnose_logs(logs, model, given.seed, given.reference_kind, given.log,
                               on_progress)
-    found = replace(found, logs=tuple(given.log))
+    found = replace(
+        found, logs=tuple(given.log),
+        findings=tuple(replace(each, remedy=verb.adapt_remedy(given, each.remedy))
+                       for each in found.findings),
+        gates=tuple(replace(each, remedy=verb.adapt_remedy(given, each.remedy))
+                    for each in found.gates))
     if found.model is not model:
         origin = {**found.model.origin, **verb.make_origin(found.logs)}
         found = replace(found, model=replace(found.model, origin=origin))

@@ -31,7 +31,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 # ruff: noqa: E402
 from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
-from gyro_calibration.cli.verb import print_message, UsageError
+from gyro_calibration.cli.verb import adapt_remedy, print_message, UsageError
 from gyro_calibration.diagnosis.causes import add_causes
 from gyro_calibration.files import (
     describe_error,
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = (None if answer is None else answer.text if not given.json
                 else json.dumps(_replace_non_finite(answer.data), allow_nan=False))
     except DataRefused as error:
-        print_message(error)
+        print_message(adapt_remedy(given, str(error)))
         return 1
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
         print_message(f'the values exceed the range of computation ({describe_error(error)}); '

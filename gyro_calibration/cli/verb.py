@@ -306,6 +306,12 @@ def sensitivity(given: argparse.Namespace) -> float | None:
     return None if given.sensitivity is None else given.sensitivity * DEGREE
 
 
+def adapt_remedy(given: argparse.Namespace, text: str) -> str:
+    """Return the remedy for a wrong sense that fits the options given."""
+    return (text.replace('give --invert', 'leave --invert out')
+            if getattr(given, 'invert', False) else text)
+
+
 def _orient_output(given: argparse.Namespace, log: Log) -> Log:
     if log.output is None:
         raise UsageError(f'{given.log}: has gyro_counts only; '

@@ -245,14 +245,16 @@ class SampleFault:
     ----------
     is_faulty : mask of the samples, shape (n,)
     p_value : of their number, or of the length of a run
-    size : expected number of repeats by codes and noise, at most; or the largest deviation of
-        outliers in standard deviations
+    size : expected number, at most, of what is tested: unlikely repeats, or such runs; or the
+        largest deviation of outliers in standard deviations
+    is_by_run : whether a run of repeats is tested, not their number
 
     """
 
     is_faulty: Mask
     p_value: float
     size: float
+    is_by_run: bool = False
 
 
 def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
@@ -282,7 +284,7 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
         chance = np.where(
             within, np.maximum(chance, band.membership_chance(comparison)[1:]), chance)
         width = np.where(within, 2.0 * band.half_width, width)
-    repeats, p_value = np.zeros(len(valid), dtype=bool), 1.0
+    repeats, p_value, by_run = np.zeros(len(valid), dtype=bool), 1.0, 1.0
     rare = (chance < _COARSE_REPEAT_CHANCE) & known
     excess, expected_count = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
     by_number = float(stats.poisson.sf(excess - 1, expected_count))
@@ -302,8 +304,11 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
                 left / (math.sqrt(2.0) * comparison.deviation))) if left > 0.0 else 1.0
         if unlikely * len(valid) < level:
             repeats[run.start + 1:run.stop + 1] = True
-            p_value = min(p_value, unlikely * len(valid))
-    return SampleFault(repeats, p_value, float(chance[known].sum())) if repeats.any() else None
+            by_run = min(by_run, unlikely * len(valid))
+    if not repeats.any():
+        return None
+    return (SampleFault(repeats, by_run, by_run, is_by_run=True) if by_run < p_value
+            else SampleFault(repeats, p_value, expected_count))
 
 
 def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) -> Array:
@@ -623,10 +628,12 @@ def _sample_findings(repeated: SampleFault | None, outlying: SampleFault | None,
     if repeated is not None:
         count, runs = int(np.count_nonzero(repeated.is_faulty)), find_runs(repeated.is_faulty)
         first = log.time[int(np.argmax(repeated.is_faulty))]
+        explained = ('no such run' if repeated.is_by_run
+                     else f'at most {repeated.size:.2g} repeats that are unlikely by themselves')
         yield _sized_finding('stuck_samples', count, 0.0, repeated.p_value,
-                             f'{count} samples in {len(runs)} runs repeat the one '
-                             f'before, the first at {first:.3f} s; codes and noise explain '
-                             f'at most {repeated.size:.2g} repeats in the whole log')
+                             f'{count} samples in {len(runs)} run{"s" * (len(runs) > 1)} repeat '
+                             f'the one before, the first at {first:.3f} s; codes and noise '
+                             f'explain {explained} in the whole log')
     if outlying is not None:
         count = int(np.count_nonzero(outlying.is_faulty))
         first = log.time[int(np.argmax(outlying.is_faulty))]

@@ -53,7 +53,7 @@ _BINARY_FACTORS: Mapping[str, float] = {
     '1000/1024': 1000.0 / 1024.0, '1048576/1000000': 1.048576, '1000000/1048576': 1.0 / 1.048576}
 UNIT_FACTORS: Mapping[str, float] = {**_COMMON_FACTORS, **_BINARY_FACTORS}
 #: Largest ratio of the factor of a gyro to 1 in the right unit, or to the factor of another unit.
-_MAX_GYRO_RATIO = 1.1
+MAX_GYRO_RATIO = 1.1
 #: Largest relative difference between a factor and that of a unit.
 _MAX_FACTOR_ERROR = 0.005
 #: Largest standard deviation of a factor as a share of its distance to 1, and of a delay as a
@@ -89,7 +89,7 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
     if matches:
         return min(matches, key=lambda name: abs(factor - UNIT_FACTORS[name]))
     distant_matches = [name for name, value in _COMMON_FACTORS.items()
-                       if _factor_ratio(factor, value) < _MAX_GYRO_RATIO]
+                       if _factor_ratio(factor, value) < MAX_GYRO_RATIO]
     return (distant_matches[0] if distant_matches and deviation < _MAX_DEVIATION * abs(factor)
             else None)
 

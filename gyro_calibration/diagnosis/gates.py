@@ -27,6 +27,7 @@ import math
 from typing import NamedTuple
 
 from gyro_calibration.calibration.dwell_search import (
+    few_values_remedy,
     find_lost_reference,
     interpolate_reference,
     require_output,
@@ -35,6 +36,7 @@ from gyro_calibration.diagnosis.expected_output import (
     fit_line,
     identify_unit_factor,
     is_implausible_factor,
+    MAX_GYRO_RATIO,
     model_scale_factor,
     reference_rate,
     UNIT_FACTORS,
@@ -188,11 +190,11 @@ def _log_problems(log: Log) -> Iterator[str]:
             yield ('the log has no reference, and the gyro is not at rest: add reference_rate_dps '
                    'or reference_heading_deg, or let it rest, and add a column moving of zeros')
         covered = np.count_nonzero(known & ~find_lost_reference(has_reference))
-        if reference is not None and (both < MIN_SAMPLES
-                                      or covered < MIN_VALID_SHARE * len(known)):
+        is_lost = bool(covered < MIN_VALID_SHARE * len(known))
+        if reference is not None and (both < MIN_SAMPLES or is_lost):
             yield (f'the reference has a value in {both} of {len(known)} samples; at least '
-                   f'{MIN_SAMPLES} and a tenth are needed, or one at even intervals: repair its '
-                   'line and record again')
+                   f'{MIN_SAMPLES}{", and a tenth or at even intervals," * is_lost} are needed: '
+                   f'{few_values_remedy(log.time, known & has_reference, MIN_SAMPLES)}')
     values, counts = np.unique(log.output[known], return_counts=True)
     share = counts.max() / counts.sum()
     if share > 0.99:
@@ -322,22 +324,40 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
         yield Gate('motion', None, 'the reference turns too little to compare it with the gyro')
         return
     best = max(by_length, key=lambda each: each.coherence)
-    yield _motion_gate(best, by_length, float(np.ptp(reference)), log)
-    if best.coherence > _MIN_UNIT_COHERENCE:
-        own = 1.0 if model is None else model_scale_factor(model, np.gradient(reference, log.time))
-        # a model with other units is refused by `check_model_units`
-        scale = best.factor * (own if 0.1 < abs(own) < 10.0 else 1.0)
-        yield from _unit_gates(1.0 / scale, best.deviation / abs(best.factor * scale), log)
+    if best.coherence < _MIN_MOTION_COHERENCE:
+        yield _motion_gate(best, by_length, float(np.ptp(reference)), log)
+        return
+    own = 1.0 if model is None else model_scale_factor(model, np.gradient(reference, log.time))
+    # a model with other units is refused by `check_model_units`
+    scale = best.factor * (own if 0.1 < abs(own) < 10.0 else 1.0)
+    relative = best.deviation / abs(best.factor)
+    is_certain, unit = best.coherence > _MIN_UNIT_COHERENCE, (1.0 / scale, relative / abs(scale))
+    is_excluded = is_implausible_factor(_nearest_scale(scale, relative, best.coherence))
+    unit_gates = [*_unit_gates(*unit, log)]
+    is_other_axis = (is_excluded and not is_certain and unit_gates[-1].name == 'unit'
+                     and identify_unit_factor(*unit) is None)
+    yield _motion_gate(best, by_length, float(np.ptp(reference)), log,
+                       is_other_axis * f', where the output is {1.0 / scale:.2g} times the '
+                       'reference')
+    if is_certain or is_excluded and not is_other_axis:
+        yield from unit_gates
+
+
+def _nearest_scale(scale: float, relative_deviation: float, coherence: float) -> float:
+    """Return the scale nearest to 1 that is not excluded; noise of the gyro reduces it."""
+    half = NORMAL_QUANTILE_975 * relative_deviation
+    return math.copysign(min(max(1.0, abs(scale) * (1.0 - half)),
+                             abs(scale) * (1.0 + half) / coherence), scale)
 
 
 def _motion_gate(best: Agreement, by_length: Sequence[Agreement], turned_angle: float,
-                 log: Log) -> Gate:
+                 log: Log, other_axis: str = '') -> Gate:
     evidence = (f'{100.0 * best.coherence:.3g} % of the variance of the heading over spans is '
-                'common to gyro and reference')
+                f'common to gyro and reference{other_axis}')
     longest = by_length[-1]
     if best.coherence - longest.coherence > 0.5 * _MIN_MOTION_COHERENCE:
         evidence += f', and {100.0 * longest.coherence:.2g} % over the longest ones'
-    elif best.coherence >= _MIN_MOTION_COHERENCE:
+    elif best.coherence >= _MIN_MOTION_COHERENCE and not other_axis:
         return Gate('motion', True, evidence)
     if longest.residual < _MIN_HEADING_DIFFERENCE or turned_angle < _MIN_TURNED_ANGLE:
         return Gate('motion', best.coherence >= _MIN_MOTION_COHERENCE or None,
@@ -360,17 +380,23 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     half = NORMAL_QUANTILE_975 * deviation
     known = (factor, (factor - half, factor + half))
     name = identify_unit_factor(factor, deviation)
-    slower, interval = 10.0 ** round(math.log10(abs(factor))), float(np.median(np.diff(log.time)))
+    power, interval = round(math.log10(abs(factor))), float(np.median(np.diff(log.time)))
+    slower = 10.0 ** power
+    correct_gyro = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
+                    '--sensitivity)')
     if name == '-1' or name is None and not is_implausible_factor(-factor):
         yield Gate('sense', False, f'{evidence}: the two count in opposite senses',
                    'give --invert, or change the sign of the column of the gyro', known)
-    elif (name is None and slower != 1.0 and abs(abs(factor) / slower - 1.0) < 0.3
-            and log.reference_rate is None
+    elif (name is None and power and log.reference_rate is None
+            and 1.0 / MAX_GYRO_RATIO < abs(factor) / slower < MAX_GYRO_RATIO
             and _SAMPLE_INTERVAL_RANGE[0] < interval / slower < _SAMPLE_INTERVAL_RANGE[1]):
-        yield Gate('time_unit', False, f'{evidence}: the stamps run {slower:g} times too fast, '
-                   f'{interval:.4g} s between samples where {interval / slower:.4g} s would agree',
+        yield Gate('time_unit', False, f'{evidence}, as if the stamps ran {slower:g} times too '
+                   f'fast, {interval:.4g} s between samples where {interval / slower:.4g} s would '
+                   'agree',
                    f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
-                   + ' (the stamps are in ms)' * (slower == 1e3), known)
+                   + ' (the stamps are in ms)' * (slower == 1e3)
+                   # units of time differ by powers of 1000
+                   + f'; or, if they are right, {correct_gyro}' * (power % 3 != 0), known)
     elif name is not None and '180' in name:
         fastest = float(np.nanquantile(np.abs(log.output), 0.99)) / DEGREE
         either = log.reference_heading is not None and 0.1 <= fastest <= 4000.0
@@ -380,8 +406,8 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     else:
         meaning = (', which is not plausible for a gyro' if name is None
                    else f', and {name} is {UNIT_FACTORS[name]:.5g}')
-        yield Gate('unit', False, evidence + meaning, 'correct the unit or the range of the gyro '
-                   '(gyro_dps, gyro_rad_s, --sensitivity), or that of the reference', known)
+        yield Gate('unit', False, evidence + meaning,
+                   f'{correct_gyro}, or that of the reference', known)
 
 
 def reference_angle(log: Log) -> Array:
@@ -451,7 +477,7 @@ def _regress_changes(gyro: Array, steps: Array, change: Array) -> Agreement:
 _GATE_SENTENCES = {
     'sense': 'Gyro and reference count in opposite senses.',
     'unit': 'Gyro and reference have different units.',
-    'time_unit': 'The stamps are in another unit of time.',
+    'time_unit': 'Gyro and reference differ by a power of ten, as with another unit of time.',
     'wrapped_heading': 'The reference heading is wrapped.',
     'motion': 'The reference shows another motion than the gyro, or the axis of the gyro tilts.',
     'model': 'The model has other units than the log, or belongs to another gyro.'}

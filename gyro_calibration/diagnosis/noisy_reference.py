@@ -389,6 +389,8 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
         elif plain.lacks_turns and _follows_the_rate(name):
             reason = ('fewer than three stretches turn, which do not distinguish it from a scale '
                       'factor error')
+        elif name == 'reference_once_per_rev':
+            reason = 'a course over ground has no shaft'
         else:
             reason = 'the errors of the reference hide it over short spans'
         shown[name] = reason
@@ -473,7 +475,7 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
     duration = float(time[-1] - time[0])
     terms: list[tuple[str, tuple[float, ...]]] = [(name, ()) for name in (
         'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity', 'rate_ramp',
-        'heading_sensitivity', 'reference_once_per_rev')]
+        'heading_sensitivity', *['reference_once_per_rev'] * fine)]
     terms += [('warm_up', (constant,)) for constant in np.geomspace(
         duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist()]
     terms += [(name, (moment,))
@@ -539,6 +541,9 @@ def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
     """Return the ratio of an effect to the largest plausible one; inf if it may be 0."""
     places = fit.value_slice(cause)
     values = fit.values[places]
+    if cause.cause == 'reference_once_per_rev':
+        # from 1 on, the reference would turn back
+        return float(np.hypot(*values))
     if len(values) == 1 and abs(values[0]) < fit.half_width(places.start):
         return math.inf
     if CAUSES[cause.cause].along != 'rate' or cause.cause not in CATALOGUE:

@@ -488,8 +488,11 @@ def _fit_columns(problem: RegressionProblem, distorted: tuple[Replay, ...],
     kept = _independent_columns(columns)
     of = columns[kept]
     information, scores = problem.products(of, of), problem.products(residual[None], of)[:, 0]
-    values = np.linalg.solve(information, scores[:, :, None])[:, :, 0]
-    squares = problem.squares(residual[None])[:, 0] - np.einsum('gq,gq->g', values, scores)
+    # of what the values for one noise leave, as the difference of the whole sums is rounded
+    left = residual - np.linalg.solve(information[0], scores[0]) @ of
+    pull = problem.products(left[None], of)[:, 0]
+    squares = problem.squares(left[None])[:, 0] - np.einsum(
+        'gq,gq->g', np.linalg.solve(information, pull[:, :, None])[:, :, 0], pull)
     determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
     likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
     return RegressionFit(problem, distorted, causes, residual, of,
@@ -503,10 +506,11 @@ def _independent_columns(columns: Array) -> list[int]:
     length = np.sqrt(np.diag(product))
     kept: list[int] = []
     for place in np.flatnonzero(length > 0.0).tolist():
-        own = product[np.ix_(kept, kept)] / np.outer(length[kept], length[kept])
-        towards = product[kept, place] / (length[kept] * length[place])
-        if 1.0 - (towards @ np.linalg.solve(own, towards) if kept else 0.0) > 1e-9:
-            kept.append(place)
+        tried = [*kept, place]
+        # the least eigenvalue is at most the share of any column that is independent of the others
+        own = product[np.ix_(tried, tried)] / np.outer(length[tried], length[tried])
+        if np.linalg.eigvalsh(own)[0] > 1e-9:
+            kept = tried
     return kept
 
 

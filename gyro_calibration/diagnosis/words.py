@@ -17,6 +17,7 @@ import math
 import re
 import textwrap
 
+from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import (
     Change,
     Diagnosis,
@@ -164,8 +165,15 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         return (verdict + ' beyond the errors of the reference' * reference_errs
                 + f'; suspected: {suspected}' * bool(suspected) + '.', _gain_sentence(diagnosis))
     parts = []
-    if established := [each for each in diagnosis.findings if each.status == 'established']:
-        parts.append(f'because of {_cause_list_phrase(established)}')
+    established = sorted((each for each in diagnosis.findings if each.status == 'established'),
+                         key=lambda each: (_is_fault_of_samples(each),
+                                           -(each.share_of_heading_error or 0.0)))
+    if established and not diagnosis.unexplained and _is_fault_of_samples(established[0]):
+        return ('No error of the gyro is established; the record has '
+                f'{_list_causes(established)}.', _gain_sentence(diagnosis))
+    if established:
+        parts.append('because of ' + f'{len(established)} causes: ' * (len(established) > 1)
+                     + _list_causes(established))
     if unexplained := diagnosis.unexplained:
         most = max(each.share_of_variance for each in unexplained)
         up_to = 'up to ' if len(unexplained) > 1 and most >= 1e-3 else ''
@@ -177,14 +185,20 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
     return f'Simulation and measurement differ {", and ".join(parts)}.', _gain_sentence(diagnosis)
 
 
-def _cause_list_phrase(findings: Sequence[Finding]) -> str:
+def _is_fault_of_samples(found: Finding) -> bool:
+    """Tell whether a finding is of single samples of the record, not of all of its output."""
+    cause = CAUSES.get(found.effect)
+    return cause is not None and cause.origin == 'record' and cause.along == 'time'
+
+
+def _list_causes(findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
         shown = [readable_name(each.effect) + (' (or {})'.format(
             join_list([readable_name(name) for name in each.ambiguous_with], 'or'))
             if each.ambiguous_with else '') for each in findings[:_MAX_NAMED_CAUSES]]
         more = ([f'{len(findings) - _MAX_NAMED_CAUSES} more'] if len(findings) > _MAX_NAMED_CAUSES
                 else [])
-        return f'{len(findings)} causes: {join_list(shown + more)}'
+        return join_list(shown + more)
     (found,) = findings
     name = readable_name(found.effect)
     sizes = [format_quantity(value, key) for key, value in found.parameters.items()][:1]

@@ -72,6 +72,7 @@ _QUANTITY_FIELDS = {
     'force variance': ('linear_acceleration_covariance.0',),
     'temperature': ('temperature',),
 }
+_IMU_RATE = 'angular_velocity.x'
 
 _NESTED_DEFINITIONS = {
     'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec',
@@ -149,11 +150,17 @@ def parse_layout(definition: str, axis: str = 'z') -> MessageLayout:
             runs[-1][1] += code
         elif code:
             runs.append([code, ''])
-    if names[:2] != ['header.stamp.sec', 'header.stamp.nanosec']:
+    # drivers nest an Imu in a message of their own
+    nested = [name.removesuffix(_IMU_RATE) for name in names if name.endswith(f'.{_IMU_RATE}')]
+    inside = nested[0] if len(nested) == 1 and _IMU_RATE not in names else ''
+    stamp = ['header.stamp.sec', 'header.stamp.nanosec']
+    if names[:2] not in (stamp, [inside + name for name in stamp]):
         raise MessageError('it does not begin with a header')
-    quantities = {quantity: names.index(found) - 2 for quantity, fields in _QUANTITY_FIELDS.items()
+    places = {name.removeprefix(inside): place - 2 for place, name in enumerate(names)
+              if name.startswith(inside)}
+    quantities = {quantity: places[found] for quantity, fields in _QUANTITY_FIELDS.items()
                   for found in [field.format(axis) for field in fields
-                                if field.format(axis) in names][:1]}
+                                if field.format(axis) in places][:1]}
     return MessageLayout(tuple((struct.calcsize(before), codes) for before, codes in runs),
                          quantities)
 

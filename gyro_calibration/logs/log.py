@@ -77,6 +77,7 @@ _MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 20, 1 <<
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
 
+_ROS_1_MAGIC = b'#ROSBAG V2.0'
 #: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
 _MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading', *ATTITUDE)
@@ -205,6 +206,10 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
                 encoding='utf-8-sig',
                 newline='') as text:
+        if file.peek(len(_ROS_1_MAGIC)).startswith(_ROS_1_MAGIC):
+            raise LogError(f'{path}: is a recording of ROS 1; wanted a log file or a ROS 2 '
+                           'recording: convert it, by pip install rosbags and '
+                           f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
         table, first_line = _read_header(path, _limit_length(lines, _MAX_HEADER_LENGTH), columns,
                                          axis)
@@ -531,7 +536,8 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
 
     Where the reference was lost or is slow, it may turn by more than half a turn from one value to
     the next. The integral of the gyro then gives the number of turns. Its sign and bias against
-    the reference are estimated from the values that lie close together.
+    the reference are estimated from the values that lie close together. A heading in deg instead
+    of rad is left as it is, as its unit is to be corrected first.
 
     Parameters
     ----------
@@ -546,6 +552,8 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
     if known.sum() < 2:
         return heading, False
+    if _is_in_degrees(reference_time[known], wrapped[known], time, np.nan_to_num(output)):
+        return wrapped, False
     plainly = np.unwrap(wrapped[known])
     expected, _ = _heading_by_gyro(reference_time[known], plainly, time, np.nan_to_num(output))
     heading[known] = expected + np.unwrap(wrapped[known] - expected)
@@ -568,11 +576,19 @@ def _heading_by_gyro(reference_time: Array, heading: Array, time: Array,
     return sign * turned + bias * reference_time, factor
 
 
+def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: Array) -> bool:
+    """Tell whether a heading exceeds a turn and, by the gyro, is in deg instead of rad."""
+    _, factor = _heading_by_gyro(reference_time, heading, time, output)
+    return (float(np.ptp(heading)) > (1.0 + _FULL_TURN_MARGIN) * 2.0 * math.pi
+            and 1.0 / 1.4 < DEGREE * abs(factor) < 1.4)
+
+
 def refuse_wrapped(log: Log) -> None:
     """
     Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped.
 
-    Over a gap of the reference, a jump is a full turn that the gyro does not show.
+    Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
+    heading in deg instead of rad are none.
 
     """
     if log.time is None or log.reference_heading is None:
@@ -583,7 +599,8 @@ def refuse_wrapped(log: Log) -> None:
     # vehicles do not turn faster than 35 rad/s
     jumps = np.flatnonzero(turns & (np.abs(change) > 35.0 * np.diff(time))
                            | _turns_without_gyro(log, known))
-    if len(jumps):
+    if len(jumps) and not (log.output is not None and _is_in_degrees(
+            time, log.reference_heading[known], log.time, np.nan_to_num(log.output))):
         first, last = known[jumps[0]], known[jumps[0] + 1]
         where = ('from one sample to the next, the first time at' if last == first + 1 else
                  'that the gyro does not show, first in the gap that ends at')

@@ -250,8 +250,13 @@ class _LogBuilder:
             raise LogError(f'{self._path}: several gyros, {_join_names(found)}; '
                            'select one with --topic')
         reasons = ''.join(f' ({note})' for note in self._contents.notes)
+        others = self._topics_of_type({
+            kind for kind, definition in self._contents.definitions.items()
+            if kind not in REFERENCE_TYPES and 'rate' in cdr.parse_layout(definition).quantities})
+        remedy = (f'select {_join_names(others, "or")} with --topic' if others
+                  else 'record the topic of the gyro')
         raise LogError(f'{self._path}: no message of {cdr.IMU} in it{reasons}'
-                       f'{self._list_topics()}; record the topic of the gyro')
+                       f'{self._list_topics()}; {remedy}')
 
     def _find_reference(self) -> _TopicSeries | None:
         if self._topics.reference is not None:
@@ -280,6 +285,10 @@ class _LogBuilder:
             raise LogError(f'{self._path}: no topic {wanted}{self._list_topics()}; '
                            f'name one of them by {_ROLES[role][0]}')
         kind = self._contents.topics[topic]
+        if kind in self._contents.undefined:
+            raise LogError(f'{self._path}: {topic} is {kind}, of which the recording has no '
+                           'definition; convert it by ros2 bag convert of ROS 2 Iron or later, '
+                           f'where the package {kind.partition("/")[0]} is sourced')
         definition = self._contents.definitions.get(kind)
         found = cdr.parse_layout(definition).quantities if definition else {}
         if (not _REQUIRED_QUANTITIES[role] & set(found)

@@ -86,6 +86,8 @@ class Contents:
     #: Topic -> message type; type with known quantities -> definition.
     topics: dict[str, str] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
+    #: Types of which the recording has no definition.
+    undefined: set[str] = field(default_factory=set)
     #: Notes of the recorder, and notes on the reading.
     recorder_notes: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -100,6 +102,8 @@ class Contents:
         if kind not in self.definitions and encoding == 'cdr':
             with suppress(MessageError):
                 definition = DEFINITIONS.get(kind, definition)
+                if not definition:
+                    self.undefined.add(kind)
                 if parse_layout(definition).quantities:
                     self.definitions[kind] = definition
         return (topic, kind) if encoding == 'cdr' and kind in self.definitions else None

@@ -84,6 +84,8 @@ def fit_stamp_grid(time: Array) -> StampGrid:
     interval = float(np.polyfit(number, time - time[0], 1)[0])
     off = time - time[0] - interval * number
     wander = float(np.abs(off - np.median(off)).max())
+    # a burst is late by no more than the wait for it; beyond that the interval itself changes
+    bursts = bursts and wander <= float(steps.max())
     uneven = not bursts and float(
         (np.abs(steps / usual - np.round(steps / usual)) > 0.4).mean()) > 0.2
     if uneven or wander > 0.05 * len(time) * interval:

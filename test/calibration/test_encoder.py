@@ -104,7 +104,10 @@ REST = motion_from_rates(np.array([0.0, 100.0]), np.array([0.5, 0.5]))
 REFUSED = {'no heading': (replace(CLEAN, reference_heading=None), 'reference_heading_deg'),
            'no time': (replace(CLEAN, time=None), 'time_s'), 'lost reference': (
                replace(CLEAN, reference_heading=np.where(LATE, np.nan, CLEAN.reference_heading)),
-               'the reference has a value in 10'),
+               'in 10 of 10000 samples; at least 100 are needed: repair its line'),
+           'few fixes': (replace(CLEAN, reference_heading=np.where(
+               np.arange(len(CLEAN)) % 200, np.nan, CLEAN.reference_heading)),
+               'a value in 50 of 10000 samples; at least 100 are needed: record longer, 198 s'),
            'lost gyro': (replace(CLEAN, output=np.where(LATE, np.nan, CLEAN.output)),
                          'the gyro has a value in 10'),
            'short': (log_of(SWING, 5.0), 'at least 10 s'), 'one speed': (

@@ -233,7 +233,9 @@ def test_samples_that_a_coarse_gyro_repeats_in_a_turn_are_found(generator):
     log = coarse(swing(generator), 3.0 * SIGMA)
     start = int(np.argmax(np.abs(np.diff(log.reference_rate[:5900], prepend=0.0))))
     log.output[start:start + 30] = log.output[start]
-    assert 'stuck_samples' in found(log)
+    stuck, = (each for each in inspect_record(log).findings if each.effect == 'stuck_samples')
+    # by the run: of repeats alone, the codes of the log explain more
+    assert 'codes and noise explain no such run' in stuck.evidence and stuck.p_value < 1e-4
 
 
 def test_steps_as_wide_as_the_noise_repeat_as_seldom_as_stated(any_generator):
@@ -448,7 +450,11 @@ REFUSED = {
     'lost gyro': (replace(GOOD, output=GOOD.output * NAN), None,
                   'the gyro has a value in 50 of 6000'),
     'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN), None,
-                       'the reference has a value in 50 of 6000'),
+                       'the reference has a value in 50 of 6000 samples; at least 100, and a '
+                       'tenth or at even intervals, are needed: repair its line'),
+    'few fixes': (Log(output=GOOD.output, time=GOOD.time, reference_heading=np.where(
+        np.arange(6000) % 100, np.nan, np.cumsum(GOOD.reference_rate) * INTERVAL)), None,
+        'in 60 of 6000 samples; at least 100 are needed: record longer, 99 s'),
     'few rows': (Log(output=GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None,
                  '5 rows'),
     'model in deg/s': (GOOD, OTHER_UNITS, 'other units'),

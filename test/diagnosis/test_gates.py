@@ -17,7 +17,7 @@ from gyro_calibration import fit
 from gyro_calibration.diagnosis.gates import check_gates
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.words import terminal_lines
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, unwrap_heading
 import numpy as np
 import pytest
 
@@ -54,6 +54,7 @@ WRONG = {
     'heading in deg': lambda log: replace(log, reference_heading=log.reference_heading / DEGREE),
     'heading in rad': lambda log: replace(log, reference_heading=log.reference_heading * DEGREE),
     'factor 2': lambda log: replace(log, output=2.0 * log.output),
+    'factor 8.5': lambda log: replace(log, output=8.5 * log.output),
     'factor 1e12': lambda log: replace(log, output=1e12 * log.output),
     'stamps in ms': lambda log: replace(log, time=1e3 * log.time),
     'stamps ten times too slow': lambda log: replace(log, time=10.0 * log.time),
@@ -82,6 +83,45 @@ def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
     assert finding.remedy in ' '.join(' '.join(terminal_lines(found)).split())
     with pytest.raises(DataRefused, match=re.escape(finding.remedy)):
         fit(log)
+
+
+@pytest.mark.parametrize('wrap', [lambda heading: heading, lambda heading: heading % 360.0],
+                         ids=['continuous', 'wrapped'])
+def test_fixes_in_deg_that_are_named_rad_have_another_unit_and_are_not_wrapped(wrap):
+    log = drive(heading_noise=1.0 * DEGREE)
+    degrees = np.where(np.arange(len(TIME)) % 25, np.nan, wrap(log.reference_heading / DEGREE))
+    for heading in (degrees, unwrap_heading(TIME, degrees, TIME, log.output)[0]):
+        failed = check_gates(replace(log, reference_heading=heading))[-1]
+        assert failed.name == 'unit' and 'deg or rad' in failed.remedy, failed.evidence
+
+
+@pytest.mark.parametrize('wrong, power, gyro', [
+    ('stamps ten times too slow', 10, True), ('stamps in ms', 1000, False)])
+def test_a_power_of_ten_below_a_thousand_may_also_be_a_factor_of_the_gyro(wrong, power, gyro):
+    remedy = check_gates(WRONG[wrong](drive()))[-1].remedy
+    assert f'divide time_s by {power}' in remedy and ('--sensitivity' in remedy) == gyro
+
+
+def tilted(seed, noise):
+    """Return a log of an axis that sees 15 % of the turns, and noise of its own."""
+    generator, log = np.random.default_rng(seed), drive(seed)
+    vibration = np.repeat(generator.standard_normal(len(TIME) // 10), 10)
+    return replace(log, output=0.15 * MOTION + noise * vibration)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_an_axis_that_follows_in_part_by_another_factor_is_another_motion(seed):
+    # half of the variance is common, which alone passes as the noise of a reference
+    gate, = (each for each in check_gates(tilted(seed, 0.2)) if each.passed is False)
+    assert gate.name == 'motion' and 'the output is 0.' in gate.evidence, gate
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_noisy_gyro_of_the_right_factor_passes(seed):
+    log = tilted(seed, 0.0)
+    noisy = replace(log, output=log.output / 0.15 + 2.0 * np.repeat(
+        np.random.default_rng(seed).standard_normal(len(TIME) // 10), 10))
+    assert not [gate for gate in check_gates(noisy) if gate.passed is False]
 
 
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])

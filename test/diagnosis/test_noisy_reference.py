@@ -165,6 +165,27 @@ def turning_once(seed):
                + BIAS_TRUE + 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time)))
 
 
+def test_a_course_has_no_error_of_a_shaft():
+    found = diagnosed(drive(5, hidden=lambda time, rate, heading, temperature:
+                            0.3 * rate * np.sin(heading)))
+    assert 'shaft' in found.cannot_show['reference_once_per_rev']
+    assert 'reference_once_per_rev' not in {each.effect for each in found.findings}
+
+
+def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
+    generator, time = np.random.default_rng(9), np.arange(0.0, 240.0, 1.0 / RATE)
+    rate = 1.2 + 0.3 * np.sin(0.21 * time)
+    heading = np.cumsum(rate) / RATE
+    for size, named in ((0.3, True), (1.2, False)):
+        log = Log(time=time, output=rate + 1e-3 * generator.standard_normal(len(time)),
+                  reference_heading=heading - size * np.cos(heading)
+                  + 1e-3 * generator.standard_normal(len(time)))
+        _, found = search_causes(fit_spans(lay_out_spans(log, 'motion_capture')), 0.01,
+                                 lambda words: None)
+        assert named == ('reference_once_per_rev' in {
+            each.cause_term.cause for each in found if each.is_established}), size
+
+
 @pytest.mark.parametrize('seed', range(2))
 def test_a_turn_that_does_not_show_the_scale_shows_nothing_that_follows_the_rate(seed):
     found = diagnosed(turning_once(seed), kind='course')

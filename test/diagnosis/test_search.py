@@ -261,3 +261,16 @@ def test_what_a_log_cannot_show_is_not_searched_for():
     assert not [name for name in searched_for if 'temperature' in name
                 or shown.get(name, '').endswith('changes')]
     assert 'rate_ramp' in {each.cause for each in propose_candidates(replays) if is_named(each)}
+
+
+def test_columns_that_nearly_depend_on_each_other_leave_a_positive_residual():
+    time = np.arange(0.0, 21.0, 0.08)
+    rate = 0.3 * np.sin(0.6 * time)
+    log = Log(time=time, reference_rate=rate, output=rate + 1e-7 * np.random.default_rng(
+        3).standard_normal(len(time)) + (time / 21.0) ** 3)
+    powers = Candidate('~time', (), lambda each: [
+        (each.channels.time / 21.0) ** power for power in range(1, 20)])
+    fit = fit_causes(build_problem([laid(log)]), [SelectedCause(powers)])
+    assert (fit.residual_squares > 0.0).all()
+    units = fit.columns / np.linalg.norm(fit.columns, axis=1)[:, None]
+    assert np.linalg.svd(units, compute_uv=False)[-1] ** 2 > 0.5e-9

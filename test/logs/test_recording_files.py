@@ -16,6 +16,7 @@ import hashlib
 import io
 import json
 import shutil
+import sqlite3
 import sys
 import tracemalloc
 
@@ -178,6 +179,33 @@ def test_a_message_of_any_kind_is_parsed_by_its_definition(make, little):
 def test_a_definition_of_nothing_or_without_end_is_refused_at_once(definition):
     with pytest.raises(MessageError):
         parse_layout(definition)
+
+
+@pytest.mark.parametrize('first', ['std_msgs/Header header\nstring raw\n', ''],
+                         ids=['own header', 'header of the Imu'])
+def test_an_imu_in_the_message_of_a_driver_serves_where_its_topic_is_named(
+        make, tmp_path, turning, monkeypatch, first):
+    pytest.importorskip('rosbags')
+    from rosbags.typesys import get_types_from_msg
+    kind = 'my_msgs/msg/Driver'
+    make.store.register(get_types_from_msg(f'{first}sensor_msgs/Imu imu\nint16 status\n', kind))
+    time, rate, _ = turning
+
+    def message(at, value):
+        own = (make.header(at), 'raw') if first else ()
+        return make.store.types[kind](*own, make.imu(at, value, force=9.8), 1)
+    monkeypatch.setattr(Messages, '__init__', lambda self, _: vars(self).update(vars(make)))
+    path = write(tmp_path / 'bag', {'driver': [(at, message(at, r)) for at, r in zip(time, rate)]})
+    log = read_recording(path, Topics('driver'))
+    np.testing.assert_array_equal(log.output, rate)
+    np.testing.assert_allclose(log.time, time, atol=1e-9)
+    assert log.specific_force[5] == 9.8
+    with pytest.raises(LogError, match='select driver with --topic'):
+        read_recording(path)
+    with sqlite3.connect(next(path.glob('*.db3'))) as file:  # as before ROS 2 Iron
+        file.execute('DROP TABLE message_definitions')
+    with pytest.raises(LogError, match='no definition; convert it by ros2 bag .* my_msgs is'):
+        read_recording(path, Topics('driver'))
 
 
 @pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])

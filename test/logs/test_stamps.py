@@ -48,3 +48,13 @@ def test_what_waited_at_a_host_is_not_lost(seconds, jitter):
          'one of 8', 'one of 20'])
 def test_what_is_lost_is_counted(time, lost):
     assert fit_stamp_grid(time).lost_after.sum() == lost
+
+
+@pytest.mark.parametrize('change', [0.0, 0.1])
+def test_an_interval_that_changes_over_the_log_is_no_burst(change):
+    generator, places = np.random.default_rng(3), np.arange(3000)
+    steps = 0.04 * (1.0 + change * np.sin(places / 500.0))
+    time = np.cumsum(steps) + 0.03 * generator.random(3000)
+    stamps = fit_stamp_grid(time)
+    assert stamps.has_bursts == (change == 0.0) == bool(stamps.burst_remarks)
+    assert change or stamps.max_deviation < 0.04
