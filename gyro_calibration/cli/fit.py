@@ -294,9 +294,11 @@ def heading_lines(model: GyroModel, found: EncoderCalibration,
         yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '
                f'{residual.largest / DEGREE:.3f} deg at most.')
     if found.residual_after.rms > 5.0 * DEGREE:
-        yield wrap_line('The error is above 5 deg rms. If the gyro is nonlinear or depends on '
-                        'temperature, use --method dwells; it needs stretches of constant rate in '
-                        'the log.')
+        remedy = ('The reference errs as much, or shows another motion: compare its turns with '
+                  'known ones before the model is used.' if found.method == 'course' else
+                  'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
+                  'needs stretches of constant rate in the log.')
+        yield wrap_line(f'The error is above 5 deg rms. {remedy}')
     yield from _remark_lines(remarks)
 
 
