@@ -328,10 +328,10 @@ def test_causes_are_named_by_their_share_of_the_heading_error_and_faults_of_samp
 
 
 def test_what_a_reference_with_errors_does_not_establish_is_not_said_to_be_noise():
-    beside = replace(adequate(), reference=Reference('course', '', {'reference': 1.0 * DEGREE}))
+    erring = replace(adequate(), reference=Reference('course', '', {'reference': 1.0 * DEGREE}))
     suspected = mark_suspected(extended().findings[0])
     assert headline(adequate())[0] == 'Simulation and measurement differ by no more than noise.'
-    assert headline(beside)[0] == ('No difference is established beyond the errors of the '
+    assert headline(erring)[0] == ('No difference is established beyond the errors of the '
                                    'reference.')
     assert headline(replace(adequate(), findings=(suspected,)))[0] == (
         f'No difference is established; suspected: {suspected.effect.replace("_", " ")}.')
