@@ -589,10 +589,13 @@ class HostTimeConverter:
             for step in self._recent_steps:
                 step.is_applied = True
         interval = stamp - self._offset - previous_time
+        # late arrivals of samples whose interval is the usual one are no step of the clock
+        late = interval - arrival_interval
         unshown = [step for step in self._recent_steps if not step.is_applied]
-        found = min(unshown, key=lambda step: abs(interval - step.size), default=None)
-        if found is None or not abs(interval - found.size) < 0.5 * abs(interval) or abs(
-                interval - arrival_interval) < abs(interval - arrival_interval - found.size):
+        found = min(unshown, key=lambda step: abs(late - step.size), default=None)
+        if (found is None or abs(interval - usual_interval) < 0.5 * usual_interval
+                or abs(late) < abs(late - found.size)
+                or not (arrival_interval or abs(interval - found.size) < 0.5 * abs(interval))):
             return stamp - self._offset
         found.is_applied = True
         left = interval - found.size

@@ -350,7 +350,7 @@ INTERVAL = 0.01
 
 def driven(step, seen=0, lost=0, others=0.0):
     """Return times of samples and others; the clock is set midway, seen `seen` samples early."""
-    stamps, times, others_times = HostTimeConverter(), [], []
+    stamps, times, others_times, last = HostTimeConverter(), [], [], 0.0
     for number in range(200):
         now = INTERVAL * number
         if 100 <= number < 100 + lost:
@@ -358,7 +358,9 @@ def driven(step, seen=0, lost=0, others=0.0):
         stamps.update(now + 1e-4, 1e9 + now + (step if number >= 100 - seen else 0.0))
         stamp = 5.0 + now + (step if number >= 100 else 0.0)
         others_times.append(stamps.convert_message(stamp + others, times[-1] if times else stamp))
-        times.append(stamps.convert_sample(stamp, times[-1] if times else -np.inf, INTERVAL))
+        times.append(stamps.convert_sample(stamp, times[-1] if times else -np.inf, INTERVAL,
+                                           now - last))
+        last = now
     return np.array(times), np.array(others_times), stamps
 
 
@@ -372,9 +374,20 @@ def test_times_go_on_where_the_clock_is_set(step, seen):
             and stamps.steps.last_step == pytest.approx(step, abs=1e-6))
 
 
-def test_what_is_lost_while_the_clock_is_set_is_a_gap_of_its_own_length():
-    times, _, _ = driven(3600.0, lost=30)
-    assert np.diff(times).max() == pytest.approx(31 * INTERVAL, abs=1e-6)
+@pytest.mark.parametrize('step', [3600.0, 0.5, 0.3, -0.3, -1.0])
+@pytest.mark.parametrize('lost', [10, 25, 60])
+def test_what_is_lost_while_the_clock_is_set_is_a_gap_of_its_own_length(step, lost):
+    times, _, _ = driven(step, lost=lost)
+    assert np.diff(times).max() == pytest.approx((lost + 1) * INTERVAL, abs=1e-6)
+
+
+def test_late_arrivals_are_no_step_of_the_clock():
+    stamps, times = HostTimeConverter(), [5.0]
+    stamps.update(0.0, 1000.0)
+    stamps.update(0.1, 999.8)  # by -0.3 s, but the stamps on their way are older
+    for number, waited in enumerate([0.01, 0.25, 0.0, 0.0, 0.01], 1):
+        times.append(stamps.convert_sample(5.0 + INTERVAL * number, times[-1], INTERVAL, waited))
+    assert np.diff(times) == pytest.approx(np.full(5, INTERVAL))
 
 
 def test_another_jump_of_the_stamps_is_one():
