@@ -58,6 +58,7 @@ from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 from scipy.ndimage import binary_erosion, median_filter
 from scipy.stats import t as student
 
@@ -276,11 +277,35 @@ class Spans:
         at = self.log.time - moved.delay
         heading_change: Array = self.heading - moved.point_means(turned)
         if self.treatment.is_fine:
+            heading_change = self._difference_of_gyro(heading_change)
             steps = np.clip(np.searchsorted(self.time, at) - 1, 0, len(heading_change) - 2)
             rate = rate + (np.diff(heading_change) / np.diff(self.time))[steps]
         return replace(
             moved, channels=replace(self.channels.with_rate(rate, self.log.output),
                                     heading=turned + np.interp(at, self.time, heading_change)))
+
+    def _difference_of_gyro(self, heading_change: Array) -> Array:
+        """
+        Return the part of the difference of the headings, shape (n + 1,), that is of the gyro.
+
+        The errors of the most likely heading given both are independent of the difference of both.
+        Columns computed from it are not correlated with the noise of the observations; those of
+        the reference alone are, which matters where it errs by degrees, and those of the gyro
+        alone, which matters if two columns are nearly the same.
+
+        """
+        if not self.treatment.errs_as_heading:
+            return heading_change / (1.0 + self.reference_noise_ratio ** 2)
+        # what turned in a hole is known by the reference alone
+        in_holes = np.append(0.0, np.cumsum(np.where(
+            self.is_measured[:len(heading_change) - 1], 0.0, np.diff(heading_change))))
+        walk: Array = self.walk_bounds[0] ** 2 * np.diff(self.time)
+        second = robust_deviation(np.diff(heading_change, 2)) ** 2
+        stiffness = max(second / 6.0 - float(np.median(walk)) / 3.0, 0.0) / walk
+        banded = np.zeros((2, len(heading_change)))
+        banded[1] = 1.0 + np.append(stiffness, 0.0) + np.append(0.0, stiffness)
+        banded[0, 1:] = -stiffness
+        return np.asarray(solveh_banded(banded, heading_change - in_holes)) + in_holes
 
     def bias_wander(self) -> tuple[Array, list[SharedNoise]]:
         """Return the columns of a wandering bias, and the parts of its noise."""

@@ -93,7 +93,7 @@ def test_a_reference_that_is_known_in_too_few_blocks_gives_no_gain(known):
     generator = np.random.default_rng(5)
     logs = [drive(generator, 300.0) for _ in known]
     laid = [replay(log, where(log.time), generator) for log, where in zip(logs, known)]
-    assert measure_gain(start_search(laid, generator), {'rate_ramp'}, False) is None
+    assert measure_gain(start_search(laid), {'rate_ramp'}, False) is None
 
 
 def test_one_part_has_no_interval_and_is_not_called_worse():
