@@ -58,7 +58,7 @@ from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import fit_rate, refuse_scale, RunLimits
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
-from gyro_calibration.logs.quality import quantization_step, refuse_dead
+from gyro_calibration.logs.quality import find_holes, quantization_step, refuse_dead
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -258,10 +258,8 @@ def _refuse_length(motion: Motion) -> None:
 
 
 def _find_holes(time: Array) -> Array:
-    """Return begin and end of each hole in the samples, s, shape (k, 2)."""
-    steps = np.diff(time)
-    is_hole = steps > max(MAX_BLOCK_DURATION, 2.5 * float(np.median(steps)))
-    return np.column_stack([time[:-1], time[1:]])[is_hole]
+    """Return begin and end of each hole that is longer than a block and than usual, s, (k, 2)."""
+    return find_holes(time, max(MAX_BLOCK_DURATION, 2.5 * float(np.median(np.diff(time)))))
 
 
 def _refuse_turn_in_hole(time: Array, output: Array, motion: Motion) -> None:

@@ -53,7 +53,12 @@ from gyro_calibration.calibration.reference_noise import (
 )
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
-from gyro_calibration.logs.quality import bridge_gaps, robust_deviation, white_noise_deviation
+from gyro_calibration.logs.quality import (
+    bridge_gaps,
+    find_holes,
+    robust_deviation,
+    white_noise_deviation,
+)
 from gyro_calibration.model.channels import channels_from_log
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
@@ -358,9 +363,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     if prior is not None:
         scale, bias = np.minimum(treatment.prior[:2], prior).tolist()
         treatment = replace(treatment, prior=(scale, bias, treatment.prior[2]))
-    time, output = log.time - log.time[0], bridge_gaps(log.output)
-    measured = time[np.isfinite(log.output)]
-    white = white_noise_deviation(log.output)
+    time, measured = log.time - log.time[0], log.output
+    output, white = bridge_gaps(measured), white_noise_deviation(measured)
     reference, noisier = log.reference_heading, 0.0
     if reference is None:
         assert log.reference_rate is not None
@@ -403,7 +407,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
                  np.bincount(place, reference[known]) / count,
                  _find_rests(time, output, known), treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
-                 np.column_stack([measured[:-1], measured[1:]])[np.diff(measured) > length])
+                 find_holes(time[np.isfinite(measured)], length))
 
 
 def _find_rests(time: Array, output: Array, known: NDArray[np.intp]) -> NDArray[np.intp]:

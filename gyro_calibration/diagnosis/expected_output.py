@@ -36,7 +36,7 @@ from gyro_calibration.calibration.reference_noise import (
     step_evenness,
 )
 from gyro_calibration.diagnosis.findings import Reference
-from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.logs.log import Array, DEGREE, Log, MAX_PLAUSIBLE_FACTOR
 from gyro_calibration.logs.quality import bridge_gaps, robust_deviation, white_noise_deviation
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
@@ -96,7 +96,7 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
 
 def is_implausible_factor(factor: float) -> bool:
     """Tell whether a factor is not plausible for a gyro with the right unit."""
-    return _factor_ratio(factor, 1.0) > 1.4
+    return _factor_ratio(factor, 1.0) > MAX_PLAUSIBLE_FACTOR
 
 
 def _factor_ratio(factor: float, value: float) -> float:

@@ -527,6 +527,8 @@ class _AxisRotation:
 
 #: Largest difference from a full turn of a jump of a wrapped heading, turns.
 _FULL_TURN_MARGIN = 0.1
+#: Largest ratio of a gyro's rate to that of its reference, either way, in the same unit.
+MAX_PLAUSIBLE_FACTOR = 1.4
 
 
 def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
@@ -580,7 +582,7 @@ def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: A
     """Tell whether a heading exceeds a turn and, by the gyro, is in deg instead of rad."""
     _, factor = _heading_by_gyro(reference_time, heading, time, output)
     return (float(np.ptp(heading)) > (1.0 + _FULL_TURN_MARGIN) * 2.0 * math.pi
-            and 1.0 / 1.4 < DEGREE * abs(factor) < 1.4)
+            and 1.0 / MAX_PLAUSIBLE_FACTOR < DEGREE * abs(factor) < MAX_PLAUSIBLE_FACTOR)
 
 
 def refuse_wrapped(log: Log) -> None:
@@ -626,7 +628,7 @@ def _turns_without_gyro(log: Log, known: NDArray[np.intp]) -> Mask:
     certain = longest * np.abs(output).max() < _FULL_TURN_MARGIN * 2.0 * math.pi
     is_whole = (np.rint(turns) != 0.0) & (np.abs(turns - np.rint(turns)) < _FULL_TURN_MARGIN)
     return np.asarray(certain & is_whole & (known[1:] > known[:-1] + 1)
-                      & (1.0 / 1.4 < abs(factor) < 1.4))
+                      & (1.0 / MAX_PLAUSIBLE_FACTOR < abs(factor) < MAX_PLAUSIBLE_FACTOR))
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:

@@ -29,6 +29,11 @@ def robust_deviation(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values)))
 
 
+def find_holes(time: Array, longest: float) -> Array:
+    """Return begin and end of each interval between samples beyond a length, s, shape (k, 2)."""
+    return np.column_stack([time[:-1], time[1:]])[np.diff(time) > longest]
+
+
 def bridge_gaps(values: Array) -> Array:
     """Return values with nan interpolated linearly."""
     known = np.isfinite(values)
