@@ -226,7 +226,7 @@ class Gain:
     def rows(self) -> list[tuple[str, Change, str]]:
         """Return what was measured before and after, with its unit of SI."""
         heading = ([] if self.heading is None
-                   else [(f'heading error over {self.window:g} s', self.heading, 'rad')])
+                   else [(f'heading error over {self.window:.3g} s', self.heading, 'rad')])
         return [*heading, ('rate error', self.rate, 'rad/s')]
 
 
