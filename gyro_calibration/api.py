@@ -50,9 +50,8 @@ from gyro_calibration.cli.compensate import CompensatedBlock, integrate_log, tra
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
-from gyro_calibration.diagnosis.expected_output import REFERENCE_KINDS
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.gates import refuse_mismatch
+from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold

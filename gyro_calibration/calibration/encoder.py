@@ -30,17 +30,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.course_over_ground import (
-    fit_course,
-    is_course,
-    is_noisy,
-    MAX_FOLLOWED_RESIDUAL,
-    MAX_ROUNDING_STEP,
-)
 from gyro_calibration.calibration.dwell_search import few_values_remedy, interpolate_reference
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
-from gyro_calibration.calibration.heading_regression import MAX_ENCODER_OFFSET, TECHNOLOGY_PRIORS
+from gyro_calibration.calibration.heading_regression import (
+    fit_course,
+    is_noisy,
+    MAX_ENCODER_OFFSET,
+    MAX_FOLLOWED_RESIDUAL,
+    TECHNOLOGY_PRIORS,
+)
 from gyro_calibration.calibration.likelihood import (
     fit_likelihood,
     MAX_BLOCK_DURATION,
@@ -54,6 +53,7 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     TridiagonalMatrix,
 )
+from gyro_calibration.calibration.reference_noise import is_course, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import fit_rate, refuse_scale, RunLimits
 from gyro_calibration.heading.integration import integrate

@@ -26,6 +26,12 @@ a vehicle whose course is lost then, is one more observation: a turn by 0. What 
 kinds of references is in `ReferenceTreatment`. The computing time is proportional to the number of
 spans.
 
+A course over ground, the direction of travel by satellites, differs from the heading by the side
+slip. It is smoothed, late or early against the gyro, lost below some speed, and in bursts of some
+seconds several times less accurate. Where a drive does not determine scale factor error and bias,
+a prior does: normal about zero, with a standard deviation that is not known, but limited by the
+technology of the gyro.
+
 """
 
 from __future__ import annotations
@@ -35,7 +41,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
-from gyro_calibration.calibration.likelihood import robust_residual
+from gyro_calibration.calibration.likelihood import robust_residual, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import (
     bias_wander_columns,
     carried_shares,
@@ -49,13 +55,22 @@ from gyro_calibration.calibration.reference_noise import (
     drop_held_values,
     encoder_step,
     heading_difference,
+    MAX_ROUNDING_STEP,
     rate_noise_share,
 )
 from gyro_calibration.heading.integration import integrate, integrate_with_curvature
-from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.logs.log import (
+    Array,
+    DataRefused,
+    DEGREE,
+    Log,
+    Mask,
+    NORMAL_QUANTILE_975,
+)
 from gyro_calibration.logs.quality import (
     bridge_gaps,
     find_holes,
+    quantization_step,
     robust_deviation,
     white_noise_deviation,
 )
@@ -96,6 +111,9 @@ _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
 #: vibration.
 _MAX_VEHICLE_WALK = 5e-4
+#: Least noise of a course from span to span, rad, least number of spans to determine it, and
+#: largest deviation of the turn of a course in a span from that of a gyro that follows it, rad.
+MIN_COURSE_NOISE, MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 0.25 * DEGREE, 10, 3.0 * DEGREE
 
 
 @dataclass(frozen=True)
@@ -751,3 +769,61 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     return WhitenedRegression(np.append(noise.whiten(spans.observed), np.zeros(len(prior))),
                               np.concatenate([noise.whiten(columns), prior]), clusters,
                               int(stretches.max()) + 1, noise)
+
+
+# a course over ground
+
+def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
+    """
+    Fit scale factor error, bias and time offset to a drive.
+
+    Parameters
+    ----------
+    log : with output, time and a course
+    technology : of the gyro, one of `TECHNOLOGY_PRIORS`
+
+    Raises
+    ------
+    DataRefused : the course is known for too short a time, or the gyro does not follow it
+
+    """
+    spans = lay_out_spans(log, 'course', np.array(TECHNOLOGY_PRIORS[technology]))
+    length = spans.treatment.min_span
+    if len(spans.time) < MIN_SPANS:
+        raise DataRefused(f'the course is known for {len(spans.time) * length:.0f} s, wanted at '
+                          f'least {MIN_SPANS * length:.0f} s: drive for longer, faster than a '
+                          'walk')
+    fit = fit_spans(spans)
+    turned = np.diff(spans.heading)
+    # a bias is the same in each span
+    residual, variation = (robust_deviation(each - np.median(each))
+                           for each in (fit.spans.observed[:len(turned)], turned))
+    if residual > max(MAX_FOLLOWED_RESIDUAL, 0.5 * variation):
+        raise DataRefused(f'from span to span of {length:.0f} s the course turns by '
+                          f'{variation / DEGREE:.1f} deg, and less the gyro by '
+                          f'{residual / DEGREE:.1f} deg (robust standard deviations): the gyro '
+                          'does not follow the course. Check that both belong to one drive, and '
+                          'check axis, sign, units, and that the gyro responds')
+    # intervals of a normal distribution, as wide as those of Student's
+    deviations = np.array([fit.half_width(place) for place in range(3)]) / NORMAL_QUANTILE_975
+    widening = deviations / np.sqrt(np.diag(fit.covariance))
+    covariance = fit.covariance * np.outer(widening, widening)
+    scale, bias, delay = fit.values.tolist()
+    return ScaleBiasFit(scale, bias, covariance[:2, :2], delay, fit.fit.size('angle_random_walk'),
+                        fit.fit.size('reference'), time_offset_deviation=float(deviations[2]))
+
+
+def is_noisy(log: Log) -> bool:
+    """Tell whether a heading without steps is as noisy as a course from span to span."""
+    assert log.reference_heading is not None
+    if quantization_step(log.reference_heading[np.isfinite(log.reference_heading)]
+                         ) > MAX_ROUNDING_STEP:
+        return False
+    spans = lay_out_spans(log)
+    count = len(spans.time) - 1
+    if count < MIN_SPANS:
+        return False
+    spans = replace(spans, delay=find_delay(spans))
+    columns = np.column_stack([spans.base_columns(), spans.acceleration_changes()])[:count]
+    residual = robust_residual(columns, spans.observed[:count], 10)
+    return robust_deviation(residual) > math.sqrt(2.0) * MIN_COURSE_NOISE

@@ -21,13 +21,12 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
-from gyro_calibration.diagnosis.expected_output import REFERENCE_KINDS
 from gyro_calibration.diagnosis.extended_model import merge_self_calibration
-from gyro_calibration.diagnosis.findings import Diagnosis
+from gyro_calibration.diagnosis.findings import Diagnosis, OnProgress
+from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import render_report
-from gyro_calibration.diagnosis.steps import OnProgress
 from gyro_calibration.diagnosis.words import is_model_extended, terminal_lines
 from gyro_calibration.files import write_atomically
 from gyro_calibration.logs.log import Log

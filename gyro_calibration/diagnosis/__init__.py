@@ -11,16 +11,15 @@
 """
 Diagnosis: what a simulation of a gyro gets wrong, why, and what extending its model improves.
 
-Reading order, each imports only from those before it: `steps` (how far a diagnosis is), `findings`
-(what is found, as records), `causes` (that can be named, and experiments that distinguish them),
-`expected_output` (by the reference, its kind, and units taken for another), `gates` (which logs
-are refused, and whether gyro and reference belong together), `data_quality` (of a record: lost,
-repeated and outlying samples, codes and limits), `replay` (of a log, and the spectrum of its
-noise), `candidates` (columns of causes, and of what has no name), `regression` (of logs on causes,
-under every noise), `search` (for causes, and their confirmation), `words` (numbers and findings
-for people), `residuals` (their noise and curves), `extended_model` (and its gain on what was held
-out), `noisy_reference` (where the reference limits what is known), `pipeline` (of a diagnosis, in
-order), `dwell_fit` (of a model and causes to a rate table), `rate_table` (the diagnosis of a rate
-table), `charts` (in pages), `report` (the page).
+Reading order, each imports only from those before it: `findings` (what is found, as records),
+`causes` (that can be named, and experiments that distinguish them), `gates` (which logs are
+refused, whether gyro and reference belong together, and the kind of the reference), `data_quality`
+(of a record: lost, repeated and outlying samples, codes and limits), `replay` (of a log, and the
+spectrum of its noise), `candidates` (columns of causes, and of what has no name), `regression` (of
+logs on causes, under every noise), `search` (for causes, and their confirmation), `words` (numbers
+and findings for people), `residuals` (their noise and curves), `extended_model` (and its gain on
+what was held out), `noisy_reference` (where the reference limits what is known), `pipeline` (of a
+diagnosis, in order), `dwell_fit` (of a model and causes to a rate table), `rate_table` (the
+diagnosis of a rate table), `report` (the page).
 
 """

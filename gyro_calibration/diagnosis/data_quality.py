@@ -31,7 +31,8 @@ import math
 from gyro_calibration.calibration.dwell_search import require_output
 from gyro_calibration.calibration.reference_noise import encoder_step, update_interval
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
-from gyro_calibration.diagnosis.expected_output import (
+from gyro_calibration.diagnosis.findings import Estimate, Finding
+from gyro_calibration.diagnosis.gates import (
     compare_output,
     fit_line,
     identify_unit_factor,
@@ -39,10 +40,10 @@ from gyro_calibration.diagnosis.expected_output import (
     model_scale_factor,
     OutputComparison,
     reference_rate,
+    resample_reference,
+    select_reference,
     UNIT_FACTORS,
 )
-from gyro_calibration.diagnosis.findings import Estimate, Finding
-from gyro_calibration.diagnosis.gates import resample_reference, select_reference
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps,

@@ -12,14 +12,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 from gyro_calibration.logs.log import Array, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
+
+#: Is called with the share of the work done, None if unknown, and the step that begins.
+OnProgress: TypeAlias = Callable[[float | None, str], object]
 
 SCHEMA = 'gyro_calibration/diagnosis/2'
 #: Why a model is not offered.

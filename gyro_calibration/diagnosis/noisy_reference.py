@@ -61,13 +61,13 @@ from gyro_calibration.diagnosis.findings import (
     Gain,
     MIN_PROBABILITY,
     NOT_OFFERED,
+    OnProgress,
     probabilities,
     Reference,
     SUSPECTED_RATE_FACTOR,
     Trace,
 )
 from gyro_calibration.diagnosis.search import MIN_PREDICTION_SIGMAS, prediction_sigmas
-from gyro_calibration.diagnosis.steps import CHECKS_STEP, OnPart, OnProgress, ProgressSteps
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
@@ -80,9 +80,6 @@ from scipy.stats import t as student
 
 #: Kinds of references that are sampled with the gyro, by one clock.
 _SAME_CLOCK = ('rate_command', 'encoder')
-#: Shares of the steps in the computing time, %, measured on 25 min of an encoder at 100 Hz.
-_STEP_SHARES = {CHECKS_STEP: 4, 'data quality': 3, 'bias and scale factor error': 26,
-                'search for causes': 45, 'cross-validation': 4, 'findings': 18}
 #: Standard deviations of a value that is found in 95 % of logs.
 DETECTION_SIGMAS = 4.8
 #: Longest lag of a gyro, s.
@@ -129,11 +126,10 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     reference : its kind
     model : of the simulation; None is an ideal gyro
     false_alarm_rate : of false alarms
-    on_progress : is called with the share of the work done and the name of the step that begins
+    on_progress : is called with None and the name of each step that begins
 
     """
-    steps = ProgressSteps(on_progress, _STEP_SHARES)
-    steps.begin('data quality')
+    on_progress(None, 'data quality')
     if reference.kind != 'rate_command' and log.reference_heading is not None:
         log = replace(log, reference_rate=None)
     else:
@@ -142,14 +138,13 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     assert log.output is not None
     cleaned_log = replace(log, output=np.where(record.usable, log.output, np.nan))
     prior = None if model is None else model.prior_deviations
-    steps.begin('bias and scale factor error')
+    on_progress(None, 'bias and scale factor error')
     if model is not None:
         cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
     plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior))
-    steps.begin('search for causes')
     extended, found = search_causes(plain, _SEARCH_ALARM_SHARE * false_alarm_rate,
-                                    steps.begin_part)
-    steps.begin('cross-validation')
+                                    on_progress)
+    on_progress(None, 'cross-validation')
     gain = _cross_validated_gain(plain, extended)
     model_fit = extended
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
@@ -159,7 +154,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
             found = [replace(each, is_established=False) for each in found]
             extended = plain
         gain = _cross_validated_gain(plain, plain)
-    steps.begin('findings')
+    on_progress(None, 'findings')
     parts, time = _heading_contributions(extended), extended.spans.time
     noise = {name: extended.noise_size(name) for name in ('reference', 'motion')}
     rates = extended.spans.point_means(np.asarray(extended.spans.channels.rate))
@@ -508,7 +503,7 @@ def _follows_the_rate(cause: str) -> bool:
 
 
 def search_causes(fit: SpanFit, false_alarm_rate: float,
-                  on_part: OnPart) -> tuple[SpanFit, list[FoundCause]]:
+                  on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
     found: list[FoundCause] = []
     candidates = propose_terms(fit)
@@ -518,7 +513,7 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
     while len(found) < MAX_CAUSES:
         found_terms = [each.cause_term for each in found]
         names = {each.cause for each in found_terms}
-        on_part(f'search for causes after {len(found)} found' if found else 'search for causes')
+        on_progress(None, f'search for causes, {len(found)} found')
         data = whiten_regression(fit, found_terms, rich_fit, use_max_random_walk=True)
         best = _find_best_cause(fit.spans, data,
                                 [each for each in candidates if each.cause not in names],

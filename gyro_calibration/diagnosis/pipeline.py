@@ -34,11 +34,6 @@ from gyro_calibration.diagnosis.causes import (
     REFERENCES,
 )
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, resolve_unit
-from gyro_calibration.diagnosis.expected_output import (
-    classify_reference,
-    identify_sample_offset,
-    is_reference_limiting,
-)
 from gyro_calibration.diagnosis.extended_model import (
     add_causes,
     add_origin_notes,
@@ -57,13 +52,17 @@ from gyro_calibration.diagnosis.findings import (
     Gain,
     Gate,
     NOT_OFFERED,
+    OnProgress,
     probabilities,
     Unexplained,
 )
 from gyro_calibration.diagnosis.gates import (
     check_gates,
     check_model_units,
+    classify_reference,
+    identify_sample_offset,
     is_at_rest,
+    is_reference_limiting,
     mismatch_finding,
     refuse_unusable,
 )
@@ -104,7 +103,6 @@ from gyro_calibration.diagnosis.search import (
     UNPREDICTIVE,
     withdraw_names,
 )
-from gyro_calibration.diagnosis.steps import CHECKS_STEP, OnProgress, ProgressSteps
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
@@ -126,12 +124,6 @@ _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K'
                      'supply': 'the supply voltage does not change',
                      'specific_force': 'the specific force does not change'}
 
-#: Shares of the steps in the computing time, %.
-_STEP_SHARES = {**dict.fromkeys((CHECKS_STEP, 'data quality', 'replay of the model'), 1),
-                'search for causes': 80,
-                **dict.fromkeys(('alternatives', 'noise figures', 'cross-validation',
-                                 'findings'), 4)}
-
 #: A cause and its alternatives, each with its deficit in log-likelihood.
 Alternatives = Sequence[tuple[SelectedCause, float]]
 
@@ -151,7 +143,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         best
     false_alarm_rate : false alarms per diagnosis
     names : file names of the logs, for messages
-    on_progress : is called with the share of the work done and the name of the step that begins
+    on_progress : is called with None and the name of each step that begins
     reference_kind : of the reference, one of `expected_output.REFERENCE_KINDS`; None is found
         from the log
 
@@ -160,7 +152,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     DataRefused : a diagnosis of these logs is not possible
 
     """
-    on_progress(0.0, CHECKS_STEP)
+    on_progress(None, 'checks of the log')
     given_model, model = model, None if model is None else merge_self_calibration(model)
     all_gates: list[Gate] = []
     for place, log in enumerate(logs):
@@ -203,20 +195,18 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                                  model: GyroModel | None, rate: float, names: Sequence[str],
                                  on_progress: OnProgress) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
-    steps = ProgressSteps(on_progress, _STEP_SHARES)
-    steps.begin('data quality')
+    on_progress(None, 'data quality')
     quality = [resolve_unit(inspect_record(log, model)) for log in logs]
-    steps.begin('replay of the model')
+    on_progress(None, 'replay of the model')
     replays = [replay(replace(log, output=clean.unit_factor * require_output(log)), clean.usable,
                       generator, clean.update_interval, clean.heading_step, clean.output_step,
                       model)
                for log, clean in zip(logs, quality)]
-    steps.begin('search for causes')
-    search = start_search(replays, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
+    search = start_search(replays, _SEARCH_ALARM_SHARE * rate, on_progress)
     everything = search_causes(search)
     averaged = average_filtered_noise(fit_causes(search.problem, everything)).problem.replays
     if averaged is not search.problem.replays:
-        search = start_search(averaged, _SEARCH_ALARM_SHARE * rate, steps.begin_part)
+        search = start_search(averaged, _SEARCH_ALARM_SHARE * rate, on_progress)
         everything = search_causes(search)
     named, unnamed = withdraw_names(search, everything)
     named, removed = confirm(search, named)
@@ -224,18 +214,18 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                    if why == UNPREDICTIVE and is_lasting(each.candidate)]
     refuted = {each.candidate.cause: why for each, why in removed.items()
                if each not in unconfirmed}
-    steps.begin('alternatives')
+    on_progress(None, 'alternatives')
     named, sets = choose_simplest(search, named, unnamed)
     found = fit_causes(search.problem, named)
     out = unmergeable_causes(model or GyroModel(), found)
-    steps.begin('noise figures')
+    on_progress(None, 'noise figures')
     # without a model, rounding of the output counts only if it is a finding
     rounds = (any(each.effect == QUANTIZATION.name for clean in quality for each in clean.findings)
               if model is None else any(term.effect is QUANTIZATION for term in model.terms))
     simulated = Noise() if model is None else model.noise
     figures = fit_noise_parameters(found, simulated, rounds)
     noise = figures.noise
-    steps.begin('cross-validation')
+    on_progress(None, 'cross-validation')
     changed = [] if model is None else _model_value_findings(found, model, noise, rate)
     within = [(known, members) for known, members in zip(named, sets) if known not in out]
     lasting = any(not is_single_event(known) for known, _ in within)
@@ -244,7 +234,7 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
         tried = {each.candidate.cause for _, members in within for each, _ in members}
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
-    steps.begin('findings')
+    on_progress(None, 'findings')
     taken = {each.candidate.cause for each in named}
     doubtful = (tuple(each for each in unconfirmed if each.candidate.cause not in taken)
                 or find_suspected(search, (*named, *unnamed)))

@@ -55,10 +55,10 @@ from gyro_calibration.diagnosis.findings import (
     Estimate,
     Finding,
     Gain,
+    OnProgress,
     Unexplained,
 )
 from gyro_calibration.diagnosis.gates import refuse_unusable
-from gyro_calibration.diagnosis.steps import OnProgress
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (

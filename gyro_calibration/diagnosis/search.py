@@ -20,7 +20,7 @@ that are held out, and if the interval of its size excludes 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 import math
 from typing import Any
@@ -39,7 +39,11 @@ from gyro_calibration.diagnosis.candidates import (
     with_shape,
 )
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.findings import RULED_OUT_DEFICIT, SUSPECTED_RATE_FACTOR
+from gyro_calibration.diagnosis.findings import (
+    OnProgress,
+    RULED_OUT_DEFICIT,
+    SUSPECTED_RATE_FACTOR,
+)
 from gyro_calibration.diagnosis.regression import (
     add_cause,
     build_problem,
@@ -165,7 +169,7 @@ class Search:
     scanned_causes : causes that are scanned for over all frequencies or times
     unidentifiable : causes that these logs cannot distinguish from bias and scale factor error
     columns_cache, step_cache : caches of columns and of steps, by the named causes
-    on_part : is called with the name of each part of the work as it begins
+    on_progress : is called with None and the name of each step that begins
 
     """
 
@@ -177,7 +181,7 @@ class Search:
     columns_cache: dict[tuple[Any, ...], CandidateColumns] = field(default_factory=dict)
     step_cache: dict[tuple[Any, ...], tuple[SearchStep | None, list[SearchStep]]] = field(
         default_factory=dict)
-    on_part: Callable[[str], object] = lambda words: None
+    on_progress: OnProgress = lambda share, words: None
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -190,9 +194,9 @@ class Search:
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
-                 on_part: Callable[[str], object] = lambda words: None) -> Search:
+                 on_progress: OnProgress = lambda share, words: None) -> Search:
     """Set up a search: candidates and noises."""
-    on_part('candidate causes')
+    on_progress(None, 'candidate causes')
     found = [*propose_candidates(replays), *generic_terms(replays)]
     problem = build_problem(replays)
     columns, fit = make_candidate_columns(problem, found), fit_causes(problem, [])
@@ -200,8 +204,10 @@ def start_search(replays: Sequence[Replay], rate: float = 0.006,
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
     shown, places = columns.evidence(fit), indices_by_cause(found)
-    return Search(problem, columns, rate / len(places), on_part=on_part, unidentifiable=frozenset(
-        cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
+    unidentifiable = frozenset(
+        cause for cause, own in places.items() if not np.isfinite(shown[own]).any())
+    return Search(problem, columns, rate / len(places), on_progress=on_progress,
+                  unidentifiable=unidentifiable)
 
 
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
@@ -239,8 +245,7 @@ def find_strongest(search: Search,
     key = tuple((each.candidate.cause, each.candidate.log_index, *each.candidate.shapes)
                 for each in causes)
     if key not in search.step_cache:
-        search.on_part(f'search for causes after {len(causes)} found' if causes
-                       else 'search for causes')
+        search.on_progress(None, f'search for causes, {len(causes)} found')
         search.step_cache[key] = _search_strongest(search, causes)
     return search.step_cache[key]
 

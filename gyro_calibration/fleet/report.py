@@ -17,9 +17,16 @@ import csv
 import io
 from typing import Any
 
-from gyro_calibration.diagnosis.charts import Chart, draw_chart, element, join_markup, Line, Markup
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.report import render_page
+from gyro_calibration.diagnosis.report import (
+    Chart,
+    draw_chart,
+    element,
+    join_markup,
+    Line,
+    Markup,
+    render_page,
+)
 from gyro_calibration.diagnosis.words import (
     as_sentence,
     display_unit,

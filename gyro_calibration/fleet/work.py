@@ -40,10 +40,10 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.diagnosis.data_quality import inspect_record
-from gyro_calibration.diagnosis.expected_output import is_implausible_factor
 from gyro_calibration.diagnosis.gates import (
     check_gates,
     is_at_rest,
+    is_implausible_factor,
     mismatch_finding,
     refuse_unusable,
 )
@@ -162,7 +162,7 @@ class LogTask:
 
     entry: FleetLog
     folder: str  # of the results
-    technology: str = 'mems'  # of the gyros, one of `course_over_ground.TECHNOLOGY_PRIORS`
+    technology: str = 'mems'  # of the gyros, one of `heading_regression.TECHNOLOGY_PRIORS`
     file_pattern: re.Pattern[str] | None = None  # by `table.compile_file_pattern`
     #: For the diagnosis, the same for each log; None without a diagnosis.
     generator: np.random.Generator | None = None

@@ -22,14 +22,15 @@ from gyro_calibration.diagnosis.data_quality import (
     inspect_record,
     update_interval,
 )
-from gyro_calibration.diagnosis.expected_output import (
+from gyro_calibration.diagnosis.gates import (
     compare_output,
     encoder_step,
     identify_sample_offset,
     identify_unit_factor,
+    is_at_rest,
+    refuse_unusable,
     UNIT_FACTORS,
 )
-from gyro_calibration.diagnosis.gates import is_at_rest, refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import find_codes

@@ -15,10 +15,7 @@ from dataclasses import replace
 from diagnosed import judge_findings, log_of
 from gyro_calibration.calibration.heading_regression import CauseTerm, fit_spans, lay_out_spans
 from gyro_calibration.calibration.reference_noise import heading_difference, rate_noise_share
-from gyro_calibration.diagnosis.expected_output import (
-    classify_reference,
-    is_reference_limiting,
-)
+from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.noisy_reference import search_causes
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import render_report

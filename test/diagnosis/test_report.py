@@ -18,7 +18,7 @@ from pathlib import Path
 import re
 import subprocess
 
-from gyro_calibration.diagnosis import charts
+from gyro_calibration.diagnosis import report
 from gyro_calibration.diagnosis.causes import mark_suspected
 from gyro_calibration.diagnosis.findings import (
     Change,
@@ -279,7 +279,7 @@ def test_every_chart_has_words_and_a_table_of_its_values(made):
 
 def test_without_matplotlib_the_values_are_there_without_pictures(monkeypatch):
     tables = render_report(extended()).count('<table')
-    monkeypatch.setattr(charts, 'find_spec', lambda name: None)
+    monkeypatch.setattr(report, 'find_spec', lambda name: None)
     text = render_report(extended())
     assert '<svg' not in text and text.count('<table') == tables
     assert 'matplotlib is not installed' in text
