@@ -118,28 +118,18 @@ MIN_COURSE_NOISE, MIN_SPANS, MAX_FOLLOWED_RESIDUAL = 0.25 * DEGREE, 10, 3.0 * DE
 
 @dataclass(frozen=True)
 class ReferenceTreatment:
-    """
-    Settings of the comparison of a kind of reference with the gyro.
+    """Settings of the comparison of a kind of reference with the gyro."""
 
-    Attributes
-    ----------
-    min_span : least length, s
-    max_spans : largest number of spans of a log
-    prior : standard deviations of scale factor error, bias (rad/s) and delay (s)
-    walk_range : smallest and largest angle random walk, in units of `Spans.walk_bounds`
-    stretch_duration : length of stretches whose scores are independent, s
-    is_fine : whether its errors are small enough to show a random walk of the bias, and events
-    errs_as_heading : whether it has errors of a heading, not of an integrated rate
-
-    """
-
-    min_span: float
-    max_spans: int
+    min_span: float  # least length, s
+    max_spans: int  # largest number of spans of a log
+    # standard deviations of scale factor error, bias (rad/s) and delay (s)
     prior: tuple[float, float, float]
+    # smallest and largest angle random walk, in units of `Spans.walk_bounds`
     walk_range: tuple[float, float]
-    stretch_duration: float
+    stretch_duration: float  # length of stretches whose scores are independent, s
+    # whether its errors are small enough to show a random walk of the bias, and events
     is_fine: bool
-    errs_as_heading: bool
+    errs_as_heading: bool  # whether it has errors of a heading, not of an integrated rate
 
 
 COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0), (0.1, 1.0),
@@ -169,41 +159,27 @@ class CauseTerm(NamedTuple):
 
 @dataclass(frozen=True)
 class Spans:
-    """
-    One log as n spans between n + 1 points, and r rests.
+    """One log as n spans between n + 1 points, and r rests."""
 
-    Attributes
-    ----------
-    log : with output, time and reference heading
-    channels : inputs of the effects; the rate is that of the gyro, as corrected so far
-    value_times : times of the known values of the reference, s
-    point_index : point of each of them
-    time, heading : of the points, s and rad, shape (n + 1,)
-    rests : first and last row of each rest in a gap of the reference, shape (r, 2)
-    treatment : of the kind of the reference
-    walk_bounds : the angle random walk by the white noise of the samples, with that of a reference
-        rate, and by the difference of gyro and reference over a second, the smaller first, rad/√s
-    reference_noise_ratio : ratio of the noise of a reference rate to that of the gyro
-    uses_code_changes : whether the points are changes of the code of an encoder
-    holes : begin and end of each hole in the output that is as long as a span, s, shape (k, 2);
-        over a span that meets one, nothing is compared, and its observation is 0
-    delay : of the stamps of the gyro relative to the reference, s
-
-    """
-
-    log: Log
-    channels: Channels
-    value_times: Array
-    point_index: NDArray[np.intp]
+    log: Log  # with output, time and reference heading
+    channels: Channels  # inputs of the effects; the rate is that of the gyro, as corrected so far
+    value_times: Array  # times of the known values of the reference, s
+    point_index: NDArray[np.intp]  # point of each of them
+    # time, heading: of the points, s and rad, shape (n + 1,)
     time: Array
     heading: Array
+    # first and last row of each rest in a gap of the reference, shape (r, 2)
     rests: NDArray[np.intp]
-    treatment: ReferenceTreatment
+    treatment: ReferenceTreatment  # of the kind of the reference
+    # the angle random walk by the white noise of the samples, with that of a reference rate, and
+    # by the difference of gyro and reference over a second, the smaller first, rad/√s
     walk_bounds: tuple[float, float]
-    reference_noise_ratio: float
-    uses_code_changes: bool
+    reference_noise_ratio: float  # ratio of the noise of a reference rate to that of the gyro
+    uses_code_changes: bool  # whether the points are changes of the code of an encoder
+    # begin and end of each hole in the output that is as long as a span, s, shape (k, 2); over a
+    # span that meets one, nothing is compared, and its observation is 0
     holes: Array
-    delay: float = 0.0
+    delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
 
     @property
     def is_measured(self) -> Mask:
@@ -442,27 +418,16 @@ def _find_rests(time: Array, output: Array, known: NDArray[np.intp]) -> NDArray[
 
 @dataclass(frozen=True)
 class SpanFit:
-    """
-    A regression with its noise.
+    """A regression with its noise."""
 
-    Attributes
-    ----------
-    spans : the log
-    causes : in addition to scale factor error, bias and delay
-    fit : of the restricted likelihood
-    values, covariance : estimates and their cluster-robust covariance
-    effective_stretches : effective number of stretches that determine each value
-    freedom : degrees of freedom of the deviation of each value
-
-    """
-
-    spans: Spans
-    causes: tuple[CauseTerm, ...]
-    fit: GridFit
+    spans: Spans  # the log
+    causes: tuple[CauseTerm, ...]  # in addition to scale factor error, bias and delay
+    fit: GridFit  # of the restricted likelihood
+    # values, covariance: estimates and their cluster-robust covariance
     values: Array
     covariance: Array
-    effective_stretches: Array
-    freedom: Array
+    effective_stretches: Array  # effective number of stretches that determine each value
+    freedom: Array  # degrees of freedom of the deviation of each value
 
     def half_width(self, value_index: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
@@ -714,21 +679,15 @@ class WhitenedRegression:
     The m priors of the values and of the wandering bias are rows after those of the observations.
     Each of them is a separate cluster.
 
-    Attributes
-    ----------
-    observed : shape (n + r + m,)
-    design : columns of scale factor error, bias, delay and causes, then those of the wander
-    clusters : numbers of the stretch of each row, and, of an encoder, of the place of the shaft
-    stretch_count : number of stretches of the log; those after them are priors
-    noise : that whitens
-
     """
 
-    observed: Array
+    observed: Array  # shape (n + r + m,)
+    # columns of scale factor error, bias, delay and causes, then those of the wander
     design: Array
+    # numbers of the stretch of each row, and, of an encoder, of the place of the shaft
     clusters: tuple[NDArray[np.intp], ...]
-    stretch_count: int
-    noise: GridFit
+    stretch_count: int  # number of stretches of the log; those after them are priors
+    noise: GridFit  # that whitens
 
     def whiten_columns(self, columns: Array) -> Array:
         """Return more columns, shape (n + r, k), in units of the noise, (n + r + m, k)."""

@@ -117,20 +117,14 @@ def step_evenness(log: Log, step: float) -> float:
 
 @dataclass(frozen=True)
 class HeadingDifference:
-    """
-    Difference of the headings of gyro and reference over a second.
+    """Difference of the headings of gyro and reference over a second."""
 
-    Attributes
-    ----------
-    constant_error : standard deviation of the part that does not grow with time, rad: errors of
-        the reference, of stamps, or by vibration of the gyro
-    walk : angle random walk of the rest, at most that of the white noise of the gyro, rad/√s
-    total_walk : angle random walk that is equivalent to the whole difference in a second, rad/√s
-
-    """
-
+    # standard deviation of the part that does not grow with time, rad: errors of the reference, of
+    # stamps, or by vibration of the gyro
     constant_error: float
+    # angle random walk of the rest, at most that of the white noise of the gyro, rad/√s
     walk: float
+    # angle random walk that is equivalent to the whole difference in a second, rad/√s
     total_walk: float
 
     @property

@@ -46,26 +46,17 @@ ColumnFunction = Callable[[Replay], Sequence[Array]]
 
 @dataclass(frozen=True)
 class Candidate:
-    """
-    One cause with its shapes.
+    """One cause with its shapes."""
 
-    Attributes
-    ----------
-    cause : its name
-    shapes : their values, in the order of the effect
-    columns : of a log
-    log_index : number of the log for a single event; None for a cause in all logs
-    amplitude : fixed coefficient of its column if only shapes are fitted; None if it is free
-    half_width : of the range in which its shape, a time or a frequency, is searched; None for a
-        shape that is searched in logarithms
-
-    """
-
-    cause: str
-    shapes: tuple[float, ...]
-    columns: ColumnFunction
+    cause: str  # its name
+    shapes: tuple[float, ...]  # their values, in the order of the effect
+    columns: ColumnFunction  # of a log
+    # number of the log for a single event; None for a cause in all logs
     log_index: int | None = None
+    # fixed coefficient of its column if only shapes are fitted; None if it is free
     amplitude: float | None = None
+    # of the range in which its shape, a time or a frequency, is searched; None for a shape that is
+    # searched in logarithms
     half_width: float | None = None
 
 

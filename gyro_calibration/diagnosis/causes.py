@@ -33,29 +33,16 @@ REFERENCES = ('reference_rate', 'reference_heading')
 
 @dataclass(frozen=True)
 class Cause:
-    """
-    One cause.
+    """One cause."""
 
-    Attributes
-    ----------
-    name : as in the catalogue of effects and in files
-    sentence : description for people
-    units : estimated parameter -> SI unit
-    required_channels : columns of a log that are required to show it; 'reference' is one of
-        `REFERENCES`
-    along : the variable along which it shows
-    separate_by : the experiment that distinguishes it from similar causes; '' without one
-    origin : what is to be corrected: 'gyro', 'reference', 'record' or 'noise'
-
-    """
-
-    name: str
-    sentence: str
-    units: Mapping[str, str]
+    name: str  # as in the catalogue of effects and in files
+    sentence: str  # description for people
+    units: Mapping[str, str]  # estimated parameter -> SI unit
+    # columns of a log that are required to show it; 'reference' is one of `REFERENCES`
     required_channels: frozenset[str]
-    along: str
-    separate_by: str
-    origin: str
+    along: str  # the variable along which it shows
+    separate_by: str  # the experiment that distinguishes it from similar causes; '' without one
+    origin: str  # what is to be corrected: 'gyro', 'reference', 'record' or 'noise'
 
     @property
     def unit(self) -> str:

@@ -96,9 +96,7 @@ def local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
     Return an upper bound of the step of codes near each value, shape (n,).
 
     Steps grow with the values of 32-bit floats and of decimals with a number of significant
-    digits; or they are too small to be determined. They are at most the smallest gap between
-    values of the same size or larger, and at most ten times the smallest relative step, as with a
-    number of digits.
+    digits.
 
     """
     steps = np.full(len(output), max(
@@ -120,18 +118,10 @@ def local_code_steps(codes: QuantizationCodes, output: Array) -> Array:
 
 @dataclass(frozen=True)
 class DeadBand:
-    """
-    A frequent value without other values near it.
+    """A frequent value without other values near it."""
 
-    Attributes
-    ----------
-    value : rad/s
-    half_width : distance of the nearest other value, rad/s
-
-    """
-
-    value: float
-    half_width: float
+    value: float  # rad/s
+    half_width: float  # distance of the nearest other value, rad/s
 
     def contains(self, output: Array) -> Mask:
         """Mark the samples in it."""
@@ -165,19 +155,12 @@ def _rest_rate_limit(output: Array) -> float:
 
 @dataclass(frozen=True)
 class Limit:
-    """
-    Largest and smallest code of a saturated output.
+    """Largest and smallest code of a saturated output."""
 
-    Attributes
-    ----------
-    low, high : the limit on each side, infinite where there is none
-    p_value : the chance that an output without one repeats its extreme codes as often
-
-    """
-
+    # low, high: the limit on each side, infinite where there is none
     low: float
     high: float
-    p_value: float
+    p_value: float  # the chance that an output without one repeats its extreme codes as often
 
     @property
     def size(self) -> float:
@@ -193,17 +176,11 @@ class Limit:
 def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
                level: float) -> Limit | None:
     """
-    Return the limit of an output, or None where it shows none.
+    Return the limit of an output, or None, by a test of this level on each side.
 
     An extreme code is a limit if it is larger than the output at rest; if it is more frequent than
     its neighbours, which are more frequent without a limit; and if the expected output is beyond
     it, which is not so for a coarse code at a constant rate.
-
-    Parameters
-    ----------
-    codes : of the output
-    comparison : output and expectation
-    level : chance of a false alarm on one side
 
     """
     chances = {}
@@ -239,39 +216,19 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
 
 @dataclass(frozen=True)
 class SampleFault:
-    """
-    Faulty samples.
+    """Faulty samples."""
 
-    Attributes
-    ----------
-    is_faulty : mask of the samples, shape (n,)
-    p_value : of their number, or of the length of a run
-    size : expected number, at most, of what is tested: unlikely repeats, or such runs; or the
-        largest deviation of outliers in standard deviations
-    is_by_run : whether a run of repeats is tested, not their number
-
-    """
-
-    is_faulty: Mask
-    p_value: float
+    is_faulty: Mask  # mask of the samples, shape (n,)
+    p_value: float  # of their number, or of the length of a run
+    # expected number, at most, of what is tested: unlikely repeats, or such runs; or the largest
+    # deviation of outliers in standard deviations
     size: float
-    is_by_run: bool = False
+    is_by_run: bool = False  # whether a run of repeats is tested, not their number
 
 
 def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
                           band: DeadBand | None, valid: Mask, level: float) -> SampleFault | None:
-    """
-    Find repeated samples, or return None.
-
-    Parameters
-    ----------
-    comparison : output and expectation
-    codes : of the output
-    band : of rates that the output has one value for, if it has one
-    valid : samples to look at; the codes explain repeats at a limit
-    level : chance of a false alarm
-
-    """
+    """Find repeated samples among valid ones, or return None."""
     known, change = valid[1:] & valid[:-1], np.diff(comparison.output)
     same = (change == 0.0) & known
     expected = (np.zeros(len(change)) if comparison.expected is None
@@ -349,18 +306,7 @@ def _robust_quantile(off: Array) -> float:
 
 def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
                   level: float) -> SampleFault | None:
-    """
-    Find outliers, or return None.
-
-    Parameters
-    ----------
-    comparison : output and expectation
-    valid : samples that count; next to three and more of six that do not, as after a run of
-        repeats, one is not tested
-    min_scatter : the scatter is at least this, rad/s: half a code
-    level : chance of a false alarm
-
-    """
+    """Find outliers among valid samples, or return None; `min_scatter` is half a code."""
     output = bridge_gaps(np.where(valid, comparison.output, np.nan))
     limit = max(_MIN_OUTLIER_SIGMAS, float(stats.norm.isf(0.25 * level / len(output))))
     # how much the output is expected to change about each sample, and how far it jumps
@@ -435,29 +381,19 @@ def _outlier_sigmas(values: Array, off: Array, expected_change: Array, valid: Ma
 
 @dataclass(frozen=True)
 class DataQuality:
-    """
-    Faults of a record, and the samples to use.
+    """Faults of a record, and the samples to use."""
 
-    Attributes
-    ----------
-    findings : one for each cause
-    remarks : for people, one sentence each
-    usable : the samples to use, shape (n,)
-    unit_factor : by which the output is multiplied to be in rad/s; 1 if the unit is right
-    limit : largest absolute output, rad/s after the factor; None without a limit
-    output_step : quantization step of the output, rad/s after the factor; 0 if it does not matter
-    heading_step : quantization step of the reference heading, rad; 0 without one
-    update_interval : of a reference that is held in between, s; None if it is new in each sample
-
-    """
-
-    findings: tuple[Finding, ...]
-    remarks: tuple[str, ...]
-    usable: Mask
+    findings: tuple[Finding, ...]  # one for each cause
+    remarks: tuple[str, ...]  # for people, one sentence each
+    usable: Mask  # the samples to use, shape (n,)
+    # by which the output is multiplied to be in rad/s; 1 if the unit is right
     unit_factor: float = 1.0
+    # largest absolute output, rad/s after the factor; None without a limit
     limit: float | None = None
+    # quantization step of the output, rad/s after the factor; 0 if it does not matter
     output_step: float = 0.0
-    heading_step: float = 0.0
+    heading_step: float = 0.0  # quantization step of the reference heading, rad; 0 without one
+    # of a reference that is held in between, s; None if it is new in each sample
     update_interval: float | None = None
 
 

@@ -291,11 +291,7 @@ def _extended_covariance(model: GyroModel, new: Sequence[Term],
     """
     Return the covariance of all fitted values of a model with new terms; None if unknown before.
 
-    Parameters
-    ----------
-    model : whose values come first; new ones are independent of them
-    new : the added terms
-    term_covariance : covariance of all their values
+    New values, with a covariance of their own, are independent of those of the model.
 
     """
     if model.terms and model.covariance is None:
@@ -341,16 +337,8 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     """
     Hold out every third block, select and fit causes without them, and predict them.
 
-    Parameters
-    ----------
-    search : of the whole logs
-    causes : the named causes and their confounders
-    has_model : whether there is a model; the error before is then that of the model, otherwise
-        that of the best bias and scale factor
-
-    Returns
-    -------
-    the gain; None if the logs are too short, or too few of their samples are used
+    The error before is that of the model, or of the best bias and scale factor without one. None
+    if the logs are too short, or too few of their samples are used.
 
     """
     replays = search.problem.replays
@@ -392,8 +380,7 @@ def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: A
     Parameters
     ----------
     held_out : description of the parts
-    squares : model -> sums of squares of each part: of the rate error, and of the heading error
-        over windows, shape (parts, 2)
+    squares : model -> sums of squares of the errors of rate and heading, shape (parts, 2)
     counts : numbers of squares in the sums, shape (parts, 2)
     before : the model that the extended one is compared with
     window : s; None if the parts are shorter
@@ -449,11 +436,7 @@ def heading_contributions(fit: RegressionFit, log_index: int,
     """
     Return the contributions to the change of heading of a log, rad, and its times, s.
 
-    Parameters
-    ----------
-    fit : of the log and others
-    log_index : number of the log
-    plain_fit : bias and scale factor of the simulation, if they were fitted; else None
+    The fit of the bias and scale factor of the simulation is subtracted, if these were fitted.
 
     """
     each = fit.problem.replays[log_index]
@@ -520,11 +503,6 @@ def jackknife_change(square_sums: Array, counts: Array) -> Change:
 
     Bootstrap intervals are too narrow for few parts, so the jackknife is used (Tukey 1958): each
     part is left out in turn, and the change has Student's distribution.
-
-    Parameters
-    ----------
-    square_sums : sums of squares of each part, before and after, shape (parts, 2)
-    counts : numbers of squares in the sums, shape (parts,)
 
     """
     before, after = np.sqrt(square_sums.sum(axis=0) / counts.sum())

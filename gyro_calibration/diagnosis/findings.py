@@ -98,25 +98,15 @@ def probabilities(deficits: Mapping[str, float]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Gate(Record):
-    """
-    A check before causes are named.
-
-    Attributes
-    ----------
-    name : wrapped_heading, motion, sense, unit, time_unit or model
-    passed : None if the log does not show it
-    evidence : the measured numbers, in words
-    remedy : what to do if it failed
-    factor : ratio of the output to the reference and its 95 % interval, if it failed by that
-
-    """
+    """A check before causes are named."""
 
     KEYS = {'evidence': 'said', 'factor': None}
 
-    name: str
-    passed: bool | None
-    evidence: str
-    remedy: str = ''
+    name: str  # wrapped_heading, motion, sense, unit, time_unit or model
+    passed: bool | None  # None if the log does not show it
+    evidence: str  # the measured numbers, in words
+    remedy: str = ''  # what to do if it failed
+    # ratio of the output to the reference and its 95 % interval, if it failed by that
     factor: tuple[float, tuple[float, float]] | None = None
 
 
@@ -176,20 +166,14 @@ class Unexplained(Record):
 
 @dataclass(frozen=True)
 class Change(Record):
-    """
-    A root mean square error before and after the extension.
-
-    Attributes
-    ----------
-    before, after : the errors
-    interval : 95 % interval of before less after; None if a single part was held out
-
-    """
+    """A root mean square error before and after the extension."""
 
     KEYS = {'interval': 'ci95'}
 
+    # before, after: the errors
     before: float
     after: float
+    # 95 % interval of before less after; None if a single part was held out
     interval: tuple[float, float] | None
 
     @property
@@ -235,48 +219,31 @@ class Gain:
 
 @dataclass(frozen=True)
 class Curve:
-    """
-    The residual along one variable, in bins, for charts: arrays of shape (bins,), in SI.
+    """The residual along one variable, in bins, for charts: arrays of shape (bins,), in SI."""
 
-    Attributes
-    ----------
-    along : rate, temperature, heading, time, frequency ...
-    unit : of `at`, SI
-    at : middle of each bin
-    before, after : mean of the residual there, against the model that was given and against the
-        extended one, rad/s
-    deviation : standard deviation of these means by noise alone, slow noise included, rad/s; along
-        frequency, where amplitudes replace means, the root mean square amplitude
-    simulated : mean error, output less true rate, of the simulation with the given model there,
-        rad/s; the measured one is the sum of this and `before`
-
-    """
-
-    along: str
-    unit: str
-    at: Array
+    along: str  # rate, temperature, heading, time, frequency ...
+    unit: str  # of `at`, SI
+    at: Array  # middle of each bin
+    # before, after: mean of the residual there, against the model that was given and against the
+    # extended one, rad/s
     before: Array
     after: Array
+    # standard deviation of these means by noise alone, slow noise included, rad/s; along
+    # frequency, where amplitudes replace means, the root mean square amplitude
     deviation: Array
+    # mean error, output less true rate, of the simulation with the given model there, rad/s; the
+    # measured one is the sum of this and `before`
     simulated: Array | None = None
 
 
 @dataclass(frozen=True)
 class Trace:
-    """
-    Measured and simulated output over time: arrays of shape (n,), s and rad/s.
+    """Measured and simulated output over time: arrays of shape (n,), s and rad/s."""
 
-    Attributes
-    ----------
-    time : s, as in the log
-    measured : output of the gyro
-    simulated, extended : output of the given and of the extended model for the same motion,
-        without noise
-
-    """
-
-    time: Array
-    measured: Array
+    time: Array  # s, as in the log
+    measured: Array  # output of the gyro
+    # simulated, extended: output of the given and of the extended model for the same motion,
+    # without noise
     simulated: Array
     extended: Array
 
@@ -302,21 +269,13 @@ class NoiseCurve:
 
 @dataclass(frozen=True)
 class Reference(Record):
-    """
-    The reference of a log.
-
-    Attributes
-    ----------
-    kind : rate_command, encoder, motion_capture, course, odometry, gyro or rest
-    evidence : how the kind was found, in words
-    noise : name -> size of the errors of the reference, SI; empty if it is taken as exact
-
-    """
+    """The reference of a log."""
 
     KEYS = {'evidence': 'known'}
 
-    kind: str
-    evidence: str
+    kind: str  # rate_command, encoder, motion_capture, course, odometry, gyro or rest
+    evidence: str  # how the kind was found, in words
+    # name -> size of the errors of the reference, SI; empty if it is taken as exact
     noise: Mapping[str, float] = field(default_factory=dict)
 
 

@@ -159,22 +159,12 @@ class LineFit:
 
 @dataclass(frozen=True)
 class OutputComparison:
-    """
-    Output and expectation, in rad/s, shape (n,).
+    """Output and expectation, in rad/s, shape (n,)."""
 
-    Attributes
-    ----------
-    output : without nan; gaps are interpolated
-    expected : from the reference, nan in its gaps; None without a reference
-    noise_deviation : standard deviation of the white noise of a sample
-    deviation : standard deviation of a sample from the expected output, at least that
-
-    """
-
-    output: Array
-    expected: Array | None
-    noise_deviation: float
-    deviation: float
+    output: Array  # without nan; gaps are interpolated
+    expected: Array | None  # from the reference, nan in its gaps; None without a reference
+    noise_deviation: float  # standard deviation of the white noise of a sample
+    deviation: float  # standard deviation of a sample from the expected output, at least that
 
 
 def compare_output(output: Array, expected: Array | None) -> OutputComparison:
@@ -486,21 +476,13 @@ _SAMPLE_INTERVAL_RANGE = (2e-5, 0.25)
 
 
 class Agreement(NamedTuple):
-    """
-    Agreement of the heading of the reference with the integral of the output over spans.
+    """Agreement of the heading of the reference with the integral of the output over spans."""
 
-    Attributes
-    ----------
-    factor, deviation : change of the reference over that of the integral; its standard deviation
-    coherence : common share of the variance
-    residual : standard deviation, rad
-
-    """
-
+    # factor, deviation: change of the reference over that of the integral; its standard deviation
     factor: float
     deviation: float
-    coherence: float
-    residual: float
+    coherence: float  # common share of the variance
+    residual: float  # standard deviation, rad
 
 
 def check_gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:

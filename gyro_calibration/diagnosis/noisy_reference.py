@@ -117,18 +117,7 @@ _MAX_LIKELIHOOD_RATIO = 25.0
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
                                 false_alarm_rate: float, on_progress: OnProgress) -> Diagnosis:
-    """
-    Diagnose a log with a reference whose errors are larger than those of the gyro.
-
-    Parameters
-    ----------
-    log : with output, time and a reference
-    reference : its kind
-    model : of the simulation; None is an ideal gyro
-    false_alarm_rate : of false alarms
-    on_progress : is called with None and the name of each step that begins
-
-    """
+    """Diagnose a log with a reference whose errors are larger than those of the gyro."""
     on_progress(None, 'data quality')
     if reference.kind != 'rate_command' and log.reference_heading is not None:
         log = replace(log, reference_rate=None)
@@ -436,26 +425,14 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True)
 class FoundCause:
-    """
-    A cause that the search found.
+    """A cause that the search found."""
 
-    Attributes
-    ----------
-    cause_term : the cause
-    p_value : of the best of all candidates in noise, cluster-robust
-    prediction_gain : gain in log-likelihood on held-out stretches
-    selection_share : share of the folds in which the same cause was selected
-    is_established : whether it is confirmed
-    probability : of the cause and of its alternatives, by name
-
-    """
-
-    cause_term: CauseTerm
-    p_value: float
-    prediction_gain: float
-    selection_share: float
-    is_established: bool
-    probability: dict[str, float]
+    cause_term: CauseTerm  # the cause
+    p_value: float  # of the best of all candidates in noise, cluster-robust
+    prediction_gain: float  # gain in log-likelihood on held-out stretches
+    selection_share: float  # share of the folds in which the same cause was selected
+    is_established: bool  # whether it is confirmed
+    probability: dict[str, float]  # of the cause and of its alternatives, by name
 
 
 def propose_terms(fit: SpanFit) -> list[CauseTerm]:
@@ -640,10 +617,8 @@ def _cross_fit(data: WhitenedRegression, columns: Array, places: Sequence[slice]
     """
     Select and fit without each fold, and predict it.
 
-    Returns
-    -------
-    gain in log-likelihood over its standard deviation by the scatter of stretches, the gain, and
-    the share of the folds in which one of the equivalent causes was selected
+    Return the gain in log-likelihood over its standard deviation by the scatter of stretches, the
+    gain, and the share of the folds in which one of the equivalent causes was selected.
 
     """
     gains: list[float] = []

@@ -63,45 +63,26 @@ _LIKELIHOOD_DROP_95 = 1.92
 
 @dataclass(frozen=True)
 class SelectedCause:
-    """
-    A selected cause.
+    """A selected cause."""
 
-    Attributes
-    ----------
-    candidate : the cause with its shapes
-    values : coefficients of its columns; empty before a fit, and its shapes are then fixed
-    penalty : penalty for the choice of its first shapes, in log-likelihood
-
-    """
-
-    candidate: Candidate
+    candidate: Candidate  # the cause with its shapes
+    # coefficients of its columns; empty before a fit, and its shapes are then fixed
     values: tuple[float, ...] = ()
-    penalty: float = 0.0
+    penalty: float = 0.0  # penalty for the choice of its first shapes, in log-likelihood
 
 
 @dataclass(frozen=True)
 class RegressionProblem:
-    """
-    The logs and the noises that are tried.
+    """The logs and the noises that are tried."""
 
-    Attributes
-    ----------
-    replays : the logs, with the reference rate
-    deviation : standard deviation of each coefficient by the first noise, relative to that of
-        white noise, shape (m,); residual and columns are divided by it
-    band_starts : first coefficient of each band, shape (b,)
-    noise_shapes : noises that are tried
-    weights : one over the variance of each band relative to the first noise, shape (g, b)
-    log_determinants : of the relative variances, and of the prior probability, shape (g,)
-
-    """
-
-    replays: tuple[Replay, ...]
+    replays: tuple[Replay, ...]  # the logs, with the reference rate
+    # standard deviation of each coefficient by the first noise, relative to that of white noise,
+    # shape (m,); residual and columns are divided by it
     deviation: Array
-    band_starts: Indices
-    noise_shapes: tuple[NoiseShape, ...]
-    weights: Array
-    log_determinants: Array
+    band_starts: Indices  # first coefficient of each band, shape (b,)
+    noise_shapes: tuple[NoiseShape, ...]  # noises that are tried
+    weights: Array  # one over the variance of each band relative to the first noise, shape (g, b)
+    log_determinants: Array  # of the relative variances, and of the prior probability, shape (g,)
 
     def coefficient_angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
@@ -182,39 +163,27 @@ class Value:
 
 @dataclass(frozen=True)
 class RegressionFit:
-    """
-    A regression with some causes.
+    """A regression with some causes."""
 
-    Attributes
-    ----------
-    problem : the logs and noises
-    distorted : the logs with the rate that the gyro senses, distorted by causes
-    causes : causes
-    residual : whitened, less the columns of causes of fixed amplitude, shape (m,)
-    columns : whitened and independent: scale factor error, those of the causes, and derivatives
-        with respect to their shapes, shape (q, m)
-    column_owners : of each column: (index of the cause, or -1 for the scale factor error; index of
-        its value, or -1 less index of its shape)
-    column_counts : number of columns with free values of each cause
-    information, scores : of the columns under each noise, shapes (g, q, q) and (g, q)
-    residual_squares : sum of whitened squares that are left under each noise, shape (g,)
-    noise_log_likelihood : restricted log likelihood of each noise, shape (g,)
-    lasting_only : whether single events of the gyro are fitted, but excluded from the
-        contributions, as in a model for other logs
-
-    """
-
-    problem: RegressionProblem
+    problem: RegressionProblem  # the logs and noises
+    # the logs with the rate that the gyro senses, distorted by causes
     distorted: tuple[Replay, ...]
-    causes: tuple[SelectedCause, ...]
-    residual: Array
+    causes: tuple[SelectedCause, ...]  # causes
+    residual: Array  # whitened, less the columns of causes of fixed amplitude, shape (m,)
+    # whitened and independent: scale factor error, those of the causes, and derivatives with
+    # respect to their shapes, shape (q, m)
     columns: Array
+    # of each column: (index of the cause, or -1 for the scale factor error; index of its value, or
+    # -1 less index of its shape)
     column_owners: tuple[tuple[int, int], ...]
-    column_counts: tuple[int, ...]
+    column_counts: tuple[int, ...]  # number of columns with free values of each cause
+    # information, scores: of the columns under each noise, shapes (g, q, q) and (g, q)
     information: Array
     scores: Array
-    residual_squares: Array
-    noise_log_likelihood: Array
+    residual_squares: Array  # sum of whitened squares that are left under each noise, shape (g,)
+    noise_log_likelihood: Array  # restricted log likelihood of each noise, shape (g,)
+    # whether single events of the gyro are fitted, but excluded from the contributions, as in a
+    # model for other logs
     lasting_only: bool = False
 
     # the likelihood
@@ -519,13 +488,9 @@ def _independent_columns(columns: Array) -> list[int]:
 def column_evidence(fit: RegressionFit, columns: Array,
                     groups: Sequence[Sequence[int]]) -> Array:
     """
-    Return the evidence of candidates given a fit, shape (groups,), -inf if unidentifiable.
+    Return the evidence of groups of columns given a fit, shape (groups,), -inf if unidentifiable.
 
-    Parameters
-    ----------
-    fit : the causes already selected
-    columns : whitened columns of the candidates, shape (p, m)
-    groups : the indices of the columns of each candidate
+    The columns of the candidates are whitened, shape (p, m).
 
     """
     problem, freedom = fit.problem, fit.degrees_of_freedom

@@ -42,26 +42,16 @@ from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """
-    A noise relative to its white part: variance of a coefficient over that of white noise.
+    """A noise relative to its white part: variance of a coefficient over that of white noise."""
 
-    Attributes
-    ----------
-    walk_ratio : rate random walk, K² / N², 1/s²
-    markov_ratio : variance of the Gauss-Markov part over the spectral density of the white one,
-        1/s
-    correlation_time : of the Gauss-Markov part, s
-    rounding_ratio : variance of the reference's rounding over the interval squared, relative to
-        that of a white sample
-    flicker_corner : frequency where the spectral density of flicker, B² / (2 pi f), is the white
-        one, Hz
-
-    """
-
-    walk_ratio: float = 0.0
+    walk_ratio: float = 0.0  # rate random walk, K² / N², 1/s²
+    # variance of the Gauss-Markov part over the spectral density of the white one, 1/s
     markov_ratio: float = 0.0
-    correlation_time: float = 1.0
+    correlation_time: float = 1.0  # of the Gauss-Markov part, s
+    # variance of the reference's rounding over the interval squared, relative to that of a white
+    # sample
     rounding_ratio: float = 0.0
+    # frequency where the spectral density of flicker, B² / (2 pi f), is the white one, Hz
     flicker_corner: float = 0.0
 
     def variance(self, angle: Array, interval: Array | float) -> Array:
@@ -162,39 +152,23 @@ _MAX_POINTS_PER_SAMPLE, _SHORT_LOG_POINTS = 5, 10_000
 
 @dataclass(frozen=True)
 class Replay:
-    """
-    One log prepared for the search: n samples, of which some are used.
+    """One log prepared for the search: n samples, of which some are used."""
 
-    Attributes
-    ----------
-    channels : inputs of the effects; the rate is that of the reference, smoothed, the time is that
-        since the first sample
-    reference : the rate that the output is compared with, rad/s, as measured
-    valid : mask of the samples that are used
-    grid_index : index of each used sample on the even grid
-    interval : of the grid, s
-    decimation : number of grid points that are averaged into one
-    fill_noise : white noise of variance 1 for missing grid points, shape (place[-1] + 1,)
-    heading_step : quantization step of the heading whose derivative is the reference, rad; 0
-        without
-    available_channels : names of the channels of the log
-    simulated_error : error of the simulated output, rad/s, shape (n,), which is subtracted from
-        `channels.output`
-    rounding_variance : variance of a sample by quantization of the output, (rad/s)²
-
-    """
-
+    # inputs of the effects; the rate is that of the reference, smoothed, the time is that since
+    # the first sample
     channels: Channels
-    reference: Array
-    valid: Mask
-    grid_index: NDArray[np.intp]
-    interval: float
-    decimation: int
-    fill_noise: Array
+    reference: Array  # the rate that the output is compared with, rad/s, as measured
+    valid: Mask  # mask of the samples that are used
+    grid_index: NDArray[np.intp]  # index of each used sample on the even grid
+    interval: float  # of the grid, s
+    decimation: int  # number of grid points that are averaged into one
+    fill_noise: Array  # white noise of variance 1 for missing grid points, shape (place[-1] + 1,)
+    # quantization step of the heading whose derivative is the reference, rad; 0 without
     heading_step: float
-    available_channels: frozenset[str]
+    available_channels: frozenset[str]  # names of the channels of the log
+    # error of the simulated output, rad/s, shape (n,), which is subtracted from `channels.output`
     simulated_error: Array
-    rounding_variance: float = 0.0
+    rounding_variance: float = 0.0  # variance of a sample by quantization of the output, (rad/s)²
 
     @property
     def point_interval(self) -> float:

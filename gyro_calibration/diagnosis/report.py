@@ -332,53 +332,34 @@ def _escaped(text: str) -> str:
 
 @dataclass(frozen=True)
 class Line:
-    """
-    One line of a chart.
+    """One line of a chart."""
 
-    Attributes
-    ----------
-    name : for legend and table
-    style : measured, simulated, before or after: colour and stroke
-    values : shape (n,), nan where missing
-    deviation : of the values, drawn as a band or as bars of 95 %; None where it is not known
-    draw_dots : draw dots instead of a line
-
-    """
-
-    name: str
-    style: str
-    values: Array
+    name: str  # for legend and table
+    style: str  # measured, simulated, before or after: colour and stroke
+    values: Array  # shape (n,), nan where missing
+    # of the values, drawn as a band or as bars of 95 %; None where it is not known
     deviation: Array | None = None
-    draw_dots: bool = False
+    draw_dots: bool = False  # draw dots instead of a line
 
 
 @dataclass(frozen=True)
 class Chart:
-    """
-    A chart, in displayed units.
+    """A chart, in displayed units."""
 
-    Attributes
-    ----------
-    name : of the chart, unique on the page
-    title, description : for people, also for screen readers
-    x_label, x_unit, x : label, unit and values of the horizontal axis, shape (n,)
-    y_label, y_unit, lines : label, unit and lines of the vertical axis
-    is_logarithmic : both axes
-    x_names : of the horizontal values, if they are numbered from 1 on
-
-    """
-
-    name: str
+    name: str  # of the chart, unique on the page
+    # title, description: for people, also for screen readers
     title: str
     description: str
+    # x_label, x_unit, x: label, unit and values of the horizontal axis, shape (n,)
     x_label: str
     x_unit: str
     x: Array
+    # y_label, y_unit, lines: label, unit and lines of the vertical axis
     y_label: str
     y_unit: str
     lines: Sequence[Line]
-    is_logarithmic: bool = False
-    x_names: Sequence[str] = ()
+    is_logarithmic: bool = False  # both axes
+    x_names: Sequence[str] = ()  # of the horizontal values, if they are numbered from 1 on
 
 
 #: Colour in the light theme, its name in the style of the page, and stroke of a style.

@@ -47,40 +47,24 @@ CURVE_BINS, CURVE_POINTS, _MAX_ALLAN_SAMPLES = 40, 600, 1 << 18
 
 @dataclass(frozen=True)
 class NoiseParameters:
-    """
-    Noise fitted to a residual.
+    """Noise fitted to a residual."""
 
-    Attributes
-    ----------
-    noise : the figures
-    intervals : of 95 % of each, by name
-    p_values : p-value of the model's figure, by name
-
-    """
-
-    noise: Noise
-    intervals: dict[str, tuple[float, float]]
-    p_values: dict[str, float]
+    noise: Noise  # the figures
+    intervals: dict[str, tuple[float, float]]  # of 95 % of each, by name
+    p_values: dict[str, float]  # p-value of the model's figure, by name
 
 
 @dataclass(frozen=True)
 class BandEnergies:
-    """
-    The coefficients of b bands.
+    """The coefficients of b bands."""
 
-    Attributes
-    ----------
-    energy, count : of each band
-    unit_variances : variance of the bands by a figure of 1, shape (b, 3), or (b, 4) with rounding
-        of the reference
-    known_variance : variance by other noise, shape (b,)
-
-    """
-
+    # energy, count: of each band
     energy: Array
     count: Array
+    # variance of the bands by a figure of 1, shape (b, 3), or (b, 4) with rounding of the
+    # reference
     unit_variances: Array
-    known_variance: Array
+    known_variance: Array  # variance by other noise, shape (b,)
 
     def take(self, kept: NDArray[np.bool_]) -> BandEnergies:
         """Return some of the bands."""
@@ -222,15 +206,7 @@ def model_residuals(replays: Sequence[Replay]) -> list[Array]:
 
 
 def residual_curves(before: Sequence[Array], after: RegressionFit) -> list[Curve]:
-    """
-    Return the mean residual in bins of each variable that changes in the logs.
-
-    Parameters
-    ----------
-    before : residual of the simulation for each log, rad/s, shape (n,)
-    after : the extended simulation
-
-    """
+    """Return the mean residual in bins of each variable, before and after the extension."""
     replays = after.problem.replays
     simulated = [each.simulated_error + error - rest
                  for each, error, rest in zip(replays, model_residuals(replays), before)]

@@ -116,20 +116,11 @@ def p_value(cause: str, evidence: float) -> float:
 
 @dataclass(frozen=True)
 class CandidateColumns:
-    """
-    Candidates with their columns, for the rate that the gyro senses.
+    """Candidates with their columns, for the rate that the gyro senses."""
 
-    Attributes
-    ----------
-    candidates : causes with their first shapes
-    groups : indices of the columns of each candidate
-    columns : whitened, shape (p, m)
-
-    """
-
-    candidates: tuple[Candidate, ...]
-    groups: tuple[tuple[int, ...], ...]
-    columns: Array
+    candidates: tuple[Candidate, ...]  # causes with their first shapes
+    groups: tuple[tuple[int, ...], ...]  # indices of the columns of each candidate
+    columns: Array  # whitened, shape (p, m)
 
     def evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
@@ -158,29 +149,21 @@ class SearchStep:
 
 @dataclass(frozen=True)
 class Search:
-    """
-    State of a search.
+    """State of a search."""
 
-    Attributes
-    ----------
-    problem : the logs
-    candidate_columns : columns of all candidates without causes that distort the rate
-    rate : false alarms per cause
-    scanned_causes : causes that are scanned for over all frequencies or times
-    unidentifiable : causes that these logs cannot distinguish from bias and scale factor error
-    columns_cache, step_cache : caches of columns and of steps, by the named causes
-    on_progress : is called with None and the name of each step that begins
-
-    """
-
-    problem: RegressionProblem
+    problem: RegressionProblem  # the logs
+    # columns of all candidates without causes that distort the rate
     candidate_columns: CandidateColumns
-    rate: float
+    rate: float  # false alarms per cause
+    # causes that are scanned for over all frequencies or times
     scanned_causes: frozenset[str] = frozenset(MAX_PER_LOG)
+    # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
+    # columns_cache, step_cache: caches of columns and of steps, by the named causes
     columns_cache: dict[tuple[Any, ...], CandidateColumns] = field(default_factory=dict)
     step_cache: dict[tuple[Any, ...], tuple[SearchStep | None, list[SearchStep]]] = field(
         default_factory=dict)
+    # is called with None and the name of each step that begins
     on_progress: OnProgress = lambda share, words: None
 
     @property
@@ -236,10 +219,8 @@ def find_strongest(search: Search,
     """
     Search for one more cause.
 
-    Returns
-    -------
-    the best step, None if no cause is significant, and all refined steps, the best first; if no
-    cause is significant, those of suspected causes
+    Return the best step, None if no cause is significant, and all refined steps, the best first;
+    if no cause is significant, those of suspected causes.
 
     """
     key = tuple((each.candidate.cause, each.candidate.log_index, *each.candidate.shapes)
@@ -308,16 +289,7 @@ def _columns_given_causes(search: Search, causes: Sequence[SelectedCause]) -> Ca
 
 
 def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> SearchStep:
-    """
-    Add a cause with its best shape near the given one.
-
-    Parameters
-    ----------
-    fit : fit to which the cause is added
-    candidate : the cause
-    penalty : penalty for the choice of its shape, in log-likelihood
-
-    """
+    """Add a cause with its best shape near the given one, less the penalty for this choice."""
     if fitted_shape_indices(candidate) and candidate.cause != 'reference_slip':
         place = fitted_shape_indices(candidate)[0]
         if candidate.cause in _SHAPE_EXPONENTS:  # begin with the shape that a free amplitude has
@@ -610,9 +582,7 @@ def confirm(search: Search, causes: Causes) -> tuple[Causes, dict[SelectedCause,
     """
     Remove causes that do not predict held-out stretches, or whose intervals include 0.
 
-    Returns
-    -------
-    the confirmed causes, and the removed ones with the reason
+    Return the confirmed causes, and the removed ones with the reason.
 
     """
     removed = {}
@@ -681,9 +651,7 @@ def choose_simplest(search: Search, named: Causes, unnamed: Causes,
     """
     Replace each cause by its simplest alternative.
 
-    Returns
-    -------
-    the causes, and for each itself and its alternatives, with their deficits in log-likelihood
+    Return the causes, and for each itself and its alternatives, with deficits in log-likelihood.
 
     """
     def size(known: SelectedCause) -> int:
