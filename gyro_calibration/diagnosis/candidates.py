@@ -32,7 +32,7 @@ from scipy.interpolate import BSpline
 
 #: Least step rate of an encoder, 1/s, at which a dead zone is searched for.
 MIN_ENCODER_STEP_RATE = 20.0
-#: Times of a bias step that are tried in all logs together.
+#: Times of a bias step, and of a bump, that are tried in all logs together.
 MAX_STEP_TIMES = 64
 #: Least change of a channel in a log, K, V and m/s²; with less it counts as missing.
 MIN_CHANNEL_RANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
@@ -241,13 +241,12 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 #: Prefix of the name of structure without a name; its variable follows.
 UNNAMED_PREFIX = '~'
-#: Numbers of waves over the range of rate and temperature, and of knots of splines; other
-#: variables have a spline of the first number alone.
-WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), (8, 24)
+#: Numbers of waves over the range of rate and temperature, and of knots of splines.
+WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), 8
 #: Harmonics of the heading.
 HEADING_HARMONICS = range(2, 11)
-#: Largest number of times of a bump in a log, and its widths as shares of the duration.
-MAX_BUMP_TIMES, BUMP_WIDTHS = 40, (0.007, 0.02, 0.05)
+#: Widths of a bump in time as shares of the duration.
+BUMP_WIDTHS = (0.007, 0.02, 0.05)
 
 Variable = Callable[[Replay], Array]
 
@@ -266,11 +265,9 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give the generic terms that these logs may show."""
     variables = dict(_scaled_variables(replays))
     for name, of in variables.items():
-        is_fine = name in ('rate', 'temperature')
-        for count in WAVE_COUNTS if is_fine else ():
+        for count in WAVE_COUNTS if name in ('rate', 'temperature') else ():
             yield _unnamed_term(name, _wave_columns(of, np.pi * count))
-        for count in SPLINE_KNOTS if is_fine else SPLINE_KNOTS[:1]:
-            yield _unnamed_term(name, _spline_columns(of, count))
+        yield _unnamed_term(name, _spline_columns(of))
     if 'rate' in variables:
         for number in HEADING_HARMONICS:
             yield _unnamed_term('heading', _wave_columns(_heading, number))
@@ -285,7 +282,7 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     for run, each in enumerate(replays):
         begin = float(each.channels.time[each.valid][0])
         for width in BUMP_WIDTHS:
-            count = min(MAX_BUMP_TIMES, round(1.0 / width)) // len(replays) + 3
+            count = min(MAX_STEP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
                 yield _unnamed_term('time', _bump_columns(moment, width * each.duration), run,
                                     moment)
@@ -332,8 +329,8 @@ def _wave_columns(phase: Variable, number: float,
     return columns
 
 
-def _spline_columns(variable: Variable, count: int) -> ColumnFunction:
-    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
+def _spline_columns(variable: Variable) -> ColumnFunction:
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, SPLINE_KNOTS - 2), [1.0] * 3])
     # their sum is constant, as the bias is
     return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
 

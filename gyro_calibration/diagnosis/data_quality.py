@@ -66,23 +66,20 @@ FALSE_ALARM_CHANCE = 2e-4
 #: Least step of codes that matters, as a share of the white noise; the same for a step of the
 #: reference, as a share of the variance.
 MIN_STEP_NOISE_RATIO, MIN_STEP_VARIANCE_SHARE = 0.2, 0.02
-#: Step of codes, as a share of the white noise, below which codes hardly repeat by chance; and
-#: least number of separate runs of an extreme code, which a repetition fault does not cause.
-_FINE_STEP_NOISE_RATIO, _MIN_LIMIT_RUNS = 0.1, 3
+#: Least number of separate runs of an extreme code, which a repetition fault does not cause.
+_MIN_LIMIT_RUNS = 3
 #: Output of a rest, as a share of the largest; a limit is higher, and a dead band is lower.
 _REST_RATE_SHARE = 0.1
-#: Samples whose expected output is within so many standard deviations of a limit are not used,
-#: because noise determines whether they are clipped.
-_LIMIT_MARGIN_SIGMAS = 4.0
 #: Number of classes of motion, by the expected change near a sample.
 _MOTION_CLASSES = 8
 #: Probability of a repeat from which on single repeats of a coarse output are not tested, and up
 #: to which they are marked as a fault.
 _COARSE_REPEAT_CHANCE, _RARE_REPEAT_CHANCE = 0.3, 0.02
-#: Least deviation of an outlier in standard deviations (more for very long logs); and deviation
-#: from which on to that of outliers there are at most half as many samples as outliers: more are a
-#: tail of the noise.
-_MIN_OUTLIER_SIGMAS, _NEAR_OUTLIER_SIGMAS = 6.0, 4.5
+#: Least deviation of an outlier in standard deviations (more for very long logs); and a deviation
+#: that noise reaches rarely: from there to that of outliers there are at most half as many samples
+#: as outliers, as more are a tail of the noise, and samples whose expected output is as near to a
+#: limit are not used, as noise determines whether they are clipped.
+_MIN_OUTLIER_SIGMAS, _RARE_SIGMAS = 6.0, 4.5
 #: Numbers of neighbours on each side with which a sample is compared, of samples between a jolt in
 #: the output and in the reference, of samples in a block of constant scatter, and of consecutive
 #: outliers, at most.
@@ -185,7 +182,7 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
     """
     chances = {}
     deviation, noise = comparison.deviation, comparison.noise_deviation
-    fine = codes.step < _FINE_STEP_NOISE_RATIO * noise
+    fine = codes.step < MIN_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
         values, counts = ((codes.values, codes.counts) if sign > 0.0
                           else (-codes.values[::-1], codes.counts[::-1]))
@@ -327,8 +324,8 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
     for run in find_runs(outlying):
         outlying[run] = run.stop - run.start <= _MAX_OUTLIER_RUN
     count = int(np.count_nonzero(outlying))
-    near = int(np.count_nonzero((sigmas > _NEAR_OUTLIER_SIGMAS) & (sigmas <= limit) & tested))
-    usual = stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_NEAR_OUTLIER_SIGMAS))
+    near = int(np.count_nonzero((sigmas > _RARE_SIGMAS) & (sigmas <= limit) & tested))
+    usual = stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_RARE_SIGMAS))
     if not count or near > 0.5 * count + usual:
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
@@ -505,12 +502,6 @@ def _check_samples(found: DataQuality, comparison: OutputComparison, has_output:
                 else limit.is_reached(output))
     valid, band = has_output & ~at_limit, find_dead_band(codes, output)
     repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
-    limit_runs = find_runs(at_limit)
-    if repeated is not None and len(limit_runs) == 1 and np.count_nonzero(at_limit) - 1 <= 2 * max(
-            run.stop - run.start for run in find_runs(repeated.is_faulty)):
-        # one run at a limit that is like the others is one of repeats
-        limit, at_limit, valid = None, np.zeros_like(at_limit), has_output
-        repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     valid = valid if repeated is None else valid & ~repeated.is_faulty
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(
@@ -520,7 +511,7 @@ def _check_samples(found: DataQuality, comparison: OutputComparison, has_output:
     away_from_limit = np.ones(len(output), dtype=bool)
     if limit is not None and comparison.expected is not None:
         # by the expected output: a selection by the measured output would be biased by its noise
-        near = _LIMIT_MARGIN_SIGMAS * comparison.deviation
+        near = _RARE_SIGMAS * comparison.deviation
         away_from_limit = ~(
             (comparison.expected > limit.high - near) | (comparison.expected < limit.low + near))
     findings = (*found.findings, *_code_findings(codes, comparison, limit, at_limit, model),

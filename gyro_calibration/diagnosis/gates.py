@@ -68,11 +68,9 @@ from scipy.signal import savgol_filter
 _FACTORS = {'pi/180': DEGREE, '180/pi': 1.0 / DEGREE, '2': 2.0, '1/2': 0.5}
 _COMMON_FACTORS: Mapping[str, float] = {
     **_FACTORS, '-1': -1.0, **{f'-{name}': -value for name, value in _FACTORS.items()}}
-#: Powers of two instead of powers of ten, and vice versa.
-_BINARY_FACTORS: Mapping[str, float] = {
-    **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)},
-    '1000/1024': 1000.0 / 1024.0, '1048576/1000000': 1.048576, '1000000/1048576': 1.0 / 1.048576}
-UNIT_FACTORS: Mapping[str, float] = {**_COMMON_FACTORS, **_BINARY_FACTORS}
+#: And powers of two instead of powers of ten.
+UNIT_FACTORS: Mapping[str, float] = {
+    **_COMMON_FACTORS, **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)}}
 #: Largest ratio of the factor of a gyro to 1 in the right unit, or to the factor of another unit.
 MAX_GYRO_RATIO = 1.1
 #: Largest relative difference between a factor and that of a unit.

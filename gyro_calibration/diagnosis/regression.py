@@ -57,8 +57,6 @@ MIN_INDEPENDENT_SHARE = 1e-7
 #: Longest averaging interval of filtered noise, s, and largest ratio of its power in the last to
 #: that in the second quarter of the frequencies.
 _MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO = 0.25, 0.7
-#: Drop of the log-likelihood at the ends of a 95 % interval.
-_LIKELIHOOD_DROP_95 = 1.92
 
 
 @dataclass(frozen=True)
@@ -524,7 +522,7 @@ def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) ->
     """Return the standard deviation of a shape by the profile of the likelihood."""
     candidate = fit.causes[cause_index].candidate
     others = fit_causes(fit.problem, fit.causes[:cause_index] + fit.causes[cause_index + 1:])
-    least = add_cause(others, candidate).log_likelihood - _LIKELIHOOD_DROP_95
+    least = add_cause(others, candidate).log_likelihood - 0.5 * NORMAL_QUANTILE_975 ** 2
     shape = candidate.shapes[shape_index]
 
     def is_below_threshold(by: float) -> bool:

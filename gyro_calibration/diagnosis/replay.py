@@ -131,11 +131,8 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
-#: Ratio of the power in the last to that in the second quarter of the frequencies, below which a
-#: record was smoothed (jumps have 0.18, noise not less). Longest averaging interval for it, s.
-_SMOOTHED_POWER_RATIO, _MAX_AVERAGING_TIME = 0.05, 0.03
-#: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
-_SMOOTHING_BINS, _ROUNDING_POWER_FACTOR = 101, 1.5
+#: Frequencies over which the power of a rate is averaged.
+_SMOOTHING_BINS = 101
 #: Update intervals of a held reference, and steps of its change, from which on a constant value is
 #: a standstill.
 _STANDSTILL_FACTOR = 1.5
@@ -145,9 +142,8 @@ _GAP_MARGIN_SAMPLES = 4
 #: Least bend of the rate at a corner as a share of the white noise: a thousand of them with one
 #: sign are 3 sigma. Largest share of corners.
 _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
-#: Largest number of grid points per sample, and number of points up to which it is not limited:
-#: most of a log must not be interpolated.
-_MAX_POINTS_PER_SAMPLE, _SHORT_LOG_POINTS = 5, 10_000
+#: Largest number of grid points per sample: most of a log must not be interpolated.
+_MAX_POINTS_PER_SAMPLE = 5
 
 
 @dataclass(frozen=True)
@@ -290,12 +286,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
                     if getattr(log, name) is not None)
     rounded = heading_step if prepared_log.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
-    expected_rounding = (_expected_rounding(log.output, smooth, kept, output_step) if output_step
-                         else np.zeros(len(time)))
-    coarse = max(output_step ** 2 / 12.0 - float(np.var(expected_rounding[kept])), 0.0)
-    plain = Replay(replace(channels, output=log.output - expected_rounding), reference, kept,
-                   place, interval, every, filling, rounded, has, np.zeros(len(time)), coarse)
-    plain = replace(plain, decimation=every * _smoothing_decimation(plain))
+    plain = Replay(channels, reference, kept, place, interval, every, filling, rounded, has,
+                   np.zeros(len(time)), output_step ** 2 / 12.0)
     if model is None:
         return plain
     # the error by the model is subtracted from the output, and effects use its distorted rate
@@ -308,7 +300,7 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
 def _refuse_gaps(time: Array, grid_index: NDArray[np.intp]) -> None:
     """Refuse a log of which most is missing, as after a jump of the clock."""
     points = int(grid_index[-1]) + 1
-    if points <= max(_MAX_POINTS_PER_SAMPLE * len(grid_index), _SHORT_LOG_POINTS):
+    if points <= _MAX_POINTS_PER_SAMPLE * len(grid_index):
         return
     gaps = np.diff(time)
     longest = int(np.argmax(gaps))
@@ -327,47 +319,6 @@ def _even_time(time: Array) -> Array:
     if not stamps.has_bursts:
         return time - time[0]
     return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
-
-
-def _smoothing_decimation(base_replay: Replay) -> int:
-    """
-    Return the factor of the number of points to average, so that strong smoothing does not show.
-
-    Otherwise the small errors of motion and reference would have so much weight at the highest
-    frequencies that a first search would name many causes for them.
-
-    """
-    residual, factor, decimation = base_replay.channels.output - base_replay.reference, 1, 1
-    while 2 * factor * base_replay.point_interval <= _MAX_AVERAGING_TIME:
-        averaged = replace(base_replay, decimation=base_replay.decimation * factor)
-        power = averaged.transform_samples(residual) ** 2
-        _, second, _, last = (float(np.median(part)) for part in np.array_split(power, 4))
-        factor *= 2
-        if last < _SMOOTHED_POWER_RATIO * second:
-            decimation = factor
-    return decimation
-
-
-def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> Array:
-    """
-    Return the mean rounding error of the output, rad/s, shape (n,).
-
-    If the steps are not small compared with the noise, it depends on the rate, and would pass for
-    a nonlinearity. It is the Fourier series of a sawtooth, smoothed by the noise before the
-    rounding (Widrow, Kollar and Liu 1996).
-
-    """
-    scale, bias = (np.polyfit(rate[valid], output[valid], 1) if np.ptp(rate[valid]) > 0.0
-                   else (1.0, float(output[valid].mean())))
-    expected = scale * rate + bias
-    variance = max(float(np.var((output - expected)[valid])) - step ** 2 / 12.0, 0.0)
-    wave = 2.0 * math.pi / step
-    total = np.zeros(len(output))
-    for order in wave * np.arange(1.0, 8.0):
-        sign = -1.0 if round(order / wave) % 2 else 1.0
-        total += (sign * 2.0 / order * math.exp(-0.5 * order ** 2 * variance)
-                  * np.sin(order * expected))
-    return total
 
 
 def _reference_rates(log: Log, time: Array, is_held: bool,
@@ -495,5 +446,5 @@ def _filter_rounding(rate: Array, step: float, interval: float) -> Array:
     rounding = ((step / interval) ** 2 / 12.0
                 * spline_derivative_gain(np.arange(len(rate)) * math.pi / len(rate)))
     power = uniform_filter1d(coefficients ** 2, _SMOOTHING_BINS, mode='nearest')
-    weight = 1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300)
+    weight = 1.0 - rounding / np.maximum(power, 1e-300)
     return idct(coefficients * np.clip(weight, 0.0, 1.0), norm='ortho')

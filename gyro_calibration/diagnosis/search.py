@@ -63,18 +63,18 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 from scipy.special import logsumexp
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
-#: Penalties in log-likelihood: of a fitted shape, at least; of each column beyond the first; and
-#: of a structure without a name.
-SHAPE_PENALTY, COLUMN_PENALTY, UNNAMED_PENALTY = 2.0, 1.2, 4.0
+#: Penalties in log-likelihood: of a fitted shape, at least, and of each column beyond the first;
+#: and of a structure without a name.
+VALUE_PENALTY, UNNAMED_PENALTY = 1.2, 4.0
 #: Largest number of a scanned cause in one log: all slips form one cause, and more tones indicate
 #: a disturbance that is not periodic.
 MAX_PER_LOG = {'interference_tone': 3, 'reference_slip': 1}
 #: Least number of periods of a tone in a log; slower variations are bias wander.
 MIN_TONE_PERIODS = 20
 #: Durations of a slip of the reference that are tried, s; and largest number of slips in a log.
-SLIP_DURATIONS, MAX_SLIPS = (0.0, 0.05, 0.1, 0.2, 0.4), 20
+SLIP_DURATIONS, MAX_SLIPS = (0.0, 0.1, 0.4), 20
 #: Largest numbers of candidates that are refined in each step, and of causes.
 MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
 #: Half-width of the range in which a shape is refined, in logarithms.
@@ -82,9 +82,12 @@ _SHAPE_RANGE = 0.8
 #: Exponents with which distortions of fixed amplitude grow with their shapes.
 _SHAPE_EXPONENTS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
 #: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
-#: standard deviations (one-sided 5 %). The gain of one stretch is limited to a likelihood ratio of
-#: 20, so that no single stretch establishes a cause. Number of stretches of all logs together.
-MIN_PREDICTION_SIGMAS, MAX_STRETCH_GAIN, STRETCH_COUNT = 1.65, 3.0, 64
+#: standard deviations. The gain of one stretch is limited to a likelihood ratio of one over the
+#: same level, so that no single stretch establishes a cause.
+_LEVEL = 0.05
+MIN_PREDICTION_SIGMAS, MAX_STRETCH_GAIN = float(norm.isf(_LEVEL)), -math.log(_LEVEL)
+#: Number of stretches of all logs together.
+STRETCH_COUNT = 64
 #: Probability of the differences between logs below which a cause does not repeat, and variables
 #: whose causes are named only if they have the same size in all logs.
 _MIN_REPEAT_CHANCE, _REPEATING_VARIABLES = 1e-3, ('temperature', 'temperature_rate')
@@ -124,7 +127,7 @@ class CandidateColumns:
 
     def evidence(self, fit: RegressionFit) -> Array:
         """Return the evidence of each candidate, less the penalty of columns beyond the first."""
-        penalty = COLUMN_PENALTY * np.array([len(group) - 1.0 for group in self.groups])
+        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in self.groups])
         return column_evidence(fit, self.columns, self.groups) - penalty
 
 
@@ -307,7 +310,7 @@ def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> Se
                                options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
     done = add_cause(fit, candidate)
-    score = (done.log_likelihood - COLUMN_PENALTY * max(done.column_counts[-1] - 1, 0) - penalty
+    score = (done.log_likelihood - VALUE_PENALTY * max(done.column_counts[-1] - 1, 0) - penalty
              - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
     return SearchStep((*fit.causes, SelectedCause(candidate, penalty=penalty)), score)
 
@@ -361,12 +364,7 @@ def find_tones(fit: RegressionFit) -> list[_ScreenedCandidate]:
             aliases = np.concatenate([places + frequency, places[1:] - frequency])
             frequency = max(aliases.tolist(), key=lambda at: _amplitude(
                 each, each.channels.output - each.reference, at))
-            # that of an encoder may be its own
-            if each.heading_step and (
-                    _amplitude(each, each.channels.output, frequency)
-                    < 0.7 * _amplitude(each, each.reference, frequency)):
-                continue
-            most, count = float(power[best]) - COLUMN_PENALTY, len(power) * len(left)
+            most, count = float(power[best]) - VALUE_PENALTY, len(power) * len(left)
             found.append(_ScreenedCandidate(
                 effect_candidate('interference_tone', frequency, log_index=run,
                                  half_width=1.0 / each.duration), most, most - math.log(count)))
@@ -389,7 +387,7 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
         acceleration = np.abs(np.gradient(each.resample(each.channels.rate), each.point_interval))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
-            tried = [_fit_slips(each, run, fit.residuals[run], left[run], factors[run], moments,
+            tried = [_fit_slips(each, run, left[run], factors[run], moments,
                                 max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
             # The largest number indicates a continuous disturbance, not slips.
             if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
@@ -397,27 +395,21 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
     return [max(found, key=lambda one: one.mean_evidence)] if found else []
 
 
-def _fit_slips(replay: Replay, log_index: int, off: Array, white: Array, factor: Array,
-               indices: Indices, width: float) -> _ScreenedCandidate:
+def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
+               width: float) -> _ScreenedCandidate:
     """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
     time = np.arange(replay.point_count) * replay.point_interval
     likely = math.log(len(indices) * len(SLIP_DURATIONS))
     size, deviation = _matched_filter(white, factor, time, width)
     wide, _ = _matched_filter(white, factor, time, 5.0 * width + 0.3)
-    value = 0.5 * (size[indices] / deviation) ** 2 - likely - COLUMN_PENALTY
+    value = 0.5 * (size[indices] / deviation) ** 2 - likely - VALUE_PENALTY
     # A slip is permanent; the sum of a temporary error over a longer time is 0. The rounding error
     # of an encoder is constant at rest, and differs by up to a step between two rests.
     is_temporary = wide[indices] / size[indices] < 0.3
     value[is_temporary | (np.abs(size[indices]) <= replay.heading_step)] = -np.inf
     chosen: list[float] = []
     total = 0.0
-    channels = replay.channels
-    residual, output, reference = (replay.resample(each) for each in (
-        off, channels.output, replay.reference))
     for place in np.argsort(-value)[:200]:
-        if _is_sample_of_gyro(residual, output, reference, int(indices[place]),
-                              max(3, round(2.0 * width / replay.point_interval))):
-            continue
         if (value[place] <= 0.0 and chosen) or len(chosen) == MAX_SLIPS:
             break
         at = float(replay.channels.time[replay.valid][0] + time[indices[place]])
@@ -427,20 +419,6 @@ def _fit_slips(replay: Replay, log_index: int, off: Array, white: Array, factor:
     return _ScreenedCandidate(
         effect_candidate('reference_slip', width, *chosen, log_index=log_index),
         total + likely * len(chosen), total if chosen else -np.inf)
-
-
-def _is_sample_of_gyro(residual: Array, output: Array, reference: Array, index: int,
-                       reach: int) -> bool:
-    """Tell whether one sample of the output, not of the reference, has most of a deviation."""
-    begin = max(index - reach, 0)
-    near = residual[begin:index + reach + 1]
-    off = (near - np.median(near)) ** 2
-    if off.max() <= max(40.0 * np.median(off), 0.4 * off.sum()):
-        return False
-    at = begin + int(off.argmax())
-    of_output, of_reference = (np.abs(np.diff(each[max(at - 3, 0):at + 4], 2)).max()
-                               for each in (output, reference))
-    return bool(of_output >= of_reference)
 
 
 def _matched_filter(white: Array, whitening_factor: Array, time: Array,
@@ -509,8 +487,8 @@ def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> SelectedCause:
 
 def complexity_penalty(cause: SelectedCause) -> float:
     """Return the penalty of shapes and columns of a cause, in log-likelihood."""
-    shapes = max(cause.penalty, SHAPE_PENALTY * len(fitted_shape_indices(cause.candidate)))
-    return shapes + COLUMN_PENALTY * max(len(cause.values) - 1, 0)
+    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause.candidate)))
+    return shapes + VALUE_PENALTY * max(len(cause.values) - 1, 0)
 
 
 def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: int) -> float:

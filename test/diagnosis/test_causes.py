@@ -20,7 +20,6 @@ from gyro_calibration.diagnosis.causes import (
     make_finding,
     mark_suspected,
     next_experiment,
-    REFERENCES,
 )
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import DEGREE, QUANTITIES
@@ -48,20 +47,6 @@ def test_a_cause_has_units_and_a_variable_along_which_it_shows():
         assert (cause.required_channels <= {*QUANTITIES, 'reference'}
                 and cause.origin in {'gyro', 'reference', 'record', 'noise'}), name
     assert len({cause.sentence for cause in CAUSES.values()}) == len(CAUSES)
-
-
-@pytest.mark.parametrize('name, needed', [
-    ('bias', {'time'}), ('bias_temperature', {'time', 'temperature'}),
-    ('scale_factor_temperature', {'time', 'temperature', 'reference'}),
-    ('supply_sensitivity', {'time', 'supply'}), ('time_offset', {'time', 'reference'}),
-    ('heading_sensitivity', {'time', 'reference'}), ('interference_tone', {'time'}),
-    ('reference_quantization', {'time', 'reference_heading'})])
-def test_what_a_log_must_hold_to_show_a_cause(name, needed):
-    assert CAUSES[name].required_channels == needed
-
-
-def test_a_reference_is_a_column_of_a_log():
-    assert set(REFERENCES) <= set(QUANTITIES)
 
 
 #: Words of the experiment for each pair of twins, in their order.

@@ -18,22 +18,17 @@ from chance import fewest, most, seeded
 from diagnosed import log_of
 from gyro_calibration.diagnosis.data_quality import (
     FALSE_ALARM_CHANCE,
-    find_repeated_samples,
     inspect_record,
     update_interval,
 )
 from gyro_calibration.diagnosis.gates import (
-    compare_output,
     encoder_step,
-    identify_sample_offset,
     identify_unit_factor,
     is_at_rest,
     refuse_unusable,
     UNIT_FACTORS,
 )
-from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
-from gyro_calibration.logs.quality import find_codes
 from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -138,14 +133,6 @@ def test_a_clean_log_has_false_alarms_as_seldom_as_stated(kind, logs, any_genera
     assert len(alarms) <= most(logs, STATED), alarms
 
 
-@pytest.mark.parametrize('noise, reference',
-                         [('mixed', 'rate'), ('flicker', 'heading'), ('walk', 'heading')])
-def test_a_clean_log_of_the_generator_has_no_findings(noise, reference, any_generator):
-    logs = [log_of(hide([], 1.0, any_generator, noise=noise, reference=reference,
-                        duration=120.0)[0]) for _ in range(8)]
-    assert sum(len(found(log)) for log in logs) <= most(8, STATED)
-
-
 @pytest.mark.parametrize('name', ['bandwidth', 'time_offset', 'cubic_nonlinearity',
                                   'interference_tone', 'reference_slip', 'bias_step'])
 def test_a_large_effect_of_the_gyro_brings_no_fault_of_the_record(name, any_generator):
@@ -164,23 +151,6 @@ def test_a_hidden_fault_is_found_alone(name, multiple, any_generator):
     hidden = [hide([name], multiple, any_generator, reference=reference, duration=200.0)[0]
               for reference in ('rate', 'heading') * 3]
     assert sum(list(found(log_of(each))) == [name] for each in hidden) >= fewest(6, 1.0 - STATED)
-
-
-@pytest.mark.parametrize('name', ['quantization', 'reference_quantization'])
-def test_a_step_is_measured(name, generator):
-    hidden = hide([name], 2.0, generator, duration=200.0)[0]
-    assert value(found(log_of(hidden))[name]) == pytest.approx(hidden.truth[name].size, rel=1e-6)
-
-
-def test_outliers_are_left_out_and_others_are_not(generator):
-    log = swing(generator)
-    wild = generator.choice(np.arange(20, 5980), 8, replace=False)
-    log.output[wild] += 12.0 * SIGMA * generator.choice([-1.0, 1.0], 8)
-    quality = inspect_record(log)
-    assert [finding.effect for finding in quality.findings] == ['outliers']
-    # two that are neighbours may hide each other
-    assert (np.count_nonzero(~quality.usable[wild]) >= 6
-            and np.count_nonzero(~quality.usable) <= 9)
 
 
 @pytest.mark.parametrize('rough, rate', [('steps', STATED), ('jolts', 0.03),
@@ -239,14 +209,6 @@ def test_samples_that_a_coarse_gyro_repeats_in_a_turn_are_found(generator):
     assert 'codes and noise explain no such run' in stuck.evidence and stuck.p_value < 1e-4
 
 
-def test_steps_as_wide_as_the_noise_repeat_as_seldom_as_stated(any_generator):
-    """200 logs at rest in the middle of a step at 2 % each; 26 alarms if each repeat counted."""
-    logs = [compare_output(np.round(any_generator.standard_normal(2000) / 1.05) * 1.05, None)
-            for _ in range(200)]
-    assert sum(find_repeated_samples(log, find_codes(log.output), None, np.ones(2000, dtype=bool),
-                                     0.02) is not None for log in logs) <= most(200, 0.02)
-
-
 @pytest.mark.parametrize('noise', [1e-4, 1e-5])
 @pytest.mark.parametrize('digits', [5, 6])
 def test_repeats_of_what_is_printed_with_so_many_digits_are_no_fault(digits, noise, any_generator):
@@ -283,15 +245,6 @@ def test_zeros_in_a_turn_are_repeated_samples_beside_a_dead_band(generator):
     assert not quality.usable[places[1:]].any() and np.count_nonzero(~quality.usable) <= 12
 
 
-def test_a_dead_band_of_the_driver_is_found_as_a_dead_zone():
-    log = log_of(hide([], 1.0, np.random.default_rng(3), noise='white', duration=600.0,
-                      sample_rate=25.0)[0])
-    turned = replace(log, output=log.output - np.median(log.output - log.reference_rate))
-    zones = [each for each in diagnose([zeroed(turned, 0.02)], np.random.default_rng(3)).findings
-             if each.effect == 'dead_zone']
-    assert value(zones[0]) == pytest.approx(0.02, rel=0.05)
-
-
 def test_a_moving_average_of_coarse_steps_has_no_repeated_samples(generator):
     """Mean of seven, as in trackers: a sample equal to the one seven before repeats it."""
     log = swing(generator)
@@ -310,14 +263,6 @@ def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
     beyond = (log.output > high) | (log.output < low)
     assert (not quality.usable[beyond].any()
             and quality.usable[np.abs(log.reference_rate) < 0.6].all())
-
-
-def test_a_limit_that_is_a_step_further_on_one_side_has_the_size_of_the_smaller(generator):
-    """As integers of 16 bits have it."""
-    log = swing(generator)
-    size = found(replace(log, output=np.clip(log.output, -0.801,
-                                             0.8)))['saturation'].parameters['saturation']
-    assert size.estimate == 0.8 and size.interval == (0.8, 0.8)
 
 
 def test_a_constant_rate_of_coarse_steps_is_no_limit(generator):
@@ -354,13 +299,6 @@ def test_a_wrong_unit_is_named_and_corrected(name, generator):
     (1.03, 1e-4, None), (0.98, 1e-4, None), (3.0, 1e-3, None)])
 def test_a_factor_is_a_unit_only_where_it_is_known_to_be_one(factor, deviation, name):
     assert identify_unit_factor(factor, deviation) == name
-
-
-@pytest.mark.parametrize('offset, deviation, name',
-                         [(0.01, 1e-4, 'one sample'), (-0.0051, 1e-4, 'half a sample'),
-                          (0.0075, 1e-4, None), (0.01, 2e-3, None), (0.02, 1e-4, None)])
-def test_an_offset_is_a_sample_only_where_it_is_known_to_be_one(offset, deviation, name):
-    assert identify_sample_offset(offset, deviation, INTERVAL) == name
 
 
 def test_a_scale_factor_error_that_the_model_has_is_no_unit(generator):
@@ -409,22 +347,6 @@ def test_the_update_interval_of_a_held_reference_is_found(every, generator):
     interval = update_interval(log.time, held, 0.0)
     assert interval == (None if every == 1 else pytest.approx(every * INTERVAL, rel=1e-6))
     assert bool(inspect_record(replace(log, reference_rate=held)).remarks) == (every > 1)
-
-
-@pytest.mark.parametrize('count', [400, 2000, 50_000])
-def test_values_without_steps_have_no_quantization(count, generator):
-    values = np.sin(np.arange(count) * 0.003) + generator.normal(0.0, 1e-3, count)
-    assert find_codes(values).step == 0.0
-    assert find_codes(np.round(values / 1e-4) * 1e-4).step == pytest.approx(1e-4, rel=1e-9)
-
-
-@pytest.mark.parametrize('share', [0.7, 0.9, 0.99])
-def test_one_value_that_comes_often_makes_no_quantization(share, generator):
-    for _ in range(20):
-        often, values = generator.random(6000) < share, generator.standard_normal(6000)
-        assert find_codes(np.where(often, 0.0, values)).step == 0.0
-        assert find_codes(np.where(
-            often, 0.0, np.round(values / 0.1) * 0.1)).step == pytest.approx(0.1, rel=1e-9)
 
 
 GOOD = swing(np.random.default_rng(1))

@@ -22,10 +22,8 @@ from gyro_calibration.diagnosis.extended_model import (
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.regression import build_problem, fit_causes, SelectedCause
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import headline, is_in_extended_model
-from gyro_calibration.logs.log import DEGREE, Log, write_log
-from gyro_calibration.model.compensation import compensate
+from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.model_file import read_model, write_model
@@ -136,20 +134,6 @@ def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, 
     assert not unmergeable_causes(GyroModel(), outcome)
 
 
-def test_a_second_tone_is_not_reported_as_in_the_model():
-    slow = term('interference_tone', 1.7, 1e-3, 0.0)
-    fast = term('interference_tone', 3.1, 1e-3, 0.0)
-    model = replace(MODEL, terms=(*LINEAR, slow), covariance=None)
-    log = drive(slow, fast)
-    found = diagnosed(log, model)
-    assert (names(found) == ['interference_tone']
-            and not is_in_extended_model(found.findings[0], found))
-    assert (found.model.terms == model.terms
-            and 'It is in the extended model' not in render_report(found))
-    assert any('interference tone occurs once: it is not in the extended model' in remark
-               for remark in found.remarks)
-
-
 @pytest.mark.parametrize('own', [(), (term('bias_step', 10.0, 2e-4),)], ids=['none', 'one'])
 @pytest.mark.parametrize('once', [term('bias_step', 130.0, 3e-3),
                                   term('interference_tone', 1.7, 1e-3, 0.0)],
@@ -196,27 +180,9 @@ def test_noise_that_a_short_log_cannot_show_stays_in_the_model():
     assert names(found) == ['warm_up'] and found.model.noise == model.noise
 
 
-def test_a_noise_that_is_found_is_put_right_and_nothing_else_is():
-    model = replace(MODEL, noise=Noise(1e-4, 1e-6, 1e-8))
-    found = diagnosed(drive(), model)
-    assert names(found) == ['angle_random_walk'] and 'is offered' in headline(found)[1]
-    assert found.model.noise == replace(model.noise,
-                                        angle_random_walk=found.noise.angle_random_walk)
-    assert (found.model.terms, found.model.rate_range) == (model.terms, model.rate_range)
-
-
 # a self-calibration behind the model
 
 BEHIND = SelfCalibration(0.02, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)))
-
-
-def test_a_self_calibration_goes_into_bias_and_scale_factor_error():
-    behind = replace(MODEL, self_calibration=BEHIND)
-    output = np.linspace(-1.5, 1.5, 7)
-    assert compensate(merge_self_calibration(behind),
-                      output).rate == pytest.approx(compensate(behind, output).rate, abs=1e-15)
-    assert (merge_self_calibration(behind).self_calibration is None and np.diag(
-        merge_self_calibration(behind).covariance) == pytest.approx([2e-10, 2e-8], rel=0.05))
 
 
 def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
@@ -252,13 +218,6 @@ def test_a_log_without_temperature_leaves_the_range_of_the_model():
     assert found.model.rate_range == (-1.5, 1.5)
 
 
-def test_ranges_are_widened_to_those_of_the_log():
-    found = diagnosed(drive(term('warm_up', 60.0, 4e-3)), replace(MODEL, rate_range=(-0.1, 0.1)))
-    assert found.model.temperature_range == pytest.approx((10.0, 45.0))
-    assert found.model.rate_range == pytest.approx((-60.0 * DEGREE * 1.01, 40.0 * DEGREE * 1.01),
-                                                   abs=0.01)
-
-
 def at_rest(swing):
     """Return a log of a gyro that does not turn, or hardly does beside its noise."""
     rate = swing * np.sin(0.3 * TIME)
@@ -277,14 +236,6 @@ def test_a_log_without_motion_says_nothing_of_rates(swing):
 
 
 # units, limit and steps
-
-def test_an_output_of_the_other_sense_is_the_only_finding_and_the_model_stays_as_it_is():
-    log, model = drive(gyro=GyroModel(LINEAR[:1])), GyroModel(LINEAR[:1], noise=NOISE)
-    found = diagnosed(replace(log, output=-log.output), model)
-    assert found.verdict == 'mismatched' and names(
-        found) == ['unit_error'] and found.model is model
-    assert '--invert' in found.findings[0].remedy
-
 
 @pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)],
                          ids=['no model', 'a model'])

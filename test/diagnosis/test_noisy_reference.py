@@ -178,7 +178,7 @@ def test_a_reference_that_would_turn_back_each_revolution_is_not_established():
                   reference_heading=heading - size * np.cos(heading)
                   + 1e-3 * generator.standard_normal(len(time)))
         _, found = search_causes(fit_spans(lay_out_spans(log, 'motion_capture')), 0.01,
-                                 lambda words: None)
+                                 lambda share, words: None)
         assert named == ('reference_once_per_rev' in {
             each.cause_term.cause for each in found if each.is_established}), size
 
@@ -314,18 +314,6 @@ def test_noise_is_no_effect_of_a_motion_in_which_effects_look_alike(seed):
     assert value(found.model, 'scale_factor_error') == pytest.approx(0.01, abs=0.004)
 
 
-def test_the_noise_of_a_reference_rate_is_seen_in_the_only_short_rest():
-    def by_hand(time):
-        return 1.5 * np.sin(2.0 * np.pi * time) * np.sin(9.1 * time) * (time > 12.0)
-
-    for seed in range(3):
-        log = swing(seed, by_hand, 1e-4)
-        assert rate_noise_share(log) == pytest.approx(0.3, rel=0.25)
-        exact = replace(log, reference_rate=by_hand(log.time))
-        assert (is_reference_limiting(log, classify_reference(log))
-                and not is_reference_limiting(exact, classify_reference(exact)))
-
-
 @pytest.mark.parametrize('interval', [0.05, 0.1])
 def test_the_noise_of_a_reference_rate_is_seen_between_two_quick_reversals(interval):
     def to_and_fro(time):
@@ -335,16 +323,6 @@ def test_the_noise_of_a_reference_rate_is_seen_between_two_quick_reversals(inter
         log = swing(seed, to_and_fro, 1e-4, interval)
         assert rate_noise_share(log) == pytest.approx(0.3, rel=0.4)
         assert rate_noise_share(replace(log, reference_rate=to_and_fro(log.time))) < 1e-3
-
-
-def test_a_fine_encoder_and_an_exact_rate_are_taken_as_they_are():
-    hidden = hide_with_reference([], 0.0, np.random.default_rng(2),
-                                 ImperfectReference('encoder', 0.0055))
-    log = log_of(hidden)
-    assert (classify_reference(log).kind == 'encoder'
-            and not is_reference_limiting(log, classify_reference(log)))
-    exact = replace(log, reference_heading=None, reference_rate=hidden.truth.rate)
-    assert not is_reference_limiting(exact, classify_reference(exact))
 
 
 def test_the_rounding_of_an_encoder_is_seen_though_its_shaft_rests_nearly_always():
@@ -379,7 +357,8 @@ def test_an_encoder_that_is_read_at_the_same_places_again_is_no_nonlinearity():
     heading = np.cumsum(rate) * 0.01 - 0.005 * rate + 2.1 * DEGREE
     log = Log(time=time, output=1.004 * rate + 5e-4 * generator.standard_normal(len(time)),
               reference_heading=np.floor(heading / step) * step)
-    fit, found = search_causes(fit_spans(lay_out_spans(log, 'encoder')), 0.01, lambda words: None)
+    fit, found = search_causes(fit_spans(lay_out_spans(log, 'encoder')), 0.01,
+                               lambda share, words: None)
     assert not fit.causes and not any(each.is_established for each in found)
 
 

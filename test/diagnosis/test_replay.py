@@ -59,22 +59,6 @@ def laid_out(log):
     return replay(log, np.ones(len(log.time), dtype=bool), np.random.default_rng(0))
 
 
-def test_effects_look_at_a_rate_without_gaps_and_lost_samples_are_not_compared(gaping):
-    each = laid_out(gaping)
-    assert np.isfinite(each.channels.rate).all()
-    assert not each.valid[np.isnan(gaping.reference_rate)].any()
-
-
-def test_a_smoothed_record_is_averaged_until_no_smoothing_is_seen(smoothed):
-    assert laid_out(smoothed).decimation > 1
-
-
-def test_a_record_that_is_not_smoothed_is_left_as_it_is(smoothed):
-    rate = np.sin(smoothed.time)
-    noise = 1e-3 * np.random.default_rng(2).standard_normal(len(rate))
-    assert laid_out(replace(smoothed, output=rate + noise, reference_rate=rate)).decimation == 1
-
-
 def test_stamps_in_bursts_lose_no_sample():
     time = 0.01 * np.arange(20_000)
     late = 0.04 * (np.arange(len(time)) // 4) + 1e-3 * (np.arange(len(time)) % 4)
@@ -113,13 +97,6 @@ def test_a_held_reference_that_stands_is_not_bent_towards_what_comes_next():
                   - wanted)[turning].max() < 1e-3 < np.abs(held - wanted)[turning].max()
 
 
-def test_a_held_heading_that_stands_has_no_rate():
-    heading = np.where(TIME < 60.0, 0.0, 0.5 * (TIME - 60.0))[np.arange(len(TIME)) // 5 * 5]
-    each = replay(Log(output=NOISE, time=TIME, reference_heading=heading),
-                  np.ones(len(TIME), bool), np.random.default_rng(0), update_interval=0.05)
-    assert np.abs(each.reference[TIME < 59.5]).max() < 1e-9
-
-
 @pytest.mark.parametrize('every', [2, 3, 5, 15])
 @pytest.mark.parametrize('quantity', ['reference_rate', 'reference_heading'])
 def test_a_reference_that_is_slower_than_the_gyro_is_compared_with_all_samples(quantity, every):
@@ -132,14 +109,6 @@ def test_a_reference_that_is_slower_than_the_gyro_is_compared_with_all_samples(q
     each = laid_out(log)
     assert 0.97 * len(TIME) < np.count_nonzero(each.valid) < 0.985 * len(TIME)
     assert (each.reference - 0.5 * np.sin(0.7 * TIME))[each.valid].std() < 0.02
-
-
-def test_a_pattern_of_a_slow_reference_that_is_not_quite_even_is_no_loss():
-    """30 values a second beside 100 samples: after 3, 3 and 4 of them."""
-    shown = np.isin(np.arange(len(TIME)), np.arange(0, len(TIME), 10.0 / 3.0).astype(int))
-    each = laid_out(Log(output=0.5 * np.sin(TIME) + NOISE, time=TIME,
-                        reference_rate=np.where(shown, 0.5 * np.sin(TIME), np.nan)))
-    assert np.count_nonzero(~each.valid) < 5
 
 
 def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():

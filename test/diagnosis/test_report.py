@@ -467,11 +467,3 @@ def test_everything_can_be_read_in_light_and_in_dark(tmp_path, dark):
     assert (found['paper'] == 'rgb(20, 24, 27)') == dark
     text, letters, *strokes = found['contrasts']
     assert text >= 4.5 and letters >= 4.5 and min(strokes) >= 3.0
-
-
-def test_it_can_be_printed(tmp_path):
-    (tmp_path / 'report.html').write_text(render_report(extended()), encoding='utf-8')
-    browse(tmp_path, f'--print-to-pdf={tmp_path / "report.pdf"}',
-           (tmp_path / 'report.html').as_uri())
-    sheets = (tmp_path / 'report.pdf').read_bytes()
-    assert sheets.startswith(b'%PDF') and 2 <= sheets.count(b'/Type /Page\n') <= 12
