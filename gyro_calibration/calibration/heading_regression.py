@@ -340,14 +340,10 @@ class Spans:
 
 def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
     """
-    Divide a log with a reference into spans.
+    Divide a log with a reference of some kind into spans.
 
-    Parameters
-    ----------
-    log : with output, time and a reference
-    kind : of the reference
-    prior : standard deviations of (s, b) from `GyroModel.prior_deviations`, if the type of gyro is
-        known
+    The prior are standard deviations of (s, b) by `GyroModel.prior_deviations`, if the type of
+    gyro is known.
 
     """
     treatment = _TREATMENTS.get(kind, COURSE_TREATMENT)
@@ -620,15 +616,13 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
 def _cluster_robust_covariance(data: WhitenedRegression,
                                fit: GridFit) -> tuple[Array, Array, Array]:
     """
-    Return the covariance of the values, not less than the scatter of the scores between stretches.
+    Return the covariance of the values, not less than the scatter of the scores of stretches.
 
-    Nor less than what the values change by without each place of a shaft (jackknife, Tukey 1958).
-    A value may be determined by a few places only, such as the turning points of a swing at an
-    even rate, and then takes up most of their errors, so that what the fit leaves there is too
-    small.
+    Nor less than what the values change by without each place of a shaft (jackknife, Tukey 1958):
+    the few turning points of a swing at an even rate may determine a value and take up their
+    errors.
 
-    Also the effective number of stretches that determine each value: the squared sum of the
-    information of the stretches over the sum of its squares; and the degrees of freedom.
+    Also the effective number of stretches that determine each value, and the degrees of freedom.
 
     """
     count, (stretch, *sectors) = len(fit.values), data.clusters
@@ -700,13 +694,8 @@ def whiten_regression(fit: SpanFit, causes: Sequence[CauseTerm], noise_fit: Span
     """
     Return the regression of a log on causes, under the noise of a fit of the same log.
 
-    Parameters
-    ----------
-    fit : the log and the prior
-    causes : the columns in addition to scale factor error, bias and delay
-    noise_fit : the fit whose noise is used; None is `fit`
-    use_max_random_walk : whether to use the upper 95 % limit of the rate random walk, as slow bias
-        wander may pass for a cause otherwise
+    The noise may be of another fit, and its random walk the upper 95 % limit, as slow bias wander
+    may pass for a cause otherwise.
 
     """
     spans, noise = fit.spans, (noise_fit or fit).fit

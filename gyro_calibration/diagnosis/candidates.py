@@ -155,80 +155,72 @@ def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
     return numbers
 
 
+def lasting_shapes(has: Collection[str], duration: float, temperature: Array,
+                   moves: bool = True) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Give the lasting causes that some channels may show, linear in size, with first shapes."""
+    yield 'rate_ramp', ()
+    yield from (('warm_up', (time_constant,)) for time_constant in np.geomspace(
+        duration / 100.0, duration * 0.7, 9).tolist())
+    if 'temperature' in has:
+        middle = float(temperature.mean())
+        yield 'bias_temperature', (middle,)
+        # usual, mean and first temperature
+        for reference in (25.0, 20.0, middle, float(temperature[0])):
+            yield 'bias_temperature_quadratic', (reference,)
+        for filter_time in (0.3, 1.0, 3.0, 10.0):
+            yield 'bias_temperature_rate', (filter_time,)
+        yield from (('thermal_lag', (time_constant,)) for time_constant in np.geomspace(
+            MIN_THERMAL_LAG, min(duration, 3000.0), 8).tolist())
+        yield from (('thermal_hysteresis', shapes)
+                    for shapes in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)))
+    if 'specific_force' in has:
+        yield 'acceleration_sensitivity', ()
+        yield from (('vibration_rectification', (constant,)) for constant in (0.1, 0.3, 1.0))
+    if 'supply' in has:
+        yield 'supply_sensitivity', (5.0,)
+    for name, own in USER_EFFECTS.items():
+        if (own.inputs & MIN_CHANNEL_RANGE.keys() <= set(has)
+                and (moves or not own.inputs & {'rate', 'output', 'heading'})):
+            yield from ((name, shapes)
+                        for shapes in product(*(shape.begin_with or (shape.default or 0.0, )
+                                                for shape in own.nonlinear_parameters)))
+    if moves:
+        yield from ((name, ()) for name in (
+            'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
+            'heading_sensitivity', 'reference_once_per_rev'))
+        if 'temperature' in has:
+            yield 'scale_factor_temperature', (middle,)
+
+
 def propose_candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give all causes that these logs may show, each with its first shapes."""
     has = common_channels(replays) - constant_channels(replays)
     duration, interval = max(each.duration for each in replays), replays[0].interval
     fastest = max(float(np.abs(each.channels.rate).max()) for each in replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
-    middle = reference_temperatures(replays)[2] if 'temperature' in has else 0.0
-    yield effect_candidate('rate_ramp')
-    for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
-        yield effect_candidate('warm_up', time_constant)
+    temperature = np.concatenate([np.atleast_1d(each.channels.temperature) for each in replays])
+    yield from (effect_candidate(name, *shapes)
+                for name, shapes in lasting_shapes(has, duration, temperature, moves))
     per_log = max(MAX_STEP_TIMES // len(replays), 1)
     for run, each in enumerate(replays):
         begin, spacing = float(each.channels.time[each.valid][0]), each.duration / (per_log + 1)
         for number in range(1, per_log + 1):
             yield effect_candidate('bias_step', begin + number * spacing, log_index=run,
                                    half_width=1.5 * spacing)
-    if 'temperature' in has:
-        yield effect_candidate('bias_temperature', middle)
-        for reference in reference_temperatures(replays):
-            yield effect_candidate('bias_temperature_quadratic', reference)
-        for filter_time in (0.3, 1.0, 3.0, 10.0):
-            yield effect_candidate('bias_temperature_rate', filter_time)
-        for time_constant in np.geomspace(MIN_THERMAL_LAG, min(duration, 3000.0), 8):
-            yield effect_candidate('thermal_lag', time_constant)
-        for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)):
-            yield effect_candidate('thermal_hysteresis', filter_time, threshold)
-    if 'specific_force' in has:
-        yield effect_candidate('acceleration_sensitivity')
-        for time_constant in (0.1, 0.3, 1.0):
-            yield effect_candidate('vibration_rectification', time_constant)
-    if 'supply' in has:
-        yield effect_candidate('supply_sensitivity', 5.0)
-    yield from (effect_candidate(name, *shapes) for name, shapes in user_effects(has, moves))
     if not moves:
         return
-    for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity'):
-        yield effect_candidate(name)
-    for angle in (0.5, 1.0, 1.5, 2.0):
-        yield effect_candidate('sine_response', angle / fastest)
-    yield effect_candidate('heading_sensitivity')
-    yield effect_candidate('reference_once_per_rev')
-    if 'temperature' in has:
-        yield effect_candidate('scale_factor_temperature', middle)
     # At a lower step rate the quantization of the encoder passes for a dead zone.
     slowest = max(1e-5 * fastest,
                   MIN_ENCODER_STEP_RATE * max(each.heading_step for each in replays))
-    for zone in np.geomspace(slowest, 0.5 * fastest, 14):
-        yield effect_candidate('dead_zone', zone)
-    for limit in (0.5, 0.65, 0.8, 0.9, 0.97):
-        yield effect_candidate('saturation', limit * fastest)
-    for offset in (0.2 * interval, 0.02, 0.1, 0.3):
-        yield effect_candidate('time_offset', offset)
-        yield effect_candidate('time_offset', -offset)
-    for lag in (0.2 * interval, 0.01, 0.03, 0.1, 0.3):
-        yield effect_candidate('bandwidth', lag)
-    yield effect_candidate('clock_rate', 1e-6)
-
-
-def user_effects(available_channels: Collection[str],
-                 has_motion: bool) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Give the user-defined effects that logs can show, with their first shapes."""
-    for name, own in USER_EFFECTS.items():
-        turned = own.inputs & {'rate', 'output', 'heading'}
-        if (own.inputs & MIN_CHANNEL_RANGE.keys() <= set(available_channels)
-                and (has_motion or not turned)):
-            yield from ((name, shapes)
-                        for shapes in product(*(shape.begin_with or (shape.default or 0.0, )
-                                                for shape in own.nonlinear_parameters)))
-
-
-def reference_temperatures(replays: Sequence[Replay]) -> list[float]:
-    """Return the trial reference temperatures of a parabola: usual, mean and first."""
-    known = np.concatenate([each.channels.temperature for each in replays])
-    return [25.0, 20.0, float(known.mean()), float(known[0])]
+    distortions = {
+        'sine_response': [angle / fastest for angle in (0.5, 1.0, 1.5, 2.0)],
+        'dead_zone': np.geomspace(slowest, 0.5 * fastest, 14).tolist(),
+        'saturation': [limit * fastest for limit in (0.5, 0.65, 0.8, 0.9, 0.97)],
+        'time_offset': [sign * offset for offset in (0.2 * interval, 0.02, 0.1, 0.3)
+                        for sign in (1.0, -1.0)],
+        'bandwidth': [0.2 * interval, 0.01, 0.03, 0.1, 0.3], 'clock_rate': [1e-6]}
+    for name, sizes in distortions.items():
+        yield from (effect_candidate(name, size) for size in sizes)
 
 
 def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]:

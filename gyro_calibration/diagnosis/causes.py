@@ -228,16 +228,9 @@ def next_experiment(name: str, alternatives: Sequence[tuple[str, float]],
     """
     Return the next experiment that distinguishes a cause from others, in words.
 
-    The text states by how many sigma these logs distinguish the causes, and how many similar logs
-    together would: the information of independent logs adds, so that sigmas grow with the square
-    root of their number.
-
-    Parameters
-    ----------
-    name : of the cause
-    alternatives : names of the alternatives, with their deficits in log-likelihood, which are half
-        the square of the sigmas
-    observed_range : of the logs, from `candidates.observed_range`
+    The alternatives are names with their deficits in log-likelihood, half the square of the sigmas
+    by which these logs distinguish them; similar logs together do by the root of their number
+    more.
 
     """
     found: dict[str, list[str]] = {}

@@ -68,14 +68,8 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
     """
     Return the extended model; the given one if no finding concerns the gyro.
 
-    Parameters
-    ----------
-    model : of the simulation, by `merge_self_calibration`; None for an ideal gyro
-    fit : the causes and their values, none of them of `unmergeable_causes`
-    quality : of each log
-    findings : all; of the noise of a given model, only the figures with a finding are replaced
-    noise : of the residual
-    bias_deviation : standard deviation of the bias, rad/s
+    The fit contains the causes that can be merged with the given model, None for an ideal gyro. Of
+    its noise, only the figures with a finding are replaced. The bias has a deviation, rad/s.
 
     """
     given = model or GyroModel()
@@ -182,8 +176,8 @@ def is_scale_implausible(fit: RegressionFit) -> bool:
     """
     Tell whether the fitted scale factor error is implausible.
 
-    If the gyro hardly turns, the noise of the reference passes for motion that the gyro does not
-    measure, which gives a scale factor error of up to -100 %.
+    If the gyro hardly turns, noise of the reference passes for motion that the gyro does not
+    measure.
 
     """
     scale = fit.scale_factor_error
@@ -456,13 +450,8 @@ def heading_error_shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
     Return the share of each cause in the mean square of the heading error over a minute.
 
     The part of a cause that is proportional to a bias or a scale factor error is counted as these,
-    because their refit would absorb it.
-
-    Parameters
-    ----------
-    logs : for each log, the contributions of causes and of what is 'left' to the change of heading
-        between times, rad, shape (n,), and the times, s, shape (n + 1,)
-    reference_square : mean square of the errors of the reference, rad²
+    because their refit would absorb it. A log has the contributions of causes and of what is
+    'left' to the change of heading, rad, shape (n,), between times, s, shape (n + 1,).
 
     """
     window_errors: dict[str, list[Array]] = {name: [] for parts, _ in logs for name in parts}

@@ -90,11 +90,6 @@ def identify_unit_factor(factor: float, deviation: float) -> str | None:
     allowed in addition to a confusion. Near 1, the factor must agree within two standard
     deviations, and its standard deviation must be below a fiftieth of its distance from 1.
 
-    Parameters
-    ----------
-    factor : ratio of the output to the reference rate, or to the output of a model
-    deviation : its standard deviation
-
     """
     matches = []
     for name, value in UNIT_FACTORS.items():

@@ -40,7 +40,7 @@ from gyro_calibration.calibration.heading_regression import (
     whiten_regression,
     WhitenedRegression,
 )
-from gyro_calibration.diagnosis.candidates import MIN_CHANNEL_RANGE, user_effects
+from gyro_calibration.diagnosis.candidates import lasting_shapes, MIN_CHANNEL_RANGE
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, mark_suspected
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
@@ -439,38 +439,20 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
     """
     Return the causes that headings over spans can show, for the channels that the log has.
 
-    Where too few stretches turn, no cause that follows the rate can be distinguished from the
-    scale factor error, so that none of these is a candidate.
+    Where too few stretches turn, none that follows the rate can be told from the scale factor
+    error.
 
     """
     log, fine, time = fit.spans.log, fit.spans.treatment.is_fine, fit.spans.time
-    duration = float(time[-1] - time[0])
-    terms: list[tuple[str, tuple[float, ...]]] = [(name, ()) for name in (
-        'scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity', 'rate_ramp',
-        'heading_sensitivity', *['reference_once_per_rev'] * fine)]
-    terms += [('warm_up', (constant,)) for constant in np.geomspace(
-        duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist()]
-    terms += [(name, (moment,))
-              for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist()
-              for name in ('bias_step', 'reference_slip')[:1 if fine else 2]]
     has = {name for name, least in MIN_CHANNEL_RANGE.items()
            if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
-    if 'temperature' in has:
-        middle = float(np.mean(np.asarray(log.temperature)))
-        terms += [(name, (middle,)) for name in (
-            'bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature')]
-        terms += [('bias_temperature_rate', (filter_time,)) for filter_time in (3.0, 10.0)]
-        if fine:
-            terms += [('thermal_lag', (constant,)) for constant in np.geomspace(
-                5.0, min(duration, 3000.0), 6).tolist()]
-            terms += [('thermal_hysteresis', shapes) for shapes in ((1.0, 2e-3), (3.0, 5e-4))]
-    if 'specific_force' in has:
-        terms += [('acceleration_sensitivity', ()), ('vibration_rectification', (1.0,))]
-    if 'supply' in has:
-        terms.append(('supply_sensitivity', (5.0,)))
-    terms += user_effects(has, has_motion=True)
-    return [CauseTerm(*each) for each in terms
-            if not (fit.lacks_turns and _follows_the_rate(each[0]))]
+    terms = [CauseTerm(*each) for each in lasting_shapes(
+        has, float(time[-1] - time[0]), np.asarray(fit.spans.channels.temperature))]
+    terms += [CauseTerm(name, (moment,))
+              for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist()
+              for name in ('bias_step', 'reference_slip')[:1 if fine else 2]]
+    return [each for each in terms if (fine or each.cause != 'reference_once_per_rev')
+            and not (fit.lacks_turns and _follows_the_rate(each.cause))]
 
 
 def _follows_the_rate(cause: str) -> bool:

@@ -552,9 +552,9 @@ def average_filtered_noise(fit: RegressionFit) -> RegressionFit:
     Average neighbouring points of logs whose noise is filtered, until no filter shows.
 
     A gyro with averaged samples, or a smoothed reference, has little noise at the highest
-    frequencies. The noises of the grid do not describe that, so that small errors of motion and
-    reference would have too much weight there. It shows in the residual of the causes: before
-    these are fitted, motion that is delayed or filtered would pass for noise.
+    frequencies, so that small errors of motion and reference would have too much weight there. It
+    shows in the residual of the causes, as motion that is delayed or filtered would pass for
+    noise.
 
     """
     while any(is_filtered := [

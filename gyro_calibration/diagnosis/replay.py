@@ -55,15 +55,7 @@ class NoiseShape:
     flicker_corner: float = 0.0
 
     def variance(self, angle: Array, interval: Array | float) -> Array:
-        """
-        Return the variance of coefficients relative to the white part.
-
-        Parameters
-        ----------
-        angle : pi k / n of each coefficient
-        interval : of the samples, s
-
-        """
+        """Return the variance of coefficients, at pi k / n each, relative to the white part."""
         wave = 2.0 - 2.0 * np.cos(angle)
         total = 1.0 + self.rounding_ratio * spline_derivative_gain(angle)
         if self.walk_ratio:
@@ -110,9 +102,8 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
     """
     Return a grid of noises that a residual may have.
 
-    A random walk shows if it is stronger than white noise over the duration of the log; a
-    Gauss-Markov process if its correlation time is between some samples and this duration. Flicker
-    replaces the Gauss-Markov process.
+    A random walk shows if it is stronger than white noise over the log; a Gauss-Markov process,
+    which flicker may replace, if its correlation time is between some samples and this duration.
 
     """
     lowest = 0.02 / duration ** 2
@@ -187,13 +178,7 @@ class Replay:
         return np.asarray(self.channels.lagged(channel, time_constant))
 
     def resample(self, values: Array, fill_deviation: float = 0.0) -> Array:
-        """
-        Return samples, shape (n,), on the even grid: gaps interpolated, neighbours averaged.
-
-        Interpolated points have no noise. If that matters, white noise of a standard deviation is
-        added to them.
-
-        """
+        """Return samples on the even grid; interpolated ones get white noise, if any is given."""
         whole = _bridge_gaps(values[self.valid], self.grid_index)
         if fill_deviation and len(whole) > len(self.grid_index):
             lost = np.ones(len(whole), dtype=bool)
@@ -244,17 +229,10 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
            update_interval: float | None = None, heading_step: float = 0.0,
            output_step: float = 0.0, model: GyroModel | None = None) -> Replay:
     """
-    Prepare a log for the search.
+    Prepare a log for the search: its usable samples, under the model of a simulation.
 
-    Parameters
-    ----------
-    log : with output, time and a reference, which is not needed at rest
-    usable : samples to use, shape (n,)
-    generator : source of the noise for gaps
-    update_interval : update interval of a reference that is held in between, s
-    heading_step : of a reference heading, rad; 0 without one
-    output_step : quantization step of the output, rad/s; 0 if it does not matter
-    model : of the simulation; None is an ideal gyro
+    Gaps are filled with noise of the generator. Steps and update interval are those of
+    `DataQuality`; no model is an ideal gyro. Raises `DataRefused` if too few samples can be used.
 
     """
     assert log.time is not None and log.output is not None
@@ -281,7 +259,8 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     heading = prepared_log.reference_heading
     if heading is None or not np.isfinite(heading).all():
         heading = integrate_trapezoidal(time, np.nan_to_num(smooth))
-    channels = replace(channels_from_log(prepared_log), rate=smooth, time=time, heading=heading)
+    channels = replace(channels_from_log(prepared_log), rate=smooth, time=time, heading=heading,
+                       output=log.output)
     has = frozenset(name for name in ('temperature', 'specific_force', 'supply')
                     if getattr(log, name) is not None)
     rounded = heading_step if prepared_log.reference_rate is None else 0.0
@@ -350,13 +329,7 @@ def _fast_transform_length(count: int) -> int:
 
 
 def _bridge_gaps(samples: Array, grid_index: NDArray[np.intp]) -> Array:
-    """
-    Return samples on the whole grid, with straight lines over gaps.
-
-    A line begins and ends in the mean of as many samples as the gap has, which reduces their
-    noise.
-
-    """
+    """Return samples on the whole grid, with lines over gaps between means as long as the gap."""
     if len(samples) == grid_index[-1] + 1:
         return samples
     steps = np.diff(grid_index)
@@ -419,12 +392,10 @@ def _find_corners(rate: Array, output: Array, valid: Mask, rounding: float) -> M
     """
     Return where the rate of a heading has corners that its samples do not resolve, shape (n,).
 
-    At a corner of the rate, a spline through the heading and the trapezoidal integral of the
-    output differ by a twelfth of the second difference, which is a 24th of the fourth; at the
-    begin or end of a motion that passes for a dead zone or a slip. The fourth difference of a
-    smooth motion, which splines follow, is small at any acceleration. A reference with bends
-    everywhere is noisy, and none are excluded; quantization of a heading alone has no fourth
-    difference of 24 times `rounding`, step over interval.
+    At a corner, a spline through the heading and the trapezoidal integral of the output differ by
+    a 24th of the fourth difference, which passes for a dead zone or a slip. That of a smooth
+    motion is small at any acceleration; where a noisy reference has bends everywhere, none are
+    excluded.
 
     """
     bend = np.abs(np.diff(np.pad(rate, 2, mode='edge'), 4)) / 24.0

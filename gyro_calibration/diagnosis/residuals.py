@@ -113,17 +113,11 @@ class BandEnergies:
 def fit_noise_parameters(fit: RegressionFit, expected: Noise,
                          is_rounding_modelled: bool = False) -> NoiseParameters:
     """
-    Fit noise figures to the residual, and compare them with those of a model.
+    Fit noise figures to the residual, and compare them with those expected of a model.
 
-    Frequencies with more power than the noise, such as those of a vibration, are left out, as
-    `allan` leaves out averaging times that a filter or interference affects.
-
-    Parameters
-    ----------
-    fit : the fit
-    expected : the noise of the model; not compared if its angle random walk is 0
-    is_rounding_modelled : whether the model has quantization, so that its angle random walk is
-        without the rounding noise; otherwise it may include it
+    Frequencies with more power than the noise, such as those of a vibration, are left out. The
+    angle random walk is without rounding noise if the model has quantization; otherwise it may
+    include it. Figures are not compared if the expected angle random walk is 0.
 
     """
     bands = drop_tone_bands(_band_energies(fit))

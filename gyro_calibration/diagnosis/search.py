@@ -436,8 +436,9 @@ def search_causes(search: Search) -> Causes:
     """
     Return the causes that the data support, with values.
 
-    The sum of several causes along one variable may resemble none of them. So if structure without
-    a name is found, the search is repeated without generic terms, and the likelier result is used.
+    If structure without a name is found, the search is repeated without generic terms, as the sum
+    of several causes along one variable may resemble none of them, and the likelier result is
+    used.
 
     """
     everything = _select_forward(search)
@@ -588,8 +589,8 @@ def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[flo
     """
     Return the gain of each cause on held-out stretches in standard deviations.
 
-    The contribution of a cause, given the others, is scaled to fit best without each stretch in
-    turn. Slips are single events, and are not required to predict other stretches.
+    Given the others, it is scaled to fit best without each stretch in turn. Slips are single
+    events.
 
     """
     full, found = fit_causes(search.problem, causes), []
