@@ -25,7 +25,7 @@ from __future__ import annotations
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwell_search import find_lost_reference
+from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.heading_regression import (
     find_delay,
     fit_spans,

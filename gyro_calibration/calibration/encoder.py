@@ -37,8 +37,11 @@ from gyro_calibration.calibration.course_over_ground import (
     MAX_FOLLOWED_RESIDUAL,
     MAX_ROUNDING_STEP,
 )
-from gyro_calibration.calibration.dwell_search import few_values_remedy, interpolate_reference
-from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    few_values_remedy,
+    interpolate_reference,
+)
 from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
 from gyro_calibration.calibration.heading_regression import MAX_ENCODER_OFFSET, TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import (

@@ -28,7 +28,7 @@ from gyro_calibration.calibration.course_over_ground import (
     MAX_ROUNDING_RATIO,
     MAX_ROUNDING_STEP,
 )
-from gyro_calibration.calibration.dwell_search import find_lost_reference
+from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.calibration.reference_noise import (
     encoder_step,
     heading_difference,

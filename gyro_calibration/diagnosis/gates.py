@@ -26,7 +26,7 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from gyro_calibration.calibration.dwell_search import (
+from gyro_calibration.calibration.dwells import (
     few_values_remedy,
     find_lost_reference,
     interpolate_reference,
