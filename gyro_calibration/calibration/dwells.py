@@ -11,24 +11,20 @@
 """
 Dwells: stretches of constant rate, each one row of means, to which a calibration is fitted.
 
-They are the rows of a rate table without time, or found in a log in time (`dwell_search`).
+They are the rows of a rate table without time, or found in a log in time: there the reference
+heading, or the integral of the reference rate, is a straight line but for the steps of an encoder.
+Ramps, the settling of the gyro after them, outliers and repeated samples are left out.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 import math
+from typing import NamedTuple
 
-from gyro_calibration.calibration.dwell_search import (
-    find_dwell_rows,
-    format_list,
-    Numbers,
-    require_output,
-    Samples,
-    SteadinessLimits,
-)
 from gyro_calibration.calibration.run_faults import (
     fit_scale,
     MAX_UNEXPLAINED_SHARE,
@@ -36,8 +32,33 @@ from gyro_calibration.calibration.run_faults import (
 )
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
+from gyro_calibration.logs.quality import (
+    find_runs,
+    mask_outliers,
+    mask_repeated_samples,
+    quantization_step,
+)
+from gyro_calibration.logs.stamps import count_lost_samples
+from gyro_calibration.logs.stamps import Integers as Numbers
 import numpy as np
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.special import digamma, polygamma
+
+#: Minimum number of samples of a dwell, and minimum duration after all cuts, s.
+_MIN_SAMPLES, _MIN_DURATION = 8, 1.5
+#: Minimum cut at both ends of a dwell, s, which excludes a time offset between gyro and reference.
+_MARGIN = 0.25
+#: Largest deviation of the heading from a straight line beyond its steps, rad, and half of the
+#: largest difference between the rates of the quarters of a dwell, rad/s.
+_MAX_DEVIATION = 0.5 * DEGREE
+#: A dwell or a sample beyond this many robust standard deviations is outlying.
+OUTLIER_THRESHOLD = 6.0
+#: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
+MIN_TEMPERATURE_SPREAD = 1.0
+#: Minimum share of a log in dwells; a swing is steady for short times only.
+_MIN_DWELL_SHARE = 0.05
+#: Duration of the blocks in which the heading is averaged, s, and how many of them show a ramp.
+_BLOCK_DURATION, _RAMP_BLOCKS = 0.1, 5
 
 
 @dataclass(frozen=True)
@@ -100,11 +121,9 @@ def extract_dwells(log: Log, name: str = '') -> Dwells:
 def select_dwells(dwells: Dwells, mask: Mask) -> Dwells:
     """Return some of the dwells, by a mask of shape (n,)."""
     temperature = None if dwells.temperature is None else dwells.temperature[mask]
-    places = tuple(place for place, wanted in zip(dwells.location, mask) if wanted)
-    rows = tuple(rows for rows, wanted in zip(dwells.rows, mask) if wanted)
-    return replace(dwells, rate=dwells.rate[mask], output=dwells.output[mask],
-                   temperature=temperature, deviation=dwells.deviation[mask],
-                   sweep=dwells.sweep[mask], location=places, rows=rows)
+    return Dwells(dwells.rate[mask], dwells.output[mask], temperature, dwells.deviation[mask],
+                  dwells.sweep[mask], tuple(compress(dwells.location, mask)), dwells.remarks,
+                  tuple(compress(dwells.rows, mask)))
 
 
 def join_dwells(parts: Sequence[Dwells]) -> Dwells:
@@ -132,6 +151,20 @@ def join_dwells(parts: Sequence[Dwells]) -> Dwells:
                   sum((part.rows for part in parts), ()))
 
 
+def require_output(log: Log) -> Array:
+    """Return the output of a log, or refuse it."""
+    if log.output is None:
+        raise DataRefused('the log holds no gyro output in rad/s; with gyro_counts alone, say how '
+                          'many deg/s a count is')
+    return log.output
+
+
+def format_list(items: Sequence[str], limit: int = 5) -> str:
+    """Return the first words, separated by commas, and the number of further ones."""
+    return ', '.join(items[:limit]) + (
+        f' and {len(items) - limit} more' if len(items) > limit else '')
+
+
 # rate tables
 
 def dwells_from_table(log: Log) -> Dwells:
@@ -157,25 +190,18 @@ def dwells_from_table(log: Log) -> Dwells:
     remark = (f'{len(lost)} rows without output or reference are left out: '
               f'{format_list([str(row) for row in lost])}')
     rate, names = log.reference_rate[rows], log.others.get('sweep')
-    numbers = {name: number for number, name in enumerate(dict.fromkeys(names or ()))}
-    sweep = (number_sweeps(rate) if names is None
-             else np.array([numbers[names[row]] for row in rows]))
-    return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows],
-                  _read_deviation_column(log)[rows], sweep,
-                  tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
-                  tuple(np.split(rows, len(rows))))
-
-
-def _read_deviation_column(log: Log) -> Array:
-    texts = log.others.get('deviation_dps')
-    if texts is None:
-        return np.full(len(log), np.nan)
+    sweep = (number_sweeps(rate) if names is None else np.array(
+        [list(dict.fromkeys(names)).index(names[row]) for row in rows]))
     try:
-        values = np.array(texts, dtype=float) * DEGREE
+        deviation = np.array(log.others.get('deviation_dps', [math.nan] * len(log)),
+                             dtype=float)[rows] * DEGREE
     except ValueError as error:
         raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
                           'or nan where it is not known') from None
-    return np.where(values > 0.0, values, np.nan)
+    return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows],
+                  np.where(deviation > 0.0, deviation, np.nan), sweep,
+                  tuple(f'row {row + 1}' for row in rows), (remark,) if len(lost) else (),
+                  tuple(np.split(rows, len(rows))))
 
 
 def number_sweeps(rate: Array) -> Numbers:
@@ -215,29 +241,347 @@ def _number_passes(value: Array) -> Numbers:
     return numbers
 
 
-# logs in time
+# the reference of a log in time
 
-def find_dwells(log: Log, limits: SteadinessLimits | None = None) -> Dwells:
+def find_lost_reference(known: Mask) -> Mask:
+    """Mark samples without a reference, where its values are above 1.5 median intervals apart."""
+    apart = np.diff(np.flatnonzero(known), prepend=-1, append=len(known))
+    usual = float(np.median(apart[1:-1])) if len(apart) > 2 else 1.0
+    lost = ~known
+    lost[~known] = np.repeat(apart > 1.5 * usual, apart - 1)
+    return lost
+
+
+def few_values_remedy(time: Array, known: Mask, wanted: int) -> str:
+    """Return how to record more values of a reference: longer, where they come evenly."""
+    stamps = time[known]
+    if not 1 < len(stamps) < wanted or find_lost_reference(known).mean() > 0.5:
+        return 'repair its line and record again'
+    duration = (stamps[-1] - stamps[0]) * (wanted - 1) / (len(stamps) - 1)
+    return f'record longer, {math.ceil(duration)} s at the interval of the reference'
+
+
+def interpolate_reference(time: Array, values: Array) -> Array:
+    """Return a slow reference at each sample, linear between its values; nan where it is lost."""
+    known = np.isfinite(values)
+    if known.all() or not known.any():
+        return values
+    return np.where(find_lost_reference(known), np.nan,
+                    np.interp(time, time[known], values[known], np.nan, np.nan))
+
+
+class _Samples(NamedTuple):
     """
-    Find the dwells in a log in time.
+    Samples with output and reference, arrays of shape (n,).
+
+    `heading` is that of the reference, or the integral of its `rate`; `step` is that of an
+    encoder, rad, and `scale` the approximate ratio of output to reference.
+
+    """
+
+    time: Array
+    output: Array
+    rate: Array | None
+    heading: Array
+    step: float
+    temperature: Array | None
+    scale: float = 1.0
+
+    @property
+    def error(self) -> Array:
+        """Return the output, less the share of a reference rate: it is steady in a dwell."""
+        return self.output if self.rate is None else self.output - self.scale * self.rate
+
+    def duration(self, rows: Numbers | slice) -> float:
+        """Return the time from the first to the last sample of a part of the log, s."""
+        return float(np.ptp(self.time[rows]))
+
+    def slope(self, rows: Numbers, angle: Array) -> float:
+        """
+        Return the mean rate of an angle over some samples, rad/s.
+
+        It is the slope of a straight line through a heading, whose errors are those of single
+        samples, and the difference of both ends over the duration where a rate was integrated.
+
+        """
+        time = self.time[rows]
+        return (_fit_slope(time, angle) if self.rate is None
+                else float((angle[-1] - angle[0]) / (time[-1] - time[0])))
+
+
+def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
+    """Return the samples with output and reference, none near a lost reference, and remarks."""
+    output, time, rate = require_output(log), log.time, log.reference_rate
+    if log.reference_heading is not None and (
+            rate is None or np.isfinite(log.reference_heading).any()):
+        rate = None  # it is often the derivative of the heading
+    reference = log.reference_heading if rate is None else rate
+    if time is None or reference is None:
+        raise DataRefused('the log has no time or no reference; to find dwells it needs time_s '
+                          'and one of reference_rate_dps and reference_heading_deg')
+    known = np.isfinite(reference)
+    lost = find_lost_reference(known)
+    # A reference has errors up to 0.05 s before and after a loss: motion capture loses its markers
+    # one by one. Stamps may come in bursts, so the mean interval counts.
+    steps = np.diff(time)
+    steps = steps[steps < 1.0]
+    reach = round(0.05 / float(steps.mean())) if len(steps) else 0
+    good = np.flatnonzero(~maximum_filter1d(lost, 2 * reach + 1) & known & np.isfinite(output))
+    if len(good) < _MIN_SAMPLES:
+        raise DataRefused(f'{len(good)} of {len(time)} samples hold both a gyro output and '
+                          'a reference; check the columns')
+    places = [f'{time[run.start]:.2f} s' for run in find_runs(lost)]
+    remark = (f'the reference was lost {_format_occurrences(len(places))}, for {lost.sum()} '
+              f'samples, at {format_list(places)}; they are left out')
+    angle = reference[good] if rate is None else integrate(time[good], reference[good])
+    return _Samples(time[good], output[good], None if rate is None else rate[good], angle,
+                    quantization_step(angle) if rate is None else 0.0,
+                    None if log.temperature is None else log.temperature[good]), (
+                        [remark] if places else [])
+
+
+def _fit_slope(x: Array, values: Array) -> float:
+    """Return the slope of the straight line through some values."""
+    centred = x - x.mean()
+    return float(centred @ values / (centred @ centred))
+
+
+# dwells of a log in time
+
+def find_dwells(log: Log) -> Dwells:
+    """
+    Find the dwells of a log in time by its reference heading, or else by its reference rate.
 
     Raises
     ------
     DataRefused : output or reference are missing, or the reference is never steady for long enough
 
     """
-    samples, dwells, remarks = find_dwell_rows(log, limits or SteadinessLimits())
-    rate, output, deviation = _average(samples, dwells)
+    samples, remarks = _select_samples(log)
     time, temperature = samples.time, samples.temperature
+    parts = [np.arange(part.start, part.stop) for part in _find_straight(samples)
+             if samples.duration(part) > _MIN_DURATION]
+    rates = np.array([samples.slope(rows, samples.heading[rows]) for rows in parts])
+    if len(rates) > 1 and np.ptp(rates) > 1.0 * DEGREE:  # rests alone do not determine the scale
+        samples = samples._replace(scale=_fit_slope(rates, np.array(
+            [np.median(samples.output[rows]) for rows in parts])))
+    is_outlier, is_repeated = np.zeros((2, len(time)), dtype=bool)
+    kept = []
+    for part in parts:
+        is_repeated[part] = mask_repeated_samples(samples.output[part])
+        fresh = part[~is_repeated[part]]
+        is_outlier[fresh] = mask_outliers(samples.error[fresh], OUTLIER_THRESHOLD)
+        kept.append(fresh[~is_outlier[fresh]])
+    settled, cut = _trim_settling(samples, kept)
+    divided = [part for rows in settled for part in _split_by_temperature(samples, rows)]
+    dwells = [rows for rows in divided
+              if len(rows) >= _MIN_SAMPLES and samples.duration(rows) >= _MIN_DURATION]
+    if short := len(divided) - len(dwells):
+        remarks.append(f'steady stretches shorter than {_MIN_DURATION:g} s without the '
+                       f'settling, left out: {short}')
+    remarks.append(cut)
+    if more := len(divided) - len(settled):
+        remarks.append('dwells that warmed or cooled by more than '
+                       f'{MIN_TEMPERATURE_SPREAD:g} K are divided, which makes {more} more')
+    within = np.zeros(len(time), dtype=bool)
+    for rows in dwells:
+        within[rows[0]:rows[-1] + 1] = True
+    remarks += _describe_left_out(log, samples, is_outlier & within, is_repeated & within, within)
+    share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
+    if share < _MIN_DWELL_SHARE:
+        limit = _MAX_DEVIATION / DEGREE
+        raise DataRefused(
+            f'the reference is steady to {limit:g} deg/s and straight to {limit:g} deg, for '
+            f'{_MIN_DURATION:g} s at a time without the settling, in {100.0 * share:.0f} % '
+            'of the log; hold each rate for longer, or use the heading itself with '
+            '--method likelihood')
+    rate, output, deviation = _average(samples, dwells)
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None
                   else np.array([temperature[rows].mean() for rows in dwells]), deviation,
                   number_sweeps(rate),
                   tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells),
-                  remarks, tuple(row[rows] for rows in dwells))
+                  tuple(remarks), tuple(row[rows] for rows in dwells))
 
 
-def _average(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array, Array]:
+def _find_straight(samples: _Samples) -> list[slice]:
+    """Return the stretches in which the heading is a straight line, but for encoder steps."""
+    step, time = samples.step, samples.time
+    first = np.unique(np.floor((time - time[0]) / _BLOCK_DURATION), return_index=True)[1]
+    edges = np.append(first, len(time))
+    times, headings = (np.add.reduceat(values, first) / np.diff(edges)
+                       for values in (time, samples.heading))
+    # A vibration of the table cancels over a whole number of its periods, so several lengths are
+    # used.
+    deviation = max((float(np.median(np.abs(
+        headings[reach:-reach] - 0.5 * (headings[2 * reach:] + headings[:-2 * reach]))))
+        for reach in (2, 3, 5) if len(headings) > 2 * reach), default=math.inf)
+    tolerance = step + float(np.clip(3.0 * deviation, 0.02 * DEGREE, _MAX_DEVIATION))
+    kept: list[slice] = []
+    for cone in _split_into_lines(times, headings, 2.0 * tolerance):
+        if times[cone.stop - 1] - times[cone.start] < 0.5 * _MIN_DURATION:
+            continue
+        part = _extend_line(times, headings, cone, tolerance)
+        # of two stretches that overlap, the longer one has the more accurate line
+        if kept and part.start < kept[-1].stop and _length(part) > _length(kept[-1]):
+            kept.pop()
+        if not kept or part.start >= kept[-1].stop:
+            kept.append(part)
+    whole = [slice(int(edges[part.start]), int(edges[part.stop]))
+             for part in kept if _length(part) > 4]
+    return [part for part in whole if _has_constant_slope(samples, part)]
+
+
+def _length(part: slice) -> int:
+    return int(part.stop - part.start)
+
+
+def _split_into_lines(time: Array, heading: Array, tolerance: float) -> Iterator[slice]:
+    """Divide a heading into the longest stretches that a line through their first point fits."""
+    start, low, high = 0, -math.inf, math.inf
+    times, headings = time.tolist(), heading.tolist()
+    for place in range(1, len(times)):
+        elapsed = times[place] - times[start]
+        rise = headings[place] - headings[start]
+        low, high = max(low, (rise - tolerance) / elapsed), min(high, (rise + tolerance) / elapsed)
+        if low > high or times[place] - times[place - 1] > _MIN_DURATION:
+            yield slice(start, place)
+            start, low, high = place, -math.inf, math.inf
+    yield slice(start, len(times))
+
+
+def _extend_line(time: Array, heading: Array, stretch: slice, tolerance: float) -> slice:
+    """Fit a line to the middle of a stretch, extend it within the tolerance, exclude the ramps."""
+    fifth = _length(stretch) // 5
+    middle = slice(stretch.start + fifth, stretch.stop - fifth)
+    # By at most its own length at both ends, so that the time is linear in the length of the log.
+    first = max(0, stretch.start - _length(stretch))
+    last = min(len(time), stretch.stop + _length(stretch))
+    line = heading[middle].mean() + _fit_slope(time[middle], heading[middle]) * (
+        time[first:last] - time[middle].mean())
+    deviation = np.abs(heading[first:last] - line)
+    beyond = np.flatnonzero(deviation > tolerance)
+    before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
+    begin = (0 if not len(before) else int(before[-1]) + 1
+             + _count_ramp_blocks(deviation[before[-1]::-1], tolerance))
+    end = (len(deviation) if not len(after)
+           else int(after[0]) - _count_ramp_blocks(deviation[after[0]:], tolerance))
+    return slice(first + begin, first + max(begin, end))
+
+
+def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
+    """
+    Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
+
+    On a ramp the deviation of the heading is proportional to the square of time, so the ratio of
+    two deviations gives its beginning; a short ramp began later.
+
+    """
+    if len(deviation) <= _RAMP_BLOCKS:
+        return 0
+    ratio = math.sqrt(max(1.0, deviation[_RAMP_BLOCKS] / tolerance))
+    return math.ceil(min(6.0, 1.0 / max(ratio - 1.0, 1e-3)) * _RAMP_BLOCKS)
+
+
+def _has_constant_slope(samples: _Samples, part: slice) -> bool:
+    """Return whether the quarters of a stretch have one slope, unlike those of a slow swing."""
+    quarters = [rows for rows in np.array_split(np.arange(part.start, part.stop), 4)
+                if len(rows) > 2]
+    slopes = np.array([_fit_slope(samples.time[rows], samples.heading[rows]) for rows in quarters])
+    blur = 8.0 * samples.step / samples.duration(part)
+    return not quarters or bool(np.ptp(slopes) <= blur + 2.0 * (
+        _MAX_DEVIATION + 0.005 * np.abs(slopes).max()))
+
+
+# settling and temperature
+
+def _trim_settling(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[list[Numbers], str]:
+    """Cut margin or settling time, if longer, off both ends of dwells; return a remark."""
+    time, error = samples.time, samples.error
+    rate_change = np.diff([np.median(samples.output[rows]) for rows in dwells])
+    # a time offset shows before a ramp, in the mirrored log
+    mirrored = [(len(time) - 1 - rows)[::-1] for rows in dwells[:-1]]
+    after, before = (max(_MARGIN, _settling_time(*each))
+                     for each in ((time, error, dwells[1:], rate_change),
+                                  (-time[::-1], error[::-1], mirrored, -rate_change)))
+    kept = [rows[(time[rows] >= time[rows[0]] + after) & (time[rows] <= time[rows[-1]] - before)]
+            for rows in dwells]
+    return kept, f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut away'
+
+
+def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
+                   rate_change: Array) -> float:
+    """
+    Return the settling time of the output after a ramp, s.
+
+    A linear response (a filter, a delay) is proportional to the change of rate, so it is averaged
+    over all dwells, which determines a response below the noise of one dwell. It is settled where
+    it is within four standard deviations of its last half; below 20 ppm it always is.
+
+    """
+    if not len(dwells):
+        return 0.0
+    durations = np.array([float(np.ptp(time[rows])) for rows in dwells])
+    interval, width = max(0.05, float(np.median(np.diff(time)))), 4
+    bins = int(min(np.quantile(durations, 0.25), 9.0) / interval)
+    edges = np.arange(bins + 1) * interval
+    used = durations >= edges[-1]
+    if bins < 8 * width or not rate_change[used].any():
+        return 0.0
+    angles = [np.interp(edges, time[rows] - time[rows[0]], integrate(time[rows], error[rows]))
+              for rows, wanted in zip(dwells, used) if wanted]
+    means = np.diff(angles, axis=1) / interval
+    late = means[:, bins // 2:].mean(axis=1, keepdims=True)
+    response = uniform_filter1d(rate_change[used] @ (means - late) / np.sum(
+        rate_change[used] ** 2), width, mode='nearest')
+    spread = max(float(response[bins // 2:].std()), 2e-5)
+    unsettled = np.flatnonzero(np.abs(response[:bins // 3]) > 4.0 * spread)
+    # after ten bins within the limit the response has ended; later ones exceed it by chance
+    unsettled = unsettled[np.cumprod(np.diff(unsettled, prepend=-1) <= 10) > 0]
+    return (int(unsettled[-1]) + 1 + width // 2) * interval if len(unsettled) else 0.0
+
+
+def _split_by_temperature(samples: _Samples, rows: Numbers) -> list[Numbers]:
+    """Divide a dwell in which the temperature changes, so that its slope can be fitted."""
+    if samples.temperature is None or len(rows) < 24:
+        return [rows]
+    twelfths = np.array_split(samples.temperature[rows], 12)
+    change = float(np.ptp([part.mean() for part in twelfths]))
+    return np.array_split(rows, max(1, min(math.ceil(change / MIN_TEMPERATURE_SPREAD),
+                                           int(samples.duration(rows) / _MIN_DURATION))))
+
+
+def _describe_left_out(log: Log, samples: _Samples, is_outlier: Mask, is_repeated: Mask,
+                       within: Mask) -> Iterator[str]:
+    """Yield remarks on outliers, repeated and lost samples within the dwells."""
+    places = [f'{time:.2f} s' for time in samples.time[is_outlier]]
+    if places:
+        yield f'outliers, left out: {len(places)}, at {format_list(places)}'
+    places = [f'{samples.time[run.start]:.2f} s ({run.stop - run.start} samples)'
+              for run in find_runs(is_repeated)]
+    if places:
+        yield (f'the output was repeated {_format_occurrences(len(places))}, at '
+               f'{format_list(places)}; the repeats are left out')
+    assert log.time is not None and log.output is not None
+    time = log.time[np.isfinite(log.output)]
+    lost = count_lost_samples(time)
+    if lost is None:
+        yield 'the stamps are too irregular to count lost samples'
+        return
+    gaps = np.flatnonzero((lost > 0) & (np.interp(time[1:], samples.time, within) > 0.5))
+    if len(gaps):
+        yield (f'samples missing within the dwells: {lost[gaps].sum()}, '
+               f'after {format_list([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
+               'constant rate the means are not affected')
+
+
+def _format_occurrences(number: int) -> str:
+    return 'once' if number == 1 else f'{number} times'
+
+
+# means
+
+def _average(samples: _Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array, Array]:
     """
     Return reference rate, output and its standard deviation of each dwell (Ojeda et al., eq. 6).
 
@@ -265,10 +609,9 @@ def _average(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array,
     # Against a heading, the scatter of the output includes the motion of the table, that of the
     # error the steps of the encoder; the smaller one is used. Its product with the duration is the
     # same in all dwells under white noise.
-    variance = (by_error if samples.rate is not None
-                else min(by_output, by_error, key=np.median))
-    deviation = np.sqrt(shrink_variances(variance * durations, batches - 1) / durations
-                        + blur ** 2)
+    variance = durations * (by_error if samples.rate is not None
+                            else min(by_output, by_error, key=np.median))
+    deviation = np.sqrt(_shrink_variances(variance, batches - 1) / durations + blur ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan)
 
 
@@ -288,22 +631,17 @@ def _encoder_deviation(heading: Array, step: float, duration: float) -> float:
         0.35 / max(steps, 0.6), math.sqrt(min(steps, samples)) / samples)
 
 
-def shrink_variances(variance: Array, dof: Array) -> Array:
+def _shrink_variances(variance: Array, dof: Array) -> Array:
     """
-    Shrink variances toward their common value, by more if they are uncertain or agree.
+    Shrink variances, shape (n,), toward their common value, by more if they agree.
 
     A variance of twelve batches has a standard error of 40 %; weights computed from it would be
     random, and the smallest variances would dominate the fit. Empirical Bayes: the logarithms are
     shrunk by the part of their scatter that the degrees of freedom explain (Smyth 2004, section
     6.2).
 
-    Parameters
-    ----------
-    variance : shape (n,); 0 where it is not known
-    dof : degrees of freedom of each, shape (n,)
-
     """
-    known = variance > 0.0
+    known = variance > 0.0  # 0 where it is not known
     if known.sum() < 3:
         return variance
     half_dof = dof[known] / 2.0

@@ -30,8 +30,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwell_search import few_values_remedy, interpolate_reference
-from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    few_values_remedy,
+    interpolate_reference,
+)
 from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
 from gyro_calibration.calibration.heading_regression import (
     fit_course,

@@ -8,7 +8,15 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""From dwells to a gyro's model: values of effects, covariance and errors of left-out sweeps."""
+"""
+From dwells to a gyro's model: values of effects, covariance, and errors of left-out sweeps.
+
+The errors are also those of full turns of 360 degrees (Ojeda et al., section 4): an error of the
+rate, rad/s, integrates to an error of the heading in each turn, rad, in proportion to the duration
+of the turn. Two errors are compared: with the bias of a rest before the mission only, and with a
+model and then the bias that remains at rest.
+
+"""
 
 from __future__ import annotations
 
@@ -16,20 +24,26 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
+from typing import NamedTuple
 
-from gyro_calibration.calibration.dwells import Dwells, select_dwells
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    MIN_TEMPERATURE_SPREAD,
+    Numbers,
+    select_dwells,
+)
 from gyro_calibration.calibration.scatter import (
     cross_validation_parts,
     estimate_scatter,
-    MIN_TEMPERATURE_SPREAD,
+    estimate_tolerance,
     rms,
     Scatter,
     sum_by_part,
     Uncertainty,
     Whitener,
 )
-from gyro_calibration.calibration.tolerance import estimate_tolerance
-from gyro_calibration.logs.log import Array, DataRefused, Mask
+from gyro_calibration.calibration.self_calibration import refuse_scale
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 from gyro_calibration.model.effects import Channels, Effect
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
@@ -37,6 +51,10 @@ from scipy.linalg import solve_triangular
 
 #: Beyond this condition number of the columns, each of length one, the effects are not separable.
 MAX_CONDITION_NUMBER = 1e3
+#: rad/s; the error of slower turns is mostly bias, not scale; as published.
+MIN_TURN_RATE = 5.0 * DEGREE
+#: A dwell that turns slower than this is a rest.
+MAX_REST_RATE = 0.1 * DEGREE
 
 
 @dataclass(frozen=True)
@@ -180,6 +198,17 @@ class Calibration:
     def left_out_rms(self) -> float:
         """Return the root mean square of the errors of sweeps left out, rad/s."""
         return rms(self.left_out_residual[self.scatter.inliers])
+
+    @property
+    def left_out_rate(self) -> Array:
+        """
+        Return the rate of each dwell by a fit without its sweep, rad/s, shape (n,).
+
+        It is not finite at outlying dwells and where the other sweeps do not determine the model.
+
+        """
+        slope = GyroModel(self.terms).output_slope(channels_of(self.dwells))
+        return np.asarray(self.dwells.rate + self.left_out_residual / slope)
 
     def cross_validation_misfit(self) -> float:
         """Return the mean over left-out sweeps of the mean squared error, in dwell variances."""
@@ -437,3 +466,129 @@ def equal_bins(values: Array, max_bins: int) -> Iterator[tuple[float, float, Mas
     place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
     for number, (low, high) in enumerate(zip(edges.tolist(), edges[1:].tolist())):
         yield low, high, place == number
+
+
+# errors of full turns
+
+@dataclass(frozen=True)
+class TurnErrors:
+    """
+    Errors of full turns, counter-clockwise positive as the heading is, each array of shape (n,).
+
+    Attributes
+    ----------
+    rate : true rate of the turn, rad/s
+    temperature : degC; None where the log holds none
+    static : with the static bias only, rad per turn
+    modelled : with the model, and the static bias after it, rad per turn
+    sweep : that the turn was measured in
+    location : of each turn in its file
+    remarks : on the source of the static bias, and on turns without an error, one sentence each
+
+    """
+
+    rate: Array
+    temperature: Array | None
+    static: Array
+    modelled: Array
+    sweep: Numbers
+    location: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.rate)
+
+
+def compute_turn_errors(dwells: Dwells, rate: Array,
+                        min_rate: float = MIN_TURN_RATE) -> TurnErrors:
+    """
+    Return the errors of full turns at the rates and temperatures of some dwells.
+
+    Parameters
+    ----------
+    dwells : without those that are outlying
+    rate : of each dwell by the model (eq. 13), rad/s, shape (n,); not finite where there is none,
+        as in `Calibration.left_out_rate`
+    min_rate : of a turn, rad/s
+
+    Raises
+    ------
+    DataRefused : no dwell of that rate has a rate by the model, none determines the static bias,
+        or the gyro is upside down
+
+    """
+    known = np.isfinite(rate)
+    lost = int(np.count_nonzero(~known & (np.abs(dwells.rate) >= min_rate)))
+    dwells, rate = select_dwells(dwells, known), rate[known]
+    wanted = np.abs(dwells.rate) >= min_rate
+    if not wanted.any():
+        raise DataRefused(f'none of {len(known)} dwells turns at {min_rate / DEGREE:g} deg/s or '
+                          'faster and has a rate by the model; '
+                          'record faster turns, or several sweeps')
+    turns = select_dwells(dwells, wanted)
+    scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
+    refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
+    rests, remark = _find_rests(dwells)
+    nearest = _find_nearest(dwells, turns, rests)
+    static, modelled = (
+        # eq. 1 and 2, eq. 13 to 16: the integral over a turn of errors of a rate, less the bias
+        (error[wanted] - [weights @ error[rows] for rows, weights in nearest])
+        * 2.0 * math.pi / np.abs(turns.rate)
+        for error in (dwells.output - dwells.rate, rate - dwells.rate))
+    remarks = [remark]
+    if lost:
+        remarks.append(f'{lost} turns are left out: the other sweeps do not determine the model')
+    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.location,
+                      tuple(remarks))
+
+
+#: Number of a sweep -> the dwells that determine its static bias, and their weights.
+Rests = dict[int, tuple[Numbers, Array]]
+
+
+def _find_rests(dwells: Dwells) -> tuple[Rests, str]:
+    """Return the rests of the sweeps (eq. 1), or if there is none the slowest turns both ways."""
+    speed, at_rest, between = np.abs(dwells.rate), Rests(), Rests()
+    sweeps = np.unique(dwells.sweep).tolist()
+    for number in sweeps:
+        rows = np.flatnonzero(dwells.sweep == number)
+        rests = rows[speed[rows] <= MAX_REST_RATE]
+        if len(rests):
+            at_rest[number] = rests, np.full(len(rests), 1.0 / len(rests))
+        ways = [rows[way * dwells.rate[rows] > 0.0] for way in (1.0, -1.0)]
+        if all(map(len, ways)):
+            slowest = np.array([each[np.argmin(speed[each])] for each in ways])
+            between[number] = slowest, speed[slowest[::-1]] / speed[slowest].sum()
+    if not at_rest and not between:
+        raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that '
+                          'nothing shows the static bias; record a rest before each sweep')
+    found, remark = at_rest or between, (
+        'the static bias is from the rest of each sweep' if at_rest else
+        'no rest; the static bias is the error between the slowest turns both ways of each sweep')
+    if others := len(sweeps) - len(found):
+        remark += (f'; {others} of {len(sweeps)} sweeps have none and take that of the nearest '
+                   'temperature')
+    return found, remark
+
+
+def _find_nearest(dwells: Dwells, turns: Dwells,
+                  rests: Rests) -> list[tuple[Numbers, Array]]:
+    """Return the rest of each turn's sweep, or else the nearest in temperature, then in order."""
+    degc, at = ((np.zeros(len(each)) if each.temperature is None else each.temperature)
+                for each in (dwells, turns))
+    of_rest = {number: float(degc[rows].mean()) for number, (rows, _) in rests.items()}
+    return [rests[min(rests, key=lambda number: (
+        number != sweep, abs(of_rest[number] - temperature), abs(number - sweep)))]
+        for sweep, temperature in zip(turns.sweep.tolist(), at.tolist())]
+
+
+class ErrorSummary(NamedTuple):
+    """Root mean square and largest absolute value of errors, rad per turn."""
+
+    rms: float
+    largest: float
+
+
+def summarize_errors(errors: Array) -> ErrorSummary:
+    """Return how large some errors are, shape (n,) with n above 0."""
+    return ErrorSummary(rms(errors), float(np.abs(errors).max()))

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwell_search import find_lost_reference
+from gyro_calibration.calibration.dwells import find_lost_reference
 from gyro_calibration.heading.integration import integrate_with_curvature
 from gyro_calibration.logs.log import Array, Log, Mask
 from gyro_calibration.logs.quality import (

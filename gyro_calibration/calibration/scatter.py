@@ -19,29 +19,43 @@ dwells of one sweep do not count as thirty independent ones.
 The sizes are estimated about a smooth surface over rate and temperature, before any effect is
 fitted. About too few effects, they would include the error of a missing effect.
 
+The covariance of the values states how well the dwells determine them, if the model is complete
+and the gyro does not change. The tolerance states the errors of another run: bias and scale factor
+change by as much as from sweep to sweep, and outside of the calibrated temperatures and rates,
+effects that were not fitted add errors.
+
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
 
-from gyro_calibration.calibration.dwells import Dwells, Numbers, select_dwells
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    MIN_TEMPERATURE_SPREAD,
+    Numbers,
+    OUTLIER_THRESHOLD,
+    select_dwells,
+)
 from gyro_calibration.calibration.likelihood import robust_residual
+from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
+from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
-#: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
-OUTLIER_THRESHOLD = 6.0
-#: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
-MIN_TEMPERATURE_SPREAD = 1.0
 #: With fewer, errors common to the dwells of a sweep are not distinguishable from random errors.
 MIN_SWEEPS = 4
 #: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
 _MIN_DWELLS = 12
+#: Standard deviations between gyros, by data sheets: the change of the bias with temperature,
+#: rad/s/K (L3G4200D: 0.03 deg/s/K), that of the scale factor, 1/K (L3G4200D: 2 % over 60 K), and
+#: the nonlinearity at the fastest rate that is not fitted, 1 (L3G4200D: 0.2 %).
+BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION, NONLINEARITY_DEVIATION = (
+    Prior().coefficient, 3e-4, 2e-3)
 
 
 @dataclass(frozen=True)
@@ -168,10 +182,17 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
         return Scatter(*np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(),
                        inliers=kept)  # type: ignore[misc]
 
+    def deviance(logarithms: Array) -> float:
+        """Return -ln of the restricted likelihood, up to a constant."""
+        tried = scatter(logarithms)
+        deviation = tried.deviation(used)
+        log_determinant, misfit, *_ = _fit_values(
+            used, deviation, surface, error, np.array([[tried.sweep_bias, tried.sweep_scale]]))
+        return 0.5 * float(log_determinant[0] + 2.0 * np.log(deviation).sum() + misfit[0])
+
     # a simplex would collapse onto a bound
     best = minimize(
-        lambda logarithms: -_restricted_log_likelihood(used, scatter(logarithms), error, surface),
-        np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B',
+        deviance, np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B',
         bounds=[(-7.0, 2.0)] * len(units), options={'eps': 1e-4, 'ftol': 1e-7})
     return scatter(best.x)
 
@@ -220,37 +241,18 @@ def surface_dof(dwells: Dwells) -> int:
     return len(dwells) - _smooth_surface(dwells).shape[1]
 
 
-def _restricted_log_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
-                               columns: Array) -> float:
-    """Return the restricted log-likelihood of the scatter, up to a constant."""
-    deviation = scatter.deviation(dwells)
-    fit = _fit_values(dwells, deviation, columns, error,
-                      np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
-    return -0.5 * float(fit.log_determinant[0] + 2.0 * np.log(deviation).sum() + fit.misfit[0])
-
-
-class _Fits(NamedTuple):
-    """
-    Values by generalised least squares, for each of k scatters of sweeps.
-
-    Attributes
-    ----------
-    log_determinant : of the covariance, in that of the dwells, times the Gram matrix, shape (k,)
-    misfit : sum of the squared whitened residuals, shape (k,)
-    values : shape (k, m)
-    inverse : of the Gram matrix of the whitened columns, shape (k, m, m)
-
-    """
-
-    log_determinant: Array
-    misfit: Array
-    values: Array
-    inverse: Array
-
-
 def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
-                sizes: Array) -> _Fits:
-    """Fit columns (n, m) to an error (n,), for scatters of sweeps' bias and scale (k, 2)."""
+                sizes: Array) -> tuple[Array, Array, Array, Array]:
+    """
+    Fit columns (n, m) to an error (n,) for each of k scatters of sweeps' bias and scale, (k, 2).
+
+    Returns
+    -------
+    logarithm of the determinants of the covariance, in that of the dwells, and of the Gram matrix,
+    shape (k,); sum of the squared whitened residuals, shape (k,); values, shape (k, m); inverse of
+    the Gram matrix of the whitened columns, shape (k, m, m)
+
+    """
     columns = np.column_stack([columns, error]) / deviation[:, None]
     shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
     inner, outer = (sum_by_part(shared[:, :, None] * each[:, None, :],
@@ -264,8 +266,8 @@ def _fit_values(dwells: Dwells, deviation: Array, columns: Array, error: Array,
     values = np.einsum('kij,kj->ki', inverse, right)
     misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right),
                         1e-12 * (columns[:, -1] @ columns[:, -1])) + 1e-200
-    return _Fits(np.linalg.slogdet(inner)[1].sum(axis=1) - np.linalg.slogdet(inverse)[1],
-                 misfit, values, inverse)
+    return (np.linalg.slogdet(inner)[1].sum(axis=1) - np.linalg.slogdet(inverse)[1], misfit,
+            values, inverse)
 
 
 # uncertainty of the values
@@ -321,19 +323,16 @@ class Uncertainty:
                                  (scatter.sweep_bias, scatter.sweep_scale), units)))
         sizes = [units * np.column_stack([np.full(len(axes[1]), bias), axes[1]])
                  for bias in axes[0]]  # in turn, for the memory
-        fits = [_fit_values(dwells, deviation, columns / lengths, error, each) for each in sizes]
-        log_determinant, misfit = (np.concatenate([fit[place] for fit in fits])
-                                   for place in (0, 1))
+        log_determinant, misfit, offsets, inverses = (np.concatenate(each) for each in zip(*(
+            _fit_values(dwells, deviation, columns / lengths, error, each) for each in sizes)))
         logarithm = -0.5 * (log_determinant + dof * np.log(misfit))
         weights = np.exp(logarithm - logarithm.max()) * np.outer(*priors).ravel()
         likely = weights > 1e-4 * weights.sum()
         weights = weights[likely] / weights[likely].sum()
-        offsets, inverses = (np.concatenate([fit[place] for fit in fits])[likely]
-                             for place in (2, 3))
         size = misfit[likely] / dof
         squares = np.concatenate(sizes)[likely] ** 2 * size[:, None]
-        return cls(weights, offsets / lengths,
-                   inverses * size[:, None, None] / np.outer(lengths, lengths), dof,
+        return cls(weights, offsets[likely] / lengths,
+                   inverses[likely] * size[:, None, None] / np.outer(lengths, lengths), dof,
                    np.sqrt(weights @ squares))
 
     @property
@@ -370,3 +369,65 @@ def _scatter_grid(size: float) -> tuple[Array, Array]:
     sizes = max(size, 0.1) * np.exp(logarithms)
     prior = sizes / (math.pi * (1.0 + sizes ** 2)) * (logarithms[1] - logarithms[0])
     return np.append(0.0, sizes), np.append(0.5, prior)
+
+
+# errors in another run
+
+def estimate_tolerance(dwells: Dwells, whitener: Whitener, sweep_scatter: Array,
+                       columns: Callable[[Array, Array], Array], covariance: Array) -> Tolerance:
+    """
+    Return the error of a rate that the covariance of the values does not contain.
+
+    Effects that were not fitted may exist below the noise: a fit with more columns has a larger
+    variance than that of the values. Its mean over the dwells is added to the variance of the
+    bias; its value half a width outside of the calibrated range gives the slopes.
+
+    Parameters
+    ----------
+    dwells : that were fitted
+    whitener : of their scatter
+    sweep_scatter : scatter of bias and scale factor from sweep to sweep, rad/s and 1, shape (2,)
+    columns : of rates, rad/s, and temperatures, degC: change of the output for each value, (n, m)
+    covariance : of the values, shape (m, m)
+
+    """
+    fastest = max(float(np.abs(dwells.rate).max()), 1e-9)
+    temperature = (np.zeros(len(dwells)) if dwells.temperature is None
+                   else np.asarray(dwells.temperature))
+    low, high = float(temperature.min()), float(temperature.max())
+    middle = 0.5 * (low + high)
+    half_width = max(0.5 * (high - low), 0.5 * MIN_TEMPERATURE_SPREAD)
+    curve = 0.5 / Prior().correlation_length  # a slope changes by its own size over this length
+    unfitted_deviations = [
+        BIAS_SLOPE_DEVIATION, BIAS_SLOPE_DEVIATION * curve, SCALE_SLOPE_DEVIATION * fastest,
+        SCALE_SLOPE_DEVIATION * fastest * curve, *[NONLINEARITY_DEVIATION * fastest] * 2]
+    first = 4 if dwells.temperature is None else 0
+
+    def extended_columns(rate: Array, warm: Array) -> Array:
+        """Return the columns of the values, slopes and curves over temperature, and powers."""
+        w, t = rate / fastest, warm - middle
+        unfitted = np.column_stack([t, t ** 2, t * w, t ** 2 * w, w ** 2, w ** 3])
+        return np.column_stack([columns(rate, warm), unfitted[:, first:]])
+
+    prior_deviation = np.array([*[math.inf] * len(covariance), *unfitted_deviations[first:]])
+    white = whitener.whiten(extended_columns(dwells.rate, temperature))
+    lengths = np.linalg.norm(white, axis=0)
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    gram = (white / lengths).T @ (white / lengths) + np.diag((prior_deviation * lengths) ** -2.0)
+    inverse = np.linalg.pinv(gram, hermitian=True)
+
+    def excess_variance(rate: Array, warm: Array) -> Array:
+        """Return the variance of the larger fit less that of the values, (rad/s)²."""
+        wide, row = extended_columns(rate, warm) / lengths, columns(rate, warm)
+        return np.maximum(
+            ((wide @ inverse) * wide).sum(axis=1) - ((row @ covariance) * row).sum(axis=1), 0.0)
+
+    ends, sides = np.array([low - half_width, high + half_width]), np.array([-1.0, 1.0])
+    at_rest = excess_variance(np.zeros(2), ends).max()
+    turning = excess_variance(fastest * np.repeat(sides, 2), np.tile(ends, 2)).max()
+    faster = excess_variance(1.5 * fastest * sides, np.full(2, middle)).max()
+    unfitted = excess_variance(dwells.rate, temperature).mean()
+    return Tolerance(math.sqrt(sweep_scatter[0] ** 2 + unfitted), float(sweep_scatter[1]),
+                     math.sqrt(at_rest) / half_width,
+                     math.sqrt(max(turning - at_rest, 0.0)) / half_width / fastest,
+                     math.sqrt(faster) / (0.5 * fastest))

@@ -27,8 +27,12 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration, fit_effects
-from gyro_calibration.calibration.scatter import estimate_scatter, Scatter
-from gyro_calibration.calibration.tolerance import BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION
+from gyro_calibration.calibration.scatter import (
+    BIAS_SLOPE_DEVIATION,
+    estimate_scatter,
+    SCALE_SLOPE_DEVIATION,
+    Scatter,
+)
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.model.effects import (
     BIAS,

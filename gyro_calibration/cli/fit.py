@@ -19,8 +19,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwell_search import format_list
-from gyro_calibration.calibration.dwells import extract_dwells, join_dwells
+from gyro_calibration.calibration.dwells import extract_dwells, format_list, join_dwells
 from gyro_calibration.calibration.encoder import (
     calibrate_encoder,
     EncoderCalibration,

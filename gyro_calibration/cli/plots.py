@@ -26,9 +26,8 @@ from typing import Any
 
 from gyro_calibration.allan import AllanChart, NoiseFit
 from gyro_calibration.calibration.dwells import Dwells
-from gyro_calibration.calibration.rate_table import Calibration
+from gyro_calibration.calibration.rate_table import Calibration, TurnErrors
 from gyro_calibration.calibration.scatter import rms
-from gyro_calibration.calibration.turn_error import TurnErrors
 from gyro_calibration.files import open_replacement
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE, Mask

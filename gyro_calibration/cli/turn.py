@@ -19,19 +19,22 @@ import io
 import math
 from typing import Any, TypeAlias
 
-from gyro_calibration.calibration.dwell_search import format_list
-from gyro_calibration.calibration.dwells import Dwells, extract_dwells, select_dwells
-from gyro_calibration.calibration.rate_table import equal_bins
-from gyro_calibration.calibration.scatter import find_inliers
-from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
-from gyro_calibration.calibration.turn_error import (
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    extract_dwells,
+    format_list,
+    select_dwells,
+)
+from gyro_calibration.calibration.rate_table import (
     compute_turn_errors,
+    equal_bins,
     ErrorSummary,
     MIN_TURN_RATE,
-    predict_left_out_rates,
     summarize_errors,
     TurnErrors,
 )
+from gyro_calibration.calibration.scatter import find_inliers
+from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
@@ -101,8 +104,9 @@ def _predict_by_fit(found: Dwells,
     calibration = select_effects(found, technology).calibration
     names = [effect.name for effect in calibration.effects]
     remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted '
-              'for each sweep to the other sweeps, so no turn is in the data of its model')
-    return (predict_left_out_rates(calibration), calibration.scatter.inliers, [remark],
+              'for each sweep to the other sweeps (each turn to the other turns, of fewer than '
+              'four sweeps), so no turn is in the data of its model')
+    return (calibration.left_out_rate, calibration.scatter.inliers, [remark],
             {'effects': names, 'left_out': True})
 
 

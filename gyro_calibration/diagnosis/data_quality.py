@@ -28,7 +28,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwell_search import require_output
+from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.calibration.reference_noise import encoder_step, update_interval
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.findings import Estimate, Finding

@@ -23,19 +23,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.dwells import Dwells, MIN_TEMPERATURE_SPREAD
 from gyro_calibration.calibration.rate_table import (
     Calibration,
     channels_of,
     fit_effects,
     sensitivity_columns,
 )
-from gyro_calibration.calibration.scatter import (
-    cross_validation_parts,
-    MIN_TEMPERATURE_SPREAD,
-    Uncertainty,
-    Whitener,
-)
+from gyro_calibration.calibration.scatter import cross_validation_parts, Uncertainty, Whitener
 from gyro_calibration.calibration.selection import (
     CONFOUNDERS,
     distinguishing_rate,

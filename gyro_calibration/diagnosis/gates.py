@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
-from gyro_calibration.calibration.dwell_search import (
+from gyro_calibration.calibration.dwells import (
     few_values_remedy,
     find_lost_reference,
     interpolate_reference,

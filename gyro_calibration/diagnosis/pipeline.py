@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwell_search import require_output
+from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.diagnosis.candidates import (
     common_channels,
     constant_channels,

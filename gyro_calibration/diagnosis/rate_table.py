@@ -16,13 +16,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwell_search import format_list
-from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    dwells_from_table,
+    format_list,
+    MIN_TEMPERATURE_SPREAD,
+    select_dwells,
+)
 from gyro_calibration.calibration.rate_table import Calibration, equal_bins, sensitivity_columns
 from gyro_calibration.calibration.scatter import (
     cross_validation_parts,
     MIN_SWEEPS,
-    MIN_TEMPERATURE_SPREAD,
     Scatter,
     surface_dof,
     Whitener,

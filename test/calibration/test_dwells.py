@@ -19,7 +19,6 @@ from gyro_calibration.calibration.dwells import (
     extract_dwells,
     find_dwells,
     join_dwells,
-    shrink_variances,
 )
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.quality import quantization_step
@@ -313,20 +312,6 @@ def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
         0.088, abs=0.009)
     assert quantization_step(encoder(2.0, generator)) == pytest.approx(2.0 * DEGREE)
     assert quantization_step(np.sin(TIME)) < 0.01 * DEGREE
-
-
-# Deviations
-
-def test_variances_that_differ_by_chance_become_one_and_others_stay(generator):
-    chance = [shrink_variances(generator.chisquare(11, 40) / 11.0, np.full(40, 11))
-              for _ in range(200)]
-    # Without shrinkage, each would have an error of 43 %.
-    assert np.sqrt(np.mean((np.array(chance) - 1.0) ** 2)) < 0.15
-    assert np.mean(chance) == pytest.approx(1.0, abs=0.02)
-    truth = np.repeat([1.0, 100.0], 20)
-    found = np.mean([shrink_variances(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11))
-                     for _ in range(200)], axis=0)
-    assert np.allclose(found / truth, 1.0, atol=0.25)
 
 
 # Recordings

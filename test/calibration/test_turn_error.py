@@ -18,10 +18,9 @@ import math
 import sys
 
 from gyro_calibration.calibration.dwells import Dwells, extract_dwells, select_dwells
-from gyro_calibration.calibration.rate_table import fit_effects
-from gyro_calibration.calibration.turn_error import (
+from gyro_calibration.calibration.rate_table import (
     compute_turn_errors,
-    predict_left_out_rates,
+    fit_effects,
     summarize_errors,
 )
 from gyro_calibration.heading.integration import integrate
@@ -140,35 +139,10 @@ def sweeps(seed=0, deviation=1e-5, odd=None):
                  sweep=number)
 
 
-def test_a_sweep_has_no_part_in_the_model_that_corrects_it():
-    found = sweeps(odd=2)
-    fit = fit_effects(select_dwells(found, found.sweep != 2), (BIAS, SCALE_FACTOR_ERROR))
-    scatter = replace(fit.scatter, inliers=np.full(len(found), True))
-    rate = predict_left_out_rates(replace(fit, dwells=found, scatter=scatter))[found.sweep == 2]
-    turning = found.rate[found.sweep == 2]
-    # rate by the model = output less bias, over 1.01; the output holds 1.03 times the rate
-    assert rate == pytest.approx(turning * 1.03 / 1.01, abs=1e-6)
-
-
 def test_errors_that_are_nothing_but_scatter_are_predicted_as_large_as_they_are():
     found = sweeps(3, 0.01)
-    rate = predict_left_out_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
+    rate = fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)).left_out_rate
     assert summarize_errors(rate - found.rate).rms / DEGREE == pytest.approx(0.01, rel=0.3)
-
-
-def test_a_single_sweep_is_predicted_dwell_by_dwell():
-    found = select_dwells(sweeps(), sweeps().sweep == 0)
-    assert (predict_left_out_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
-            == pytest.approx(found.rate, abs=1e-6))
-
-
-def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_reported():
-    found = table([0, 20, -20, 0, 0, 0], [0.1, 0.3, -0.1, 0.1001, 0.1, 0.0999],
-                  sweep=[0, 0, 0, 1, 1, 1])
-    rate = predict_left_out_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
-    assert np.isnan(rate[:3]).all()
-    with pytest.raises(DataRefused, match='record faster turns, or several sweeps'):
-        compute_turn_errors(found, rate)
 
 
 def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
@@ -185,7 +159,7 @@ def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_te
     found = extract_dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
     fit = fit_effects(found, (rate_temperature_polynomial(3, 2),))
     kept = fit.scatter.inliers
-    errors = compute_turn_errors(select_dwells(found, kept), predict_left_out_rates(fit)[kept])
+    errors = compute_turn_errors(select_dwells(found, kept), fit.left_out_rate[kept])
     assert (summarize_errors(errors.static).largest > 0.02 * TURN
             > summarize_errors(errors.modelled).largest)
     assert summarize_errors(errors.static).rms > 10.0 * summarize_errors(errors.modelled).rms

@@ -14,11 +14,10 @@ from dataclasses import replace
 from functools import cache
 
 from gyro_calibration.calibration.dwells import Dwells, select_dwells
-from gyro_calibration.calibration.rate_table import fit_effects
-from gyro_calibration.calibration.turn_error import (
+from gyro_calibration.calibration.rate_table import (
     compute_turn_errors,
+    fit_effects,
     MIN_TURN_RATE,
-    predict_left_out_rates,
 )
 from gyro_calibration.cli.plots import (
     draw_error_surface,
@@ -74,7 +73,7 @@ def fitted(fit):
 def draw_turns(path, fit):
     kept = fit.scatter.inliers
     return draw_turn_errors(path, compute_turn_errors(select_dwells(fit.dwells, kept),
-                                                      predict_left_out_rates(fit)[kept]),
+                                                      fit.left_out_rate[kept]),
                             MIN_TURN_RATE)
 
 
