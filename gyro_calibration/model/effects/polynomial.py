@@ -110,18 +110,8 @@ def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:
     -------
     the effect, and the values of its parameters in SI
 
-    Raises
-    ------
-    ValueError : not a matrix of finite numbers
-
     """
-    try:
-        c = np.array(matrix, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        c = np.empty(0)
-    if c.ndim != 2 or not c.size or not (np.abs(c) <= 1e100).all():
-        raise ValueError('matrix_dps must be rows of finite numbers of one length, highest powers '
-                         'first, as eq. 11 of Ojeda et al.')
+    c = np.array(matrix, dtype=float)
     rows, columns = c.shape
     in_si = c[::-1, ::-1] * DEGREE ** (1.0 - np.arange(columns))
     effect = rate_temperature_polynomial(columns - 1, rows - 1)
