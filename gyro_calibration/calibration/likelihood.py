@@ -38,22 +38,13 @@ from scipy.linalg import helmert
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """
-    Comparison of the residual of a fit with the known noise.
+    """Comparison of the residual of a fit with the known noise."""
 
-    Attributes
-    ----------
-    chi_square : sum of squares of the residual over the variance that is known
-    dof : degrees of freedom
-    probability : of as much, or more, by chance
-    noise_ratio : noise that accumulates in the heading, over the known one; noise that repeats or
-        averages out is not included
-
-    """
-
-    chi_square: float
-    dof: float
-    probability: float
+    chi_square: float  # sum of squares of the residual over the variance that is known
+    dof: float  # degrees of freedom
+    probability: float  # of as much, or more, by chance
+    # noise that accumulates in the heading, over the known one; noise that repeats or averages out
+    # is not included
     noise_ratio: float
 
     def __str__(self) -> str:
@@ -72,50 +63,38 @@ MIN_FIT_PROBABILITY = 1e-3
 
 @dataclass(frozen=True)
 class ScaleBiasFit:
-    """
-    The result of a fit.
+    """The result of a fit."""
 
-    Attributes
-    ----------
-    scale_factor_error, bias : s, 1, and b, rad/s
-    covariance : of (s, b), shape (2, 2); nan where the method gives none
-    time_offset : how late the gyro is against the profile, s
-    angle_random_walk, reference_noise : as the run shows them, rad/√s and rad in one reading
-    stretch_residual : largest deviation of a stretch of the run from the profile, rad, and its
-        significance in standard deviations
-    time_offset_deviation : standard deviation of the time offset, s
-    influence : the effect of the noise of each block on (s, b), shape (n, 2), and the times of the
-        blocks, s, shape (n,), as one array (n, 3)
-    stretch_interval : beginning and end of that stretch, s
-    start_heading, start_heading_deviation : true heading where gyro and reference begin, from the
-        reference's first heading, and its standard deviation, rad; nan against a profile, which
-        defines its own start
-    residual_squares, dof : sum of squares of the residual, in units of white noise of 1 rad/√s,
-        and its degrees of freedom
-    goodness : comparison of that with the noise; None where the noise is not known
-    repeatable_error : error of the heading that repeats with the motion, rad, where the bias was
-        fitted to windows because of it
-    slip_deviation : standard deviation between the turns of a profile of the fraction that each
-        lost, 1
-
-    """
-
+    # s, 1, and b, rad/s
     scale_factor_error: float
     bias: float
-    covariance: Array
-    time_offset: float = 0.0
+    covariance: Array  # of (s, b), shape (2, 2); nan where the method gives none
+    time_offset: float = 0.0  # how late the gyro is against the profile, s
+    # as the run shows them, rad/√s and rad in one reading
     angle_random_walk: float = math.nan
     reference_noise: float = math.nan
+    # largest deviation of a stretch of the run from the profile, rad, and its significance in
+    # standard deviations
     stretch_residual: tuple[float, float] = (0.0, 0.0)
-    time_offset_deviation: float = math.nan
+    time_offset_deviation: float = math.nan  # standard deviation of the time offset, s
+    # the effect of the noise of each block on (s, b), shape (n, 2), and the times of the blocks,
+    # s, shape (n,), as one array (n, 3)
     influence: Array = field(default_factory=lambda: np.empty((0, 3)))
-    stretch_interval: tuple[float, float] = (0.0, 0.0)
+    stretch_interval: tuple[float, float] = (0.0, 0.0)  # beginning and end of that stretch, s
+    # true heading where gyro and reference begin, from the reference's first heading, and its
+    # standard deviation, rad; nan against a profile, which defines its own start
     start_heading: float = math.nan
     start_heading_deviation: float = math.nan
+    # sum of squares of the residual, in units of white noise of 1 rad/√s, and its degrees of
+    # freedom
     residual_squares: float = math.nan
     dof: float = 0.0
+    # comparison of that with the noise; None where the noise is not known
     goodness: GoodnessOfFit | None = None
+    # error of the heading that repeats with the motion, rad, where the bias was fitted to windows
+    # because of it
     repeatable_error: float = 0.0
+    # standard deviation between the turns of a profile of the fraction that each lost, 1
     slip_deviation: float = 0.0
 
 
@@ -145,34 +124,24 @@ class _ReferencePoints:
 
 @dataclass(frozen=True)
 class _Increments:
-    """
-    Increments of the headings of gyro and reference between blocks, each a mean over some points.
+    """Increments of headings of gyro and reference between blocks, each a mean over points."""
 
-    Attributes
-    ----------
-    columns : reference increments, rad; intervals, s; the change by a time offset, rad/s; by a
-        lag, rad/s²; by errors that several points share, rad; shape (n, 4 + k)
-    prior_deviation, prior_mean : prior standard deviations and means of the values, shape (4 + k,)
-    prior_factors : possible factors of the prior standard deviations, shape (m, 4 + k)
-    gyro_increments : increments of the gyro's integral, rad, shape (n,)
-    walk_variance, walk_covariance : variance of the increments of a random walk, and covariance of
-        each with the one before, s, shape (n,)
-    reference_variance : variance of the reference in each block, up to one factor, shape (n + 1,)
-    time : of the blocks, s, shape (n + 1,)
-    start_offsets : from the first point to the first block: its heading, the time, the shared
-        errors in that block, then the turn of the gyro
-
-    """
-
+    # reference increments, rad; intervals, s; the change by a time offset, rad/s; by a lag,
+    # rad/s²; by errors that several points share, rad; shape (n, 4 + k)
     columns: Array
-    prior_deviation: Array
-    prior_factors: Array
-    prior_mean: Array
-    gyro_increments: Array
+    prior_deviation: Array  # prior standard deviations of the values, shape (4 + k,)
+    prior_factors: Array  # possible factors of the prior standard deviations, shape (m, 4 + k)
+    prior_mean: Array  # prior means of the values, shape (4 + k,)
+    gyro_increments: Array  # increments of the gyro's integral, rad, shape (n,)
+    # variance of the increments of a random walk, and covariance of each with the one before, s,
+    # shape (n,)
     walk_variance: Array
     walk_covariance: Array
+    # variance of the reference in each block, up to one factor, shape (n + 1,)
     reference_variance: Array
-    time: Array
+    time: Array  # of the blocks, s, shape (n + 1,)
+    # from the first point to the first block: its heading, the time, the shared errors in that
+    # block, then the turn of the gyro
     start_offsets: Array
 
 
@@ -542,19 +511,12 @@ def _solve_weighted(data: _Increments, noise: _IncrementCovariance, instrument: 
 
 @dataclass(frozen=True)
 class _ModelAverage:
-    """
-    Estimates averaged over the sizes of both noises and of the priors, weighted by likelihood.
+    """Estimates averaged over the sizes of both noises and of the priors, by likelihood."""
 
-    Attributes
-    ----------
-    values, covariance : means of the values, shape (k,), and their covariance, shape (k, k)
-    ratio, prior_deviation : of the noises, and prior standard deviations, shape (k,), that are
-        likeliest
-
-    """
-
+    # means of the values, shape (k,), and their covariance, shape (k, k)
     values: Array
     covariance: Array
+    # of the noises, and prior standard deviations, shape (k,), that are likeliest
     ratio: float
     prior_deviation: Array
 
@@ -768,25 +730,17 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
 
 @dataclass(frozen=True)
 class DeviatingStretch:
-    """
-    The stretch of a run that improves a fit most by a turn of its own.
+    """The stretch of a run that improves a fit most by a turn of its own."""
 
-    Attributes
-    ----------
-    first, last : edges that it begins and ends at
-    excess_rate : its excess rate, rad/s
-    explained_squares, remaining_squares : sum of squares that it explains, and that remains
-    all_explained_squares, column_squares : sums of squares that each stretch explains, and of its
-        column without the part that the fit explains, for all stretches that are distinguishable
-        from the fit, shape (m,)
-
-    """
-
+    # edges that it begins and ends at
     first: int
     last: int
-    excess_rate: float
+    excess_rate: float  # its excess rate, rad/s
+    # sum of squares that it explains, and that remains
     explained_squares: float
     remaining_squares: float
+    # sums of squares that each stretch explains, and of its column without the part that the fit
+    # explains, for all stretches that are distinguishable from the fit, shape (m,)
     all_explained_squares: Array
     column_squares: Array
 

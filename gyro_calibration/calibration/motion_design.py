@@ -58,26 +58,18 @@ _MEDIAN_SIGMA = float(ndtri(0.75))
 
 @dataclass(frozen=True)
 class RobotLimits:
-    """
-    The limits of the motion of a robot.
+    """The limits of the motion of a robot."""
 
-    Attributes
-    ----------
-    rate, acceleration, jerk : largest absolute values, rad/s, rad/s², rad/s³; inf for no limit of
-        the jerk
-    slowest : smallest rate of a turn between its ramps, rad/s, at which the robot turns smoothly
-    lowest, highest : limits of the heading, rad, which begins at 0
-    rest : minimum duration of the rests at the beginning and at the end, s
-
-    """
-
+    # largest absolute values, rad/s, rad/s², rad/s³; inf for no limit of the jerk
     rate: float
     acceleration: float
     jerk: float = math.inf
+    # smallest rate of a turn between its ramps, rad/s, at which the robot turns smoothly
     slowest: float = 0.0
+    # limits of the heading, rad, which begins at 0
     lowest: float = -math.inf
     highest: float = math.inf
-    rest: float = 1.0
+    rest: float = 1.0  # minimum duration of the rests at the beginning and at the end, s
 
     def ramp_times(self, rate: Number) -> tuple[Number, Number]:
         """Return the time of a ramp from rest to a rate less its rounding, and the rounding, s."""
@@ -107,23 +99,15 @@ class RobotLimits:
 
 @dataclass(frozen=True)
 class Prediction:
-    """
-    The expected accuracy of a calibration by a motion.
+    """The expected accuracy of a calibration by a motion."""
 
-    Attributes
-    ----------
-    scale_deviation : standard deviation of s, 1
-    bias_deviation : standard deviation of b against the mean bias of the drive that follows,
-        rad/s; without flicker and random walk it is what the calibration states
-    heading_error : mean absolute error of the heading over that drive, rad
-    floor : the part of it that white noise causes, which remains if s and the bias are known at
-        all times
-
-    """
-
-    scale_deviation: float
+    scale_deviation: float  # standard deviation of s, 1
+    # standard deviation of b against the mean bias of the drive that follows, rad/s; without
+    # flicker and random walk it is what the calibration states
     bias_deviation: float
-    heading_error: float
+    heading_error: float  # mean absolute error of the heading over that drive, rad
+    # the part of it that white noise causes, which remains if s and the bias are known at all
+    # times
     floor: float
 
 
@@ -239,19 +223,13 @@ class _NoiseCovariances:
     The n observations are the increments between the blocks of the run, rad, and the mean rate of
     the rest, rad/s, if there is one.
 
-    Attributes
-    ----------
-    white_precision : of the covariance of the increments by white noise, rad⁻²
-    run_covariance : covariance of the observations by all noise, shape (n, n)
-    cross_covariance : covariance of the observations with the heading of the drive, shape (n, m)
-    drive_variance : variance of the heading of the drive, rad², shape (m,)
-
     """
 
-    white_precision: Array
-    run_covariance: Array
+    white_precision: Array  # of the covariance of the increments by white noise, rad⁻²
+    run_covariance: Array  # covariance of the observations by all noise, shape (n, n)
+    # covariance of the observations with the heading of the drive, shape (n, m)
     cross_covariance: Array
-    drive_variance: Array
+    drive_variance: Array  # variance of the heading of the drive, rad², shape (m,)
 
 
 def _noise_covariances(noise: Noise, duration: float, blocks: int, rest_duration: float,

@@ -90,43 +90,27 @@ COSINE_COUNT = 24
 
 @dataclass(frozen=True)
 class BandedNoise:
-    """
-    A part of the noise whose covariance is ``size**2`` times a tridiagonal matrix.
+    """A part of the noise whose covariance is ``size**2`` times a tridiagonal matrix."""
 
-    Attributes
-    ----------
-    name : of the size
-    diagonal : shape (n,)
-    off_diagonal : of each observation with the one before it, shape (n,); the first is not looked
-        at. None where they are independent
-    size_range : smallest and largest size that is possible; equal where the size is known
-
-    """
-
-    name: str
-    diagonal: Array
+    name: str  # of the size
+    diagonal: Array  # shape (n,)
+    # of each observation with the one before it, shape (n,); the first is not looked at. None
+    # where they are independent
     off_diagonal: Array | None
+    # smallest and largest size that is possible; equal where the size is known
     size_range: tuple[float, float]  # noqa: A003
 
 
 @dataclass(frozen=True)
 class SharedNoise:
-    """
-    A part of the variances of the shared values ``u``: ``size**2`` times `variance`.
+    """A part of the variances of the shared values ``u``: ``size**2`` times `variance`."""
 
-    Attributes
-    ----------
-    name : of the size
-    variance : shape (q,)
-    size_range : smallest and largest size that is possible; equal where the size is known
-    unobservable_variance : variance that the observations have in common, so that it looks like
-        one of the values, in units of size²
-
-    """
-
-    name: str
-    variance: Array
+    name: str  # of the size
+    variance: Array  # shape (q,)
+    # smallest and largest size that is possible; equal where the size is known
     size_range: tuple[float, float]  # noqa: A003
+    # variance that the observations have in common, so that it looks like one of the values, in
+    # units of size²
     unobservable_variance: float = 0.0
 
 
@@ -138,55 +122,38 @@ class HierarchicalPrior:
     A value that the data determine weakly is drawn towards the mean of its prior, a value that
     they determine well is not.
 
-    Attributes
-    ----------
-    name : of the size
-    value_index : number of the value
-    size_range : smallest and largest standard deviation, in the unit of the value
-
     """
 
-    name: str
-    value_index: int
+    name: str  # of the size
+    value_index: int  # number of the value
+    # smallest and largest standard deviation, in the unit of the value
     size_range: tuple[float, float]  # noqa: A003
 
 
 @dataclass(frozen=True)
 class GridFit:
-    """
-    The result of a regression, averaged over the sizes of the noise.
+    """The result of a regression, averaged over the sizes of the noise."""
 
-    Attributes
-    ----------
-    values : estimates, shape (m,)
-    covariance : of the values, shape (m, m), including the uncertainty of the noise
-    sizes : for each size its name, its estimate (mean of the logarithm), and the limits that hold
-        95 %
-    likeliest_sizes : the size of each part at the point of the grid with the largest likelihood,
-        by name
-    log_likelihood : there, with the values of flat prior integrated out; for models with the same
-        columns of flat prior
-    log_evidence : logarithm of the mean likelihood over the grid, to compare models with the same
-        columns of flat prior
-    residual : observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
-    shared : estimates of u at the likeliest point, shape (q,)
-    influence : what the error of each observation adds to the values at the likeliest point, shape
-        (n, m); sums over stretches of a log give a covariance that does not rely on the noise
-        model
-    unobservable_variance : variance that the shared noise has in common with one of the values, as
-        it is `unobservable_variance`
-
-    """
-
-    values: Array
-    covariance: Array
+    values: Array  # estimates, shape (m,)
+    covariance: Array  # of the values, shape (m, m), including the uncertainty of the noise
+    # for each size its name, its estimate (mean of the logarithm), and the limits that hold 95 %
     sizes: Mapping[str, tuple[float, float, float]]
+    # the size of each part at the point of the grid with the largest likelihood, by name
     likeliest_sizes: Mapping[str, float]
+    # there, with the values of flat prior integrated out; for models with the same columns of flat
+    # prior
     log_likelihood: float
+    # logarithm of the mean likelihood over the grid, to compare models with the same columns of
+    # flat prior
     log_evidence: float
+    # observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
     residual: Array
-    shared: Array
+    shared: Array  # estimates of u at the likeliest point, shape (q,)
+    # what the error of each observation adds to the values at the likeliest point, shape (n, m);
+    # sums over stretches of a log give a covariance that does not rely on the noise model
     influence: Array
+    # variance that the shared noise has in common with one of the values, as it is
+    # `unobservable_variance`
     unobservable_variance: float
     _noise: TridiagonalMatrix
     _carried: Array | None = None

@@ -18,8 +18,9 @@ faster or slower, begun late, or ended early.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import permutations
 import math
 
 from gyro_calibration.calibration.likelihood import find_deviating_stretch
@@ -30,56 +31,32 @@ import numpy as np
 
 #: Minimum length of the pieces in which motions are compared, and step of the tried starts, ends
 #: and offsets, s; largest number of pieces: the time of the search is proportional to its cube.
-_MIN_PIECE_DURATION, _TRIAL_STEP, _MAX_PIECES = 0.1, 0.1, 650
-#: Speeds that are tried, as parts of the profile's.
-_TRIAL_SPEEDS = 2.0 ** (np.arange(-32, 33) / 16.0)
+_TRIAL_STEP, _MAX_PIECES = 0.1, 650
 #: A motion explains a run if it leaves at most this fraction of its sum of squares.
 MAX_UNEXPLAINED_SHARE = 0.1
 #: Factor by which a motion with a deviating stretch must leave less than one without.
 _SLIP_PENALTY = 1.5
 
-#: Reported over true rate -> the confused unit of the gyro, or of the profile, that causes it.
+#: Units that are confused, in rad/s.
+_RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'mrad/s': 1e-3, 'mdeg/s': 1e-3 * DEGREE,
+               'deg/h': DEGREE / 3600.0, 'revolutions/s': 2.0 * math.pi,
+               'revolutions/min': math.pi / 30.0}
+#: Reported over true rate -> the cause in the gyro, and the one in the profile; likely ones last.
 _UNIT_CONFUSIONS = {
-    180.0 / math.pi: ('the gyro is in deg/s and read as rad/s',
-                      'the profile in rad and read as deg'),
-    math.pi / 180.0: ('the gyro is in rad/s and read as deg/s',
-                      'the profile in deg and read as rad'),
+    **{factor: (f'the gyro is read with {factor:g} times its sensitivity',
+                f'the profile was driven at {factor:g} times its rate')
+       for base in (2.0, 4.0, 8.0, 10.0, 100.0) for factor in (base, 1.0 / base)},
+    **{float(f'{taken / size:.6g}'): (
+        f'the gyro is in {unit} and read as {other}',
+        f'the profile in {other.removesuffix("/s")} and read as {unit.removesuffix("/s")}')
+       for (unit, size), (other, taken) in permutations(reversed(_RATE_UNITS.items()), 2)},
     1e3: ('the gyro is in thousandths (mdeg/s, mrad/s) and read as whole units',
           'the profile in thousands'),
     1e-3: ('the gyro is in thousands',
            'the profile in thousandths (mdeg, mrad) and read as whole units'),
-    180e3 / math.pi: ('the gyro is in mdeg/s and read as rad/s',
-                      'the profile in rad and read as mdeg'),
-    math.pi / 180e3: ('the gyro is in rad/s and read as mdeg/s',
-                      'the profile in mdeg and read as rad'),
-    1e3 * math.pi / 180.0: ('the gyro is in mrad/s and read as deg/s',
-                            'the profile in deg and read as mrad'),
-    180e-3 / math.pi: ('the gyro is in deg/s and read as mrad/s',
-                       'the profile in mrad and read as deg'),
-    0.5 / math.pi: ('the gyro is in revolutions/s and read as rad/s '
-                    '(or in revolutions/min and read as deg/s)',
-                    'the profile in rad and read as revolutions'),
-    2.0 * math.pi: ('the gyro is in rad/s and read as revolutions/s',
-                    'the profile in revolutions and read as rad'),
-    1.0 / 360.0: ('the gyro is in revolutions/s and read as deg/s',
-                  'the profile in deg and read as revolutions'),
-    360.0: ('the gyro is in deg/s and read as revolutions/s',
-            'the profile in revolutions and read as deg'),
-    30.0 / math.pi: ('the gyro is in revolutions/min and read as rad/s',
-                     'the profile is 9.5 times too slow'),
-    3600.0: ('the gyro is in deg/h and read as deg/s', 'the profile is 3600 times too slow'),
-    648e3 / math.pi: ('the gyro is in deg/h and read as rad/s',
-                      'the profile is 206265 times too slow'),
-    1.0 / 3600.0: ('the gyro is in deg/s and read as deg/h', 'the profile is 3600 times too fast'),
-    2.0: ('the gyro is read with twice its sensitivity',
-          'the profile was driven at twice its rate'),
-    0.5: ('the gyro is read with half its sensitivity', 'the profile was driven at half its rate'),
-    **{factor: (f'the gyro is read with {factor:g} times its sensitivity',
-                f'the profile was driven at {factor:g} times its rate')
-       for factor in (4.0, 8.0, 10.0, 100.0, 0.25, 0.125, 0.1, 0.01)},
 }
-#: Largest scale factor error in addition to a confused unit, as a logarithm.
-_UNIT_LOG_TOLERANCE = math.log(1.1)
+#: Largest ratio of the scale factor to that of a confused unit.
+_UNIT_TOLERANCE = 1.1
 
 
 def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
@@ -92,16 +69,15 @@ def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
     reference : its name, if its unit may be the wrong one; else ''
 
     """
-    size = abs(math.log(max(abs(scale), 1e-300)))
-    nearest = min(_UNIT_CONFUSIONS,
-                  key=lambda factor: abs(math.log(max(abs(scale), 1e-300) / factor)))
-    if (size < _UNIT_LOG_TOLERANCE
-            or abs(math.log(max(abs(scale), 1e-300) / nearest)) > _UNIT_LOG_TOLERANCE):
+    size = max(abs(scale), 1e-300)
+    found = [causes for factor, causes in reversed(_UNIT_CONFUSIONS.items())
+             if 1.0 / _UNIT_TOLERANCE < size / factor < _UNIT_TOLERANCE]
+    if not found or 1.0 / _UNIT_TOLERANCE < size < _UNIT_TOLERANCE:
         return
     sign_note = ', and turns the other way' if scale < 0.0 else ''
-    gyro, profile = _UNIT_CONFUSIONS[nearest]
+    gyro, profile = (', or '.join(texts) for texts in zip(*found))
     cause = f'either {gyro}, or {profile.replace("profile", reference)}' if reference else gyro
-    raise DataRefused(f'the gyro reports {abs(scale):.4g} times what was turned{sign_note}: '
+    raise DataRefused(f'the gyro reports {size:.4g} times what was turned{sign_note}: '
                       f'{cause}; correct the unit')
 
 
@@ -132,7 +108,7 @@ class RunPieces:
 
 def split_run(time: Array, rate: Array) -> RunPieces:
     """Return a run in pieces."""
-    length = max(_MIN_PIECE_DURATION, 2.0 * float(np.median(np.diff(time))),
+    length = max(_TRIAL_STEP, 2.0 * float(np.median(np.diff(time))),
                  float(time[-1] - time[0]) / _MAX_PIECES)
     edges = np.arange(time[0], time[-1], length)
     return RunPieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
@@ -152,11 +128,10 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
     DataRefused : with the cause that explains it best
 
     """
-    trials = {name: _best_trial(make_trials(run, motion, largest_offset))
-              for name, make_trials in _FAULT_TRIALS.items()}
-    name = min(trials,
-               key=lambda each: trials[each][0] * (_SLIP_PENALTY if each == 'slip' else 1.0))
-    unexplained, value = trials[name]
+    trials = [*_try_motions(run, motion, largest_offset),
+              *((_SLIP_PENALTY * unexplained, slip or message)
+                for unexplained, message in _try_slips(run, motion, largest_offset))]
+    unexplained, message = min(trials)
     if _SLIP_PENALTY * unexplained > fit_profile(
             run, motion, largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
         return
@@ -164,7 +139,7 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
         raise DataRefused('the robot turned otherwise than the profile (the best that can be made '
                           f'of it explains {100 * max(1 - unexplained, 0.0):.0f} % of the run): '
                           'was another profile driven?')
-    raise DataRefused(slip if slip and name == 'slip' else _FAULT_MESSAGES[name](value, motion))
+    raise DataRefused(message)
 
 
 def fit_profile(run: RunPieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
@@ -173,69 +148,47 @@ def fit_profile(run: RunPieces, motion: Motion, largest_offset: float) -> tuple[
                for offset in _trial_offsets(largest_offset))
 
 
-#: Unexplained part of a run, and the value of what was tried: a speed, s, or a turn in rad with
-#: its time, s.
-Trials = Iterable[tuple[float, tuple[float, ...]]]
-
-
-def _best_trial(trials: Trials) -> tuple[float, tuple[float, ...]]:
-    """Return the trial with the least unexplained fraction; infinity without trials."""
-    return min(trials, key=lambda each: each[0], default=(math.inf, ()))
-
-
 def _trial_offsets(largest_offset: float) -> Array:
-    return (np.arange(-round(largest_offset / _TRIAL_STEP),
-                      round(largest_offset / _TRIAL_STEP) + 1) * _TRIAL_STEP)
+    count = round(largest_offset / _TRIAL_STEP)
+    return np.arange(-count, count + 1) * _TRIAL_STEP
 
 
-def _try_early_ends(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
-    """Try ends of the motion, each at the delay that fits the part before it best."""
-    for end in np.arange(0.05, 0.97, 0.0125) * motion.duration:
-        yield _best_trial((run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
-                           (float(end),)) for offset in _trial_offsets(largest_offset)[::2])
-
-
-def _try_speeds(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
-    for speed in _TRIAL_SPEEDS[np.abs(np.log(_TRIAL_SPEEDS)) > _UNIT_LOG_TOLERANCE]:
-        for offset in _trial_offsets(largest_offset)[::2]:
-            angle = run.reference_angle(motion, offset, float(speed))
-            yield run.fit_scale(angle)[0], (float(speed),)
-
-
-def _try_late_starts(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
-    for offset in _trial_offsets(0.6 * motion.duration):
+def _try_motions(run: RunPieces, motion: Motion,
+                 largest_offset: float) -> Iterator[tuple[float, str]]:
+    """Give the unexplained part of a run by ends, speeds and starts, and the cause."""
+    duration = motion.duration
+    for offset in _trial_offsets(largest_offset)[::2]:
+        for end in np.arange(0.05, 0.97, 0.0125) * duration:
+            yield (run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
+                   f"the robot stopped at about {end:.1f} s of the profile's {duration:.1f} s: "
+                   'drive the whole profile')
+        for speed in (2.0 ** (each / 16.0) for each in range(-32, 33)):
+            if max(speed, 1.0 / speed) > _UNIT_TOLERANCE:
+                yield (run.fit_scale(run.reference_angle(motion, offset, speed))[0],
+                       f'the robot drove the profile {speed:.2f} times as fast as given, in '
+                       f'{duration / speed:.1f} s instead of {duration:.1f} s: drive it at its '
+                       'own speed, or give the profile that was driven')
+    for offset in _trial_offsets(0.6 * duration):
         if abs(offset) > largest_offset:
-            yield run.fit_scale(run.reference_angle(motion, offset))[0], (float(offset),)
+            yield (run.fit_scale(run.reference_angle(motion, offset))[0],
+                   f'the robot began {abs(offset):.1f} s {"after" if offset > 0 else "before"} '
+                   'the profile: begin with it, or allow a larger time offset')
 
 
-def _try_slips(run: RunPieces, motion: Motion, largest_offset: float) -> Trials:
-    """Try a stretch with a different turn, at the delay that fits best with it."""
+def _try_slips(run: RunPieces, motion: Motion,
+               largest_offset: float) -> Iterator[tuple[float, str]]:
+    """Give the unexplained part of a run with a stretch of another turn, and the cause."""
     edges = np.arange(0, len(run.gyro_angle) + 1, 5)
     interval = float(np.median(np.diff(run.edges)))
     steps = np.where(np.arange(len(run.gyro_angle))[:, None] >= edges, interval, 0.0)
-    whole = np.sum((run.gyro_angle - run.gyro_angle.mean()) ** 2)
+    whole = max(float(np.sum((run.gyro_angle - run.gyro_angle.mean()) ** 2)), 1e-300)
     for offset in _trial_offsets(largest_offset):
         reference = run.reference_angle(motion, offset)
         found = find_deviating_stretch(
             np.column_stack([reference, np.full(len(reference), interval)]), steps, run.gyro_angle)
-        left = run.fit_scale(reference)[0] - found.explained_squares / max(float(whole), 1e-300)
-        yield left, (found.excess_rate * float(edges[found.last] - edges[found.first]) * interval,
-                     float(run.edges[edges[found.first]]))
-
-
-_FAULT_TRIALS: dict[str, Callable[[RunPieces, Motion, float], Trials]] = {
-    'early': _try_early_ends, 'speed': _try_speeds, 'late': _try_late_starts, 'slip': _try_slips}
-_FAULT_MESSAGES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
-    'early': lambda value, motion: (
-        f"the robot stopped at about {value[0]:.1f} s of the profile's {motion.duration:.1f} s: "
-        'drive the whole profile'), 'speed': lambda value, motion: (
-            f'the robot drove the profile {value[0]:.2f} times as fast as given, in '
-            f'{motion.duration / value[0]:.1f} s instead of {motion.duration:.1f} s: '
-            'drive it at its own speed, or give the profile that was driven'),
-    'late': lambda value, _: (
-        f'the robot began {abs(value[0]):.1f} s {"after" if value[0] > 0 else "before"} '
-        'the profile: begin with it, or allow a larger time offset'),
-    'slip': lambda value, _: format_slip(abs(value[0]), value[1])}
+        turned = found.excess_rate * float(edges[found.last] - edges[found.first]) * interval
+        yield (run.fit_scale(reference)[0] - found.explained_squares / whole,
+               format_slip(abs(turned), float(run.edges[edges[found.first]])))
 
 
 def format_slip(angle: float, time: float, sigmas: float = math.nan) -> str:

@@ -56,66 +56,41 @@ from scipy.special import chdtrc, ndtri
 
 @dataclass(frozen=True)
 class RunLimits:
-    """
-    The limits of a run that is accepted.
+    """The limits of a run that is accepted."""
 
-    Attributes
-    ----------
-    min_samples : minimum number of samples
-    max_gap : longest between samples, s
-    min_rate_spread : smallest standard deviation of the profile's rate, rad/s; one speed does not
-        separate scale from bias
-    max_scale_factor_error : largest, 1
-    max_bias : largest, rad/s
-    max_scale_deviation : largest standard deviation of the scale, 1
-    max_stretch_residual : largest significant deviation of a stretch of the run from the profile,
-        rad
-    max_time_offset : largest lag of the gyro behind the profile, either way, s
-    max_noise_ratio, max_unexplained_angle : largest noise that accumulates in the heading, as a
-        multiple of the known noise and as its heading error over the run, rad; a run that exceeds
-        both is refused
-    rest_duration : length of the check after the run, s
-    max_rest_rate : largest corrected rate at rest after the run, rad/s, unless the noise explains
-        more
-    max_repeatable_error : largest error of the heading that repeats with the motion, rad
-    max_heading_error : largest error of the heading after five minutes, rad, unless it was larger
-        without the calibration (`likelihood` only)
-
-    """
-
-    min_samples: int = 50
-    max_gap: float = 0.5
+    min_samples: int = 50  # minimum number of samples
+    max_gap: float = 0.5  # longest between samples, s
+    # smallest standard deviation of the profile's rate, rad/s; one speed does not separate scale
+    # from bias
     min_rate_spread: float = 1.0 * DEGREE
-    max_scale_factor_error: float = 0.3
-    max_bias: float = 10.0 * DEGREE
-    max_scale_deviation: float = 0.02
+    max_scale_factor_error: float = 0.3  # largest, 1
+    max_bias: float = 10.0 * DEGREE  # largest, rad/s
+    max_scale_deviation: float = 0.02  # largest standard deviation of the scale, 1
+    # largest significant deviation of a stretch of the run from the profile, rad
     max_stretch_residual: float = 1.0 * DEGREE
-    max_time_offset: float = 1.0
+    max_time_offset: float = 1.0  # largest lag of the gyro behind the profile, either way, s
+    # largest noise that accumulates in the heading, as a multiple of the known noise and as its
+    # heading error over the run, rad; a run that exceeds both is refused
     max_noise_ratio: float = 8.0
     max_unexplained_angle: float = 1.0 * DEGREE
-    rest_duration: float = 2.0
+    rest_duration: float = 2.0  # length of the check after the run, s
+    # largest corrected rate at rest after the run, rad/s, unless the noise explains more
     max_rest_rate: float = 2e-4
+    # largest error of the heading that repeats with the motion, rad
     max_repeatable_error: float = 1.0 * DEGREE
+    # largest error of the heading after five minutes, rad, unless it was larger without the
+    # calibration (`likelihood` only)
     max_heading_error: float = 15.0 * DEGREE
 
 
 @dataclass(frozen=True)
 class ReferenceErrors:
-    """
-    The errors of a reference that are not observable in a run; zero for an exact or measured one.
+    """Errors of a reference that a run does not show; zero for an exact or measured one."""
 
-    Attributes
-    ----------
-    scale_deviation : standard deviation of its scale factor error, 1; of wheels, that of radius
-        over track
-    rate_deviation : standard deviation of its drift, rad/s
-    random_walk : of its heading, rad/√s
-
-    """
-
+    # standard deviation of its scale factor error, 1; of wheels, that of radius over track
     scale_deviation: float = 0.0
-    rate_deviation: float = 0.0
-    random_walk: float = 0.0
+    rate_deviation: float = 0.0  # standard deviation of its drift, rad/s
+    random_walk: float = 0.0  # of its heading, rad/√s
 
 
 #: Largest slip of wheels that follow commanded rates on a good floor, as a fraction of each turn;
@@ -348,22 +323,12 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
 
 @dataclass(frozen=True)
 class RestCheck:
-    """
-    The result of a rest after a run.
+    """The result of a rest after a run."""
 
-    Attributes
-    ----------
-    rate : mean of the corrected rate, rad/s
-    deviation : its standard deviation by noise, calibration and wander, rad/s
-    limit : largest mean that is accepted, rad/s
-    fit : the calibration, with its bias updated by the rest
-
-    """
-
-    rate: float
-    deviation: float
-    limit: float
-    fit: ScaleBiasFit
+    rate: float  # mean of the corrected rate, rad/s
+    deviation: float  # its standard deviation by noise, calibration and wander, rad/s
+    limit: float  # largest mean that is accepted, rad/s
+    fit: ScaleBiasFit  # the calibration, with its bias updated by the rest
 
 
 def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None = None,

@@ -11,8 +11,8 @@
 """
 Every cause that a diagnosis can name: effects of the gyro, faults of reference or record, noise.
 
-The formulas and units of effects are in `effects`. This module holds the variable along which each
-cause shows, and the experiment that distinguishes it from similar causes.
+The formulas and units of effects are in `effects`, with the variable along which each shows, and
+the experiment that distinguishes it from similar causes.
 
 """
 
@@ -50,46 +50,13 @@ class Cause:
         return next(iter(self.units.values()))
 
 
-_REVERSALS_EXPERIMENT = ('swing fast with quick reversals: a lag reduces the amplitude of fast '
-                         'motion, a delay does not')
-_THERMAL_CYCLE_EXPERIMENT = ('heat and cool the resting gyro at two temperature rates, with '
-                             'abrupt changes from heating to cooling')
-_FULL_SCALE_EXPERIMENT = 'turn at many speeds up to full scale'
-_CLOSED_TURN_EXPERIMENT = 'make whole turns between marks, or use a second reference'
-_HEADING_STOP_EXPERIMENT = 'turn at several speeds, and stop at eight headings'
-
-#: Effect of the gyro -> the variable along which it shows, and its experiment.
-_GYRO_EFFECTS: Mapping[str, tuple[str, str]] = {
-    'bias': ('rate', 'turn the axis over within one power-on, with all motors off'),
-    'scale_factor_error': ('rate', _CLOSED_TURN_EXPERIMENT),
-    'scale_factor_asymmetry': ('rate', 'turn both ways at many speeds, slow ones too'),
-    'quadratic_nonlinearity': ('rate', 'turn both ways at many speeds, slow ones too, with the '
-                               'sensor on the axis of the table'),
-    'cubic_nonlinearity': ('rate', _FULL_SCALE_EXPERIMENT),
-    'sine_response': ('rate', _FULL_SCALE_EXPERIMENT),
-    'bias_temperature': ('temperature', 'heat and cool the gyro within one log, and start it both '
-                         'cold and warm'),
-    'bias_temperature_quadratic': ('temperature', ''),
-    'scale_factor_temperature': ('temperature', ''),
-    'bias_temperature_rate': ('temperature_rate', _THERMAL_CYCLE_EXPERIMENT),
-    'thermal_lag': ('temperature_rate', _THERMAL_CYCLE_EXPERIMENT),
-    'thermal_hysteresis': ('temperature_rate', 'repeat the same temperature cycle at two '
-                           'temperature rates'),
-    'warm_up': ('time', 'start the gyro both cold and warm, and let it rest'),
-    'rate_ramp': ('time', 'record again, from a power-on at another temperature: only a ramp '
-                  'repeats'),
-    'bias_step': ('time', 'record again: a step does not repeat'),
-    'heading_sensitivity': ('heading', _HEADING_STOP_EXPERIMENT),
-    'acceleration_sensitivity': ('specific_force', 'rest in several poses within one power-on'),
-    'vibration_rectification': ('vibration', 'rest with the motor on and off'),
-    'supply_sensitivity': ('supply', 'step the supply voltage at one temperature'),
-    'interference_tone': ('frequency', ''),
-    'bandwidth': ('rate_change', _REVERSALS_EXPERIMENT),
-    'time_offset': ('rate_change', _REVERSALS_EXPERIMENT),
-    'clock_rate': ('time', 'record long, with sharp reversals at both ends'),
-    'dead_zone': ('rate', 'sweep slowly through zero'),
-    'saturation': ('rate', 'turn faster than the limit: the output stays at its extreme code'),
-    'quantization': ('output', 'turn slowly, and check the spacing of the output codes'),
+#: Effect -> the experiment that distinguishes it in logs, where that of its record is one for a
+#: rate table.
+_LOG_EXPERIMENTS: Mapping[str, str] = {
+    'bias': 'turn the axis over within one power-on, with all motors off',
+    'scale_factor_error': 'make whole turns between marks, or use a second reference',
+    'quadratic_nonlinearity': 'turn both ways at many speeds, slow ones too, with the sensor on '
+                              'the axis of the table',
 }
 
 #: Name, sentence, unit, origin, required channels, variable along which it shows, experiment.
@@ -101,9 +68,9 @@ _OTHER_CAUSES = (
     ('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time', 'time', ''),
     ('reference_once_per_rev', 'The reference errs once in a revolution, as an eccentric encoder '
      'or a wobbling table does.', '1', 'reference', 'time reference', 'heading',
-     _HEADING_STOP_EXPERIMENT),
+     CATALOGUE['heading_sensitivity'].experiment),
     ('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference',
-     'time reference', 'rate', _CLOSED_TURN_EXPERIMENT),
+     'time reference', 'rate', _LOG_EXPERIMENTS['scale_factor_error']),
     ('reference_slip', 'The reference slipped: it shows a rotation that the gyro did not make.',
      'rad', 'reference', 'time reference', 'rate_change', ''),
     ('reference_quantization', 'The reference heading is quantized, so that its rate between '
@@ -120,18 +87,18 @@ _OTHER_CAUSES = (
 )
 
 
-def _cause_of_effect(name: str, along: str, separate_by: str) -> Cause:
-    effect = CATALOGUE[name]
+def _cause_of_effect(effect: Effect) -> Cause:
     units = {parameter.name: parameter.unit
              for parameter in effect.parameters if parameter.default is None}
-    turned = along in {'rate', 'heading', 'rate_change'} and name != 'bias'
+    turned = effect.along in {'rate', 'heading', 'rate_change'} and effect.name != 'bias'
     needs = {'time', *(effect.inputs & {'temperature', 'specific_force', 'supply'}),
              *({'reference'} if turned or 'rate' in effect.inputs else ())}
-    return Cause(name, effect.cause, units, frozenset(needs), along, separate_by, 'gyro')
+    return Cause(effect.name, effect.cause, units, frozenset(needs), effect.along,
+                 _LOG_EXPERIMENTS.get(effect.name, effect.experiment), 'gyro')
 
 
 CAUSES: dict[str, Cause] = {
-    **{name: _cause_of_effect(name, *shown) for name, shown in _GYRO_EFFECTS.items()},
+    **{name: _cause_of_effect(effect) for name, effect in CATALOGUE.items()},
     **{name: Cause(name, sentence, {name: unit}, frozenset(needs.split()), along, separate_by, of)
        for name, sentence, unit, of, needs, along, separate_by in _OTHER_CAUSES}}
 
@@ -139,7 +106,7 @@ CAUSES: dict[str, Cause] = {
 def add_causes(effects: Iterable[Effect]) -> None:
     """Add user-defined effects of the catalogue to the causes that a diagnosis searches for."""
     for effect in effects:
-        CAUSES[effect.name] = _cause_of_effect(effect.name, effect.along, effect.experiment)
+        CAUSES[effect.name] = _cause_of_effect(effect)
 
 
 def make_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,

@@ -96,36 +96,21 @@ class DataRefused(InputError):
 
 @dataclass(frozen=True)
 class Log:
-    """
-    A log: arrays in SI, each of shape (n,) or absent.
+    """A log: arrays in SI, each of shape (n,) or absent."""
 
-    Attributes
-    ----------
-    time : s, increasing; without it the rows are dwells of a rate table
-    output : output of the gyro, rad/s, counter-clockwise positive
-    counts : raw output before any scaling, 1
-    temperature : by the sensor of the gyro, degC
-    reference_rate, reference_heading : rad/s and rad; nan where the reference was lost; the
-        heading is continuous
-    specific_force : along the input axis, m/s²
-    supply : V
-    moving : 1 or 0
-    notes : the lines before the header, without their '#'
-    others : other columns of the file, as text, in their order; the second of two equal names
-        becomes `name.1`
-
-    """
-
-    time: Array | None = None
-    output: Array | None = None
-    counts: Array | None = None
-    temperature: Array | None = None
+    time: Array | None = None  # s, increasing; without it the rows are dwells of a rate table
+    output: Array | None = None  # output of the gyro, rad/s, counter-clockwise positive
+    counts: Array | None = None  # raw output before any scaling, 1
+    temperature: Array | None = None  # by the sensor of the gyro, degC
+    # rad/s and rad; nan where the reference was lost; the heading is continuous
     reference_rate: Array | None = None
     reference_heading: Array | None = None
-    specific_force: Array | None = None
-    supply: Array | None = None
-    moving: Array | None = None
-    notes: tuple[str, ...] = ()
+    specific_force: Array | None = None  # along the input axis, m/s²
+    supply: Array | None = None  # V
+    moving: Array | None = None  # 1 or 0
+    notes: tuple[str, ...] = ()  # the lines before the header, without their '#'
+    # other columns of the file, as text, in their order; the second of two equal names becomes
+    # `name.1`
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -28,8 +28,7 @@ import math
 from typing import Any
 
 from gyro_calibration.logs.log import Log, Number
-from gyro_calibration.model.effects import Channels
-from gyro_calibration.model.effects.effect import lag_difference
+from gyro_calibration.model.effects import Channels, lag_difference
 import numpy as np
 
 #: State at the last sample, by (channel, time constant) of a lag and ('heating', filter time,

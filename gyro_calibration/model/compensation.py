@@ -29,34 +29,23 @@ from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy.linalg import block_diag
 
-#: Rates beyond this, rad/s, are treated as overflow: the model's values are too large.
-_MAX_COMPUTABLE_RATE = 1e300
-
 
 @dataclass(frozen=True)
 class CompensatedSamples:
-    """
-    Compensated samples: numbers, or arrays of shape (n,).
+    """Compensated samples: numbers, or arrays of shape (n,)."""
 
-    Attributes
-    ----------
-    model_rate : rate after the model and before the self-calibration, rad/s; input of the next
-        self-calibration
-    rate : rad/s
-    temperature : degC, limited to plausible temperatures
-    temperature_clipped : the temperature is outside the calibrated range. Up to
-        `GyroModel.extrapolation_range` the correction is extrapolated, beyond that it is held
-    beyond_range : the output is outside the calibrated range of rates, or not plausible, or no
-        rate has this output. Up to `GyroModel.rate_limit` the correction is extrapolated. Beyond
-        that, and where the response no longer grows with the rate, the last correction is held, so
-        that the rate is always finite
-
-    """
-
+    # rate after the model and before the self-calibration, rad/s; input of the next self-
+    # calibration
     model_rate: Number
-    rate: Number
-    temperature: Number
+    rate: Number  # rad/s
+    temperature: Number  # degC, limited to plausible temperatures
+    # the temperature is outside the calibrated range. Up to `GyroModel.extrapolation_range` the
+    # correction is extrapolated, beyond that it is held
     temperature_clipped: Number
+    # the output is outside the calibrated range of rates, or not plausible, or no rate has this
+    # output. Up to `GyroModel.rate_limit` the correction is extrapolated. Beyond that, and where
+    # the response no longer grows with the rate, the last correction is held, so that the rate is
+    # always finite
     beyond_range: Number
 
 
@@ -74,39 +63,18 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
 
     """
     given = model.reference_temperature if temperature is None else temperature
-    if not isinstance(output, np.ndarray):
-        return _compensate_sample(model, output, given, environment)
-    return (_compensate_blocks(model, output, given) if environment is None
-            else _compensate_array(model, output, given, environment))
+    return (_compensate_blocks(model, output, given)
+            if isinstance(output, np.ndarray) and environment is None
+            else _compensate_at_once(model, output, given, environment))
 
 
-def _compensate_sample(model: GyroModel, output: float, temperature: float,
-                       environment: Channels | None) -> CompensatedSamples:
-    """Compensate a single sample, with the same result as in a log."""
-    (low, high), (slowest, fastest), limit = (
-        model.extrapolation_range, model.rate_range, model.rate_limit)
-    used, seen = min(max(temperature, low), high), min(max(output, -limit), limit)
-    coldest, hottest = model.valid_temperatures
-    modelled, unexplained = model.rate_from_channels(
-        Channels.instantaneous(seen, seen, used) if environment is None
-        else environment.with_rate(seen, seen))
-    if not -_MAX_COMPUTABLE_RATE < modelled < _MAX_COMPUTABLE_RATE:
-        modelled, unexplained = seen, True
-    rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
-    if seen != output:
-        modelled, rate, unexplained = modelled + (output - seen), rate + (output - seen), True
-    return CompensatedSamples(
-        modelled, rate,
-        temperature if used == temperature else clip(temperature, *model.temperature_limits),
-        not coldest <= temperature <= hottest, unexplained or not slowest <= output <= fastest)
-
-
-def _compensate_array(model: GyroModel, output: Array, temperature: Number,
-                      environment: Channels | None = None) -> CompensatedSamples:
+def _compensate_at_once(model: GyroModel, output: Number, temperature: Number,
+                        environment: Channels | None = None) -> CompensatedSamples:
+    """Compensate a sample, or all samples of a log, with the same result."""
     (slowest, fastest), limit = model.rate_range, model.rate_limit
     # no masks are made where the extremes show that all samples are inside
     beyond = _mask_outside(output, max(slowest, -limit), min(fastest, limit))
-    seen = output if beyond is False else np.clip(output, -limit, limit)
+    seen = output if beyond is False else clip(output, -limit, limit)
     clipped, used, plausible = (_mask_outside(temperature, *model.valid_temperatures), temperature,
                                 temperature)
     if clipped is not False:
@@ -116,10 +84,9 @@ def _compensate_array(model: GyroModel, output: Array, temperature: Number,
         modelled, unexplained = model.rate_from_channels(
             Channels(seen, seen, used) if environment is None
             else environment.with_rate(seen, seen))
-        if not -_MAX_COMPUTABLE_RATE < modelled.sum() < _MAX_COMPUTABLE_RATE:
-            # the model overflows there: these samples are not corrected
-            computed = abs(modelled) < _MAX_COMPUTABLE_RATE
-            modelled, unexplained = np.where(computed, modelled, seen), unexplained | ~computed
+        if not np.isfinite(modelled).all():  # the model overflows there, and is not used
+            computed = np.isfinite(modelled)
+            modelled, unexplained = np.where(computed, modelled, seen)[()], unexplained | ~computed
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen is not output:
         modelled, rate = modelled + (output - seen), rate + (output - seen)
@@ -143,8 +110,9 @@ def _compensate_blocks(model: GyroModel, output: Array, temperature: Number) -> 
     rate = modelled if model.self_calibration is None else np.empty(len(output))
     for begin in range(0, len(output), CACHE_BLOCK_SAMPLES):
         block = slice(begin, begin + CACHE_BLOCK_SAMPLES)
-        part = _compensate_array(model, output[block], temperature[block]
-                                 if isinstance(temperature, np.ndarray) else temperature)
+        part = _compensate_at_once(
+            model, output[block],
+            temperature[block] if isinstance(temperature, np.ndarray) else temperature)
         modelled[block] = part.model_rate
         if part.temperature_clipped is not False:
             clipped[block] = part.temperature_clipped

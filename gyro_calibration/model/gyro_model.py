@@ -78,26 +78,15 @@ class Term:
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """
-    Scale factor error s and bias b that remain after the model (Hong and Park, eq. 1 to 3).
+    """Scale factor error s and bias b that remain after the model (Hong and Park, eq. 1 to 3)."""
 
-    Attributes
-    ----------
-    scale_factor_error : s, 1
-    bias : b, rad/s
-    covariance : of (s, b), shape (2, 2); None where it is not known
-    time : when, ISO 8601
-    temperature : at which, degC; None where it was not known
-    method : likelihood, heading, rate, turns or rest
-
-    """
-
-    scale_factor_error: float = 0.0
-    bias: float = 0.0
+    scale_factor_error: float = 0.0  # s, 1
+    bias: float = 0.0  # b, rad/s
+    # of (s, b), shape (2, 2); None where it is not known
     covariance: tuple[tuple[float, float], tuple[float, float]] | None = None
-    time: str = ''
-    temperature: float | None = None
-    method: str = ''
+    time: str = ''  # when, ISO 8601
+    temperature: float | None = None  # at which, degC; None where it was not known
+    method: str = ''  # likelihood, heading, rate, turns or rest
 
     @property
     def scale(self) -> float:
@@ -143,55 +132,38 @@ class SelfCalibration:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """
-    Errors of the rate beyond the covariance of the values: standard deviations.
+    """Errors of the rate beyond the covariance of the values: standard deviations."""
 
-    Attributes
-    ----------
-    bias, scale_factor_error : their change from one run to the next, rad/s and 1; not used where
-        there is a self-calibration, which estimates them
-    bias_per_kelvin, scale_factor_error_per_kelvin : per K outside of the calibrated temperatures,
-        rad/s/K and 1/K
-    per_rate : error of the rate per rad/s of the output outside of the calibrated range, 1
-
-    """
-
+    # their change from one run to the next, rad/s and 1; not used where there is a self-
+    # calibration, which estimates them
     bias: float = 0.0
     scale_factor_error: float = 0.0
+    # per K outside of the calibrated temperatures, rad/s/K and 1/K
     bias_per_kelvin: float = 0.0
     scale_factor_error_per_kelvin: float = 0.0
+    # error of the rate per rad/s of the output outside of the calibrated range, 1
     per_rate: float = 0.0
 
 
 @dataclass(frozen=True)
 class GyroModel:
-    """
-    The model of one gyro.
+    """The model of one gyro."""
 
-    Attributes
-    ----------
-    terms : its effects
-    covariance : of all fitted values in the order of the terms, shape (m, m); None if unknown
-    rate_range, temperature_range : calibrated range of the fit, rad/s and degC
-    noise : its noise figures
-    noise_bounds : by name of a noise figure, the bounds that hold it with 95 % confidence
-    gyro : name, serial_number, technology, as text
-    origin : files, date and program of the calibration
-    self_calibration : the last one
-    tolerance : errors of the rate beyond the covariance
-
-    """
-
-    terms: tuple[Term, ...] = ()
+    terms: tuple[Term, ...] = ()  # its effects
+    # of all fitted values in the order of the terms, shape (m, m); None if unknown
     covariance: Array | None = None
+    # calibrated range of the fit, rad/s and degC
     rate_range: tuple[float, float] = (-math.inf, math.inf)
     temperature_range: tuple[float, float] = (-math.inf, math.inf)
     reference_temperature: float = 25.0
-    noise: Noise = Noise()
+    noise: Noise = Noise()  # its noise figures
+    # name, serial_number, technology, as text
     gyro: Mapping[str, str] = field(default_factory=dict)
+    # files, date and program of the calibration
     origin: Mapping[str, Any] = field(default_factory=dict)
-    self_calibration: SelfCalibration | None = None
-    tolerance: Tolerance = Tolerance()
+    self_calibration: SelfCalibration | None = None  # the last one
+    tolerance: Tolerance = Tolerance()  # errors of the rate beyond the covariance
+    # by name of a noise figure, the bounds that hold it with 95 % confidence
     noise_bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def estimates(self) -> Iterator[tuple[str, Parameter, float, float]]:

@@ -20,7 +20,6 @@ from typing import Any
 from gyro_calibration.files import (
     describe_error,
     InputError,
-    MAX_MAGNITUDE,
     suggest_nearest,
     write_atomically,
 )
@@ -50,9 +49,6 @@ POLYNOMIAL = 'rate_temperature_polynomial'
 _NOISE_NAMES = tuple(Noise.__dataclass_fields__)
 #: Highest order of a polynomial.
 _MAX_POLYNOMIAL_ORDER = 20
-#: Largest standard deviation of a self-calibration, rad/s and 1; beyond it the variance of the
-#: heading exceeds double precision.
-_MAX_STANDARD_DEVIATION = 100.0
 
 
 class ModelError(InputError):
@@ -111,7 +107,7 @@ def _parse_content(content: Any) -> GyroModel:
         else _parse_covariance('covariance', top['covariance'], size),
         _parse_range('valid.rate', valid.get('rate')), temperature_range,
         parse_number('reference_temperature', top.get('reference_temperature', middle)),
-        Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_noise_figure))),
+        Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_nonnegative))),
         {name: parse_text(f'gyro.{name}', value)
          for name, value in parse_section('gyro', None).items()},
         parse_section('origin', None), _parse_self_calibration(top.get('self_calibration')),
@@ -122,14 +118,6 @@ def _parse_content(content: Any) -> GyroModel:
 
 def _parse_nonnegative(key_path: str, value: Any) -> float:
     return parse_number(key_path, value, low=0.0)
-
-
-def _parse_noise_figure(key_path: str, value: Any) -> float:
-    """Read a noise figure: 0, or large enough that its square does not underflow."""
-    if 0.0 < (size := _parse_nonnegative(key_path, value)) < 1.0 / MAX_MAGNITUDE:
-        raise InvalidValue(key_path, value,
-                           f'0 where it is not known, or at least {1.0 / MAX_MAGNITUDE}')
-    return size
 
 
 def _parse_range(key_path: str, value: Any) -> tuple[float, float]:
@@ -143,16 +131,21 @@ def _parse_range(key_path: str, value: Any) -> tuple[float, float]:
     return low, high
 
 
-def _parse_rows(key_path: str, value: Any) -> list[list[float]]:
-    return [[parse_number(f'{key_path}[{i}][{j}]', item) for j, item in enumerate(row)]
-            for i, row in enumerate(value)]
+def _parse_matrix(key_path: str, value: Any, wanted: str) -> Array:
+    """Return rows of numbers of one length."""
+    lengths = {len(row) if isinstance(row, list) else 0
+               for row in value} if isinstance(value, list) else {0}
+    if len(lengths) != 1 or 0 in lengths:
+        raise InvalidValue(key_path, value, wanted)
+    return np.array([[parse_number(f'{key_path}[{i}][{j}]', item) for j, item in enumerate(row)]
+                     for i, row in enumerate(value)])
 
 
 def _parse_covariance(key_path: str, value: Any, size: int = 2) -> Array:
-    if not isinstance(value, list) or [len(row) if isinstance(row, list) else -1
-                                       for row in value] != [size] * size:
-        raise InvalidValue(key_path, value, f'{size} rows of {size} numbers, one a fitted value')
-    matrix = np.array(_parse_rows(key_path, value)).reshape(size, size)
+    wanted = f'{size} rows of {size} numbers, one a fitted value'
+    matrix = np.zeros((0, 0)) if value == [] else _parse_matrix(key_path, value, wanted)
+    if matrix.shape != (size, size):
+        raise InvalidValue(key_path, value, wanted)
     rounding = 1e-9 * np.abs(matrix).max(initial=0.0)
     smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + rounding)], default=0.0)
     if not np.allclose(matrix, matrix.T, atol=rounding) or smallest < 0.0:
@@ -173,15 +166,15 @@ def _parse_term(name: str, values: Any) -> Term:
 
 
 def _parse_values(key_path: str, effect: Effect, given: Mapping[str, Any]) -> tuple[float, ...]:
-    refuse_unknown_names(key_path, given, [parameter.name for parameter in effect.parameters])
+    known = {parameter.name: parameter.default for parameter in effect.parameters}
+    refuse_unknown_names(key_path, given, known)
     values = []
     for parameter in effect.parameters:
-        value = parse_number(f'{key_path}.{parameter.name}',
-                             given.get(parameter.name, parameter.default))
+        place = f'{key_path}.{parameter.name}'
+        value = parse_number(place, given.get(parameter.name, parameter.default))
         low, high = parameter.bounds
         if not low <= value <= high:
-            raise InvalidValue(f'{key_path}.{parameter.name}', value,
-                               f'{low:g} to {high:g} {parameter.unit}')
+            raise InvalidValue(place, value, f'{low:g} to {high:g} {parameter.unit}')
         values.append(value)
     return tuple(values)
 
@@ -189,8 +182,13 @@ def _parse_values(key_path: str, effect: Effect, given: Mapping[str, Any]) -> tu
 def _parse_polynomial(key_path: str, given: Mapping[str, Any]) -> Term:
     """Read a polynomial: the paper's matrix, or orders [rate, temperature] with named values."""
     if 'matrix_dps' in given:
-        return Term(
-            *validate(key_path, given, {'matrix_dps': _parse_polynomial_matrix})['matrix_dps'])
+        refuse_unknown_names(key_path, given, ['matrix_dps'])
+        place, rows = f'{key_path}.matrix_dps', given['matrix_dps']
+        wanted = f'rows of finite numbers of one length, up to order {_MAX_POLYNOMIAL_ORDER}'
+        matrix = _parse_matrix(place, rows, wanted)
+        if max(matrix.shape) > _MAX_POLYNOMIAL_ORDER + 1:
+            raise InvalidValue(place, rows, wanted)
+        return Term(*polynomial_from_matrix(matrix))
     orders = given.get('orders')
     if not isinstance(orders, list) or len(orders) != 2 or not all(
             type(order) is int and 0 <= order <= _MAX_POLYNOMIAL_ORDER for order in orders):
@@ -199,19 +197,6 @@ def _parse_polynomial(key_path: str, given: Mapping[str, Any]) -> Term:
     effect = rate_temperature_polynomial(*orders)
     return Term(effect, _parse_values(
         key_path, effect, {name: value for name, value in given.items() if name != 'orders'}))
-
-
-def _parse_polynomial_matrix(key_path: str, rows: Any) -> tuple[Effect, tuple[float, ...]]:
-    if (not isinstance(rows, list) or not all(isinstance(row, list) for row in rows)
-            or max(map(len, [rows, *rows])) > _MAX_POLYNOMIAL_ORDER + 1):
-        raise InvalidValue(key_path, rows,
-                           f'rows of finite numbers, up to order {_MAX_POLYNOMIAL_ORDER}')
-    try:
-        return polynomial_from_matrix(_parse_rows(key_path, rows))
-    except InvalidValue:
-        raise
-    except ValueError as error:
-        raise InvalidValue(key_path, rows, str(error)) from None
 
 
 _SELF_CALIBRATION_SCHEMA = {
@@ -237,9 +222,6 @@ def _parse_self_calibration(value: Any) -> SelfCalibration | None:
     if matrix is None:
         return SelfCalibration(**run)
     (a, b), (_, c) = matrix.tolist()
-    if max(a, c) > _MAX_STANDARD_DEVIATION ** 2:
-        raise InvalidValue(place, value,
-                           f'standard deviations of at most {_MAX_STANDARD_DEVIATION:g}')
     return SelfCalibration(**run, covariance=((a, b), (b, c)))
 
 

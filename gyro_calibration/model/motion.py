@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import csv
 from dataclasses import dataclass
 import io
@@ -19,6 +20,7 @@ import math
 from pathlib import Path
 
 from gyro_calibration.files import describe_error, InputError, MAX_MAGNITUDE, read_bytes
+from gyro_calibration.logs.columns import COLUMNS
 from gyro_calibration.logs.log import (
     Array,
     DataRefused,
@@ -50,17 +52,11 @@ class Motion:
     Between them the rate is linear where rates are given, and the heading is linear where only
     headings are given.
 
-    Attributes
-    ----------
-    time : s, increasing, shape (n,), beginning at 0
-    heading : rad, continuous, shape (n,), beginning at 0
-    rate : rad/s, shape (n,); None where the motion was given by its heading
-
     """
 
-    time: Array
-    heading: Array
-    rate: Array | None = None
+    time: Array  # s, increasing, shape (n,), beginning at 0
+    heading: Array  # rad, continuous, shape (n,), beginning at 0
+    rate: Array | None = None  # rad/s, shape (n,); None where the motion was given by its heading
 
     @property
     def duration(self) -> float:
@@ -133,15 +129,22 @@ def constant_rate_motion(segments: list[tuple[float, float]], ramp: float = 0.5)
     return motion_from_rates(np.array(time), np.array(rate))
 
 
+def _turns_and_rests(first_rest: float,
+                     turns: Iterable[tuple[float, float, float]]) -> Motion:
+    """Return the motion of turns of (duration, s, rate, deg/s, duration of the rest after, s)."""
+    return constant_rate_motion([(first_rest, 0.0), *(
+        stretch for duration, rate, rest in turns for stretch in ((duration, rate), (rest, 0.0)))])
+
+
 #: 20 s that separate scale factor error from bias: both signs, two speeds, rests, ramps of 0.5 s,
 #: and the first heading at the end.
-CALIBRATION_MOTION = constant_rate_motion([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30),
-                                           (1, 0), (3.5, -30), (1, 0)])
-#: 160 s of a robot in a building, half of it at rest or on straight paths.
-ROBOT_MOTION = constant_rate_motion([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10),
-                                     (6, 0), (9.5, 10), (6, 0), (5, 20), (8, 0), (5, -20), (7, 0),
-                                     (5, -20), (8, 0), (5, 20), (7, 0), (9.5, 10), (6, 0),
-                                     (9.5, -10), (8, 0), (9, 0)])
+CALIBRATION_MOTION = _turns_and_rests(1.0, ((4, 45, 1), (4, -45, 1), (3.5, 30, 1), (3.5, -30, 1)))
+#: 160 s of a robot in a building, half of it at rest or on straight paths: turns of 90 deg and the
+#: ramps after them.
+ROBOT_MOTION = _turns_and_rests(10.0, (
+    (90 / abs(rate) + 0.5, rate, rest) for rate, rest in (
+        (15, 6), (-15, 8), (-10, 6), (10, 6), (20, 8), (-20, 7), (-20, 8), (20, 7), (10, 6),
+        (-10, 17))))
 NAMED_MOTIONS = {
     'calibration': CALIBRATION_MOTION,
     'robot': ROBOT_MOTION,
@@ -154,9 +157,9 @@ def motion_by_name(motion: str | Path) -> Motion:
     return NAMED_MOTIONS.get(str(motion)) or read_motion(motion)
 
 
-_COLUMN_UNITS = {
-    f'{prefix}{name}': factor for prefix in ('', 'reference_') for name, factor in (
-        ('heading_deg', DEGREE), ('heading_rad', 1.0), ('rate_dps', DEGREE), ('rate_rad_s', 1.0))}
+_COLUMN_UNITS = {name: factor for column, (quantity, factor) in COLUMNS.items()
+                 if quantity.startswith('reference_')
+                 for name in (column.removeprefix('reference_'), column)}
 
 
 def read_motion(path: str | Path) -> Motion:
@@ -194,7 +197,7 @@ def read_motion(path: str | Path) -> Motion:
 
 def _find_motion_column(path: str | Path, header: list[str]) -> str:
     """Return the name of the column that holds the motion."""
-    found = [name for name in _COLUMN_UNITS if name in header]
+    found = sorted(name for name in _COLUMN_UNITS if name in header)
     both = [each[:14] for each in found] == ['reference_head', 'reference_rate']
     if 'time_s' not in header or len(found) != 1 + both:
         given = excerpt(','.join(header)) or 'nothing'

@@ -31,20 +31,11 @@ _FLICKER_TIME_CONSTANTS = np.array([3.0, 30.0, 300.0, 3000.0])
 
 @dataclass(frozen=True)
 class Noise:
-    """
-    The noise figures of a gyro.
+    """The noise figures of a gyro."""
 
-    Attributes
-    ----------
-    angle_random_walk : N, rad/√s; 0 where it is not known
-    bias_instability : B, rad/s; the floor of the Allan deviation is 0.664 B
-    rate_random_walk : K, rad/s/√s
-
-    """
-
-    angle_random_walk: float = 0.0
-    bias_instability: float = 0.0
-    rate_random_walk: float = 0.0
+    angle_random_walk: float = 0.0  # N, rad/√s; 0 where it is not known
+    bias_instability: float = 0.0  # B, rad/s; the floor of the Allan deviation is 0.664 B
+    rate_random_walk: float = 0.0  # K, rad/s/√s
 
     def rate_variance(self, interval: float) -> float:
         """Return the variance of the white noise of samples every `interval` s, (rad/s)²."""

@@ -22,20 +22,17 @@ from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
 import re
-import reprlib
 from typing import Any
 
 from gyro_calibration.files import MAX_MAGNITUDE, read_bytes, suggest_nearest, to_printable
 import numpy as np
 import yaml
 
-#: Largest file, bytes: twice the size of a model with the covariance of 150 values.
-MAX_SETTINGS_BYTES = 1_000_000
-#: Largest depth of nested lists and names, and largest number of nodes; parsing takes 30 us each.
-_MAX_DEPTH, _MAX_VALUES = 10, 50_000
-#: Shortens large values in messages.
-_SHORT_REPR = reprlib.Repr()
-_SHORT_REPR.maxlevel = 3
+#: Largest file, bytes: twice the size of a model with the covariance of 150 values; and largest
+#: depth of nested lists and names, which the stack of Python holds.
+MAX_SETTINGS_BYTES, _MAX_DEPTH = 1_000_000, 10
+_INTEGER = re.compile('[-+]?[0-9]{1,400}')
+_FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?')
 
 
 def read_settings(path: str | Path, max_size: int = MAX_SETTINGS_BYTES) -> Any:
@@ -70,8 +67,7 @@ class InvalidValue(ValueError):
 
     def __init__(self, key_path: str, value: Any, expected: str):
         super().__init__(f'{to_printable(key_path[:100])} is '
-                         f'{"empty" if value is None else _SHORT_REPR.repr(value)}; wanted '
-                         f'{expected}')
+                         f'{"empty" if value is None else repr(value)[:100]}; wanted {expected}')
 
 
 def validate(key_path: str, value: Any, schema: Any) -> Any:
@@ -146,7 +142,18 @@ def format_settings(content: Any) -> str:
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
-class _Loader(yaml.SafeLoader):
+def _parse_plain(text: str) -> Any:
+    """Return the value of an unquoted text."""
+    if text in ('', '~', 'null', 'Null', 'NULL'):
+        return None
+    if text.lower() in ('true', 'false'):
+        return text.lower() == 'true'
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    return float(text) if len(text) < 400 and _FLOAT.fullmatch(text) else text
+
+
+class _Loader(yaml.BaseLoader):
     """
     Reads names, texts, numbers and lists, and refuses aliases, tags and names given twice.
 
@@ -154,9 +161,7 @@ class _Loader(yaml.SafeLoader):
 
     """
 
-    yaml_constructors: dict[Any, Any] = {}
-    yaml_implicit_resolvers: dict[Any, Any] = {}
-    _depth = _count = 0
+    _depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event: Any = self.peek_event()
@@ -166,12 +171,13 @@ class _Loader(yaml.SafeLoader):
             _refuse_node('a tag is not read; leave it out', event)
         if self._depth == _MAX_DEPTH:
             _refuse_node(f'more than {_MAX_DEPTH} levels are nested', event)
-        if self._count == _MAX_VALUES:
-            _refuse_node(f'there are more than {_MAX_VALUES} values', event)
-        self._depth, self._count = self._depth + 1, self._count + 1
+        self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
+
+    def construct_scalar(self, node: Any) -> Any:
+        return node.value if node.style else _parse_plain(node.value)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
         names: dict[str, Any] = {}
@@ -184,53 +190,27 @@ class _Loader(yaml.SafeLoader):
         return names
 
 
-class _Dumper(yaml.SafeDumper):
-    """Quotes texts that would be read as numbers."""
+def _refuse_node(problem: str, node: Any) -> None:
+    raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
-    yaml_implicit_resolvers: dict[Any, Any] = {
-        first: list(each) for first, each in yaml.SafeDumper.yaml_implicit_resolvers.items()}
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes texts that would be read as numbers or line ends."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
     def represent_str(self, data: str) -> Any:
-        # Outside of double quotes these would be read as line ends.
-        return self.represent_scalar('tag:yaml.org,2002:str', data,
-                                     '"' if re.search('[\x85\u2028\u2029]', data) else None)
+        quoted = _parse_plain(data) != data or re.search('[\x85\u2028\u2029]', data)
+        return self.represent_scalar('tag:yaml.org,2002:str', data, '"' if quoted else None)
+
+    def represent_float(self, data: float) -> Any:
+        if not math.isfinite(data):
+            raise ArithmeticError(f'{data:g} is no number that a file may hold')
+        return super().represent_float(data)
 
 
-def _represent_float(dumper: Any, value: float) -> Any:
-    if not math.isfinite(value):
-        raise ArithmeticError(f'{value:g} is no number that a file may hold')
-    return yaml.SafeDumper.represent_float(dumper, value)
-
-
-def _refuse_node(problem: str, node: Any) -> None:
-    raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
-
-
-#: Name -> (pattern, first characters, constructor). More than 400 digits are not read as a number,
-#: since that would take long.
-_YAML_TYPES: dict[str, tuple[str, list[str], Any]] = {
-    'null': ('~|null|Null|NULL|', ['~', 'n', 'N', ''], lambda loader, node: None),
-    'bool': ('true|True|TRUE|false|False|FALSE', list('tTfF'),
-             lambda loader, node: node.value.lower() == 'true'),
-    'int': ('[-+]?[0-9]{1,400}', list('-+0123456789'), lambda loader, node: int(node.value)),
-    'float': (r'[-+]?(?:[0-9]{1,400}(?:\.[0-9]{0,400})?|\.[0-9]{1,400})(?:[eE][-+]?[0-9]{1,9})?|'
-              r'[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)',
-              list('-+.0123456789'), lambda loader, node: float(
-                  node.value.lower().replace('.inf', 'inf').replace('.nan', 'nan'))),
-    'str': ('', [], lambda loader, node: node.value),
-    'seq': ('', [], yaml.SafeLoader.construct_yaml_seq),
-    'map': ('', [], yaml.SafeLoader.construct_yaml_map),
-}
 _Dumper.add_representer(str, _Dumper.represent_str)
-_Dumper.add_representer(float, _represent_float)
+_Dumper.add_representer(float, _Dumper.represent_float)
 _Dumper.add_multi_representer(np.generic, lambda dumper, value: dumper.represent_data(
     float(value) if isinstance(value, np.floating) else value.item()))
-for _name, (_pattern, _first, _constructor) in _YAML_TYPES.items():
-    _tag = f'tag:yaml.org,2002:{_name}'
-    _Loader.add_constructor(_tag, _constructor)
-    if _first:
-        _Loader.add_implicit_resolver(_tag, re.compile(rf'(?:{_pattern})\Z'), _first)
-        _Dumper.add_implicit_resolver(_tag, re.compile(rf'(?:{_pattern})\Z'), _first)

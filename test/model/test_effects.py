@@ -216,11 +216,3 @@ def test_a_centred_and_scaled_polynomial_is_written_out_as_eq_11():
     for output, degc in [(-90.0, 26.0), (0.0, 35.0), (55.0, 44.0)]:
         error = Term(effect, values).error(Channels(math.nan, output * DEGREE, degc))
         assert eq_12(matrix, output, degc) == pytest.approx(error / DEGREE, abs=1e-9)
-
-
-@pytest.mark.parametrize('matrix',
-                         [[], [[]], 'abc', None, [[1, 2], [3]], [[math.nan]], [[math.inf, 1]],
-                          [1, 2], [[[1]]], [['a']], [[10 ** 400]], [[1e308, 0, 0, 0]], {}])
-def test_what_is_no_matrix_of_eq_11_is_refused(matrix):
-    with pytest.raises(ValueError, match='rows of finite numbers'):
-        polynomial_from_matrix(matrix)

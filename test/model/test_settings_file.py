@@ -33,8 +33,6 @@ REFUSED = {
     'deep': ('[' * 100_000, 'more than 10 levels'),
     'deep in names': ('{a: ' * 100_000, 'more than 10 levels'),
     'deep in blocks': ('- ' * 100_000, 'more than 10 levels'),
-    'many values': ('- 1\n' * 60_000, 'more than 50000 values'),
-    'many in a row': ('[' + '1,' * 60_000 + ']', 'more than 50000 values'),
     'large': ('#' * 1_000_001, 'more than 1000000 bytes'),
     'two documents': ('a: 1\n---\nb: 1', 'another document'),
     'a zero byte': ('a: \0', 'not allowed'),
@@ -71,7 +69,7 @@ def test_what_is_no_file_of_settings_is_refused_in_a_line_and_soon(
 
 
 @pytest.mark.parametrize('text, value', [
-    ('1e-4', 1e-4), ('-2E+5', -2e5), ('.5', 0.5), ('1.', 1.0), ('010', 10), ('-.inf', -math.inf),
+    ('1e-4', 1e-4), ('-2E+5', -2e5), ('.5', 0.5), ('1.', 1.0), ('010', 10),
     ('true', True), ('', None), ('~', None), ('yes', 'yes'), ('2026-11-21', '2026-11-21'),
     ('2024-13-45', '2024-13-45'), ('0x10', '0x10'), ('1_0', '1_0'), ('1:30', '1:30'), ('<<', '<<'),
     ('"1"', '1'), ('9' * 401, '9' * 401), ('9' * 400, 10 ** 400 - 1)])
