@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gyro_calibration.heading.gaps import Intervals
+from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.heading.log_compensation import smooth_track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Array, Mask

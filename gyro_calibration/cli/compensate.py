@@ -23,7 +23,7 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.gaps import Intervals
+from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
 from gyro_calibration.heading.integration import BlockIntegrator, Threshold
 from gyro_calibration.heading.log_compensation import (

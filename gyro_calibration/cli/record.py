@@ -40,7 +40,7 @@ from gyro_calibration.driver.recorder import (
 )
 from gyro_calibration.driver.timestamps import ClockStepDetector, read_steady_clock
 from gyro_calibration.files import InputError, to_printable
-from gyro_calibration.heading.gaps import Intervals
+from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log

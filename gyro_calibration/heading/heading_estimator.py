@@ -20,7 +20,7 @@ robot drives, and adds the bias at rest to the table for the next run.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 import math
@@ -33,9 +33,10 @@ from gyro_calibration.heading.assumptions import (
     with_assumed_covariance,
 )
 from gyro_calibration.heading.bias_table import BiasTable, propagate_calibration
-from gyro_calibration.heading.gaps import TIME_TOLERANCE
+from gyro_calibration.heading.integration import TIME_TOLERANCE
+from gyro_calibration.heading.stationary import BLOCK_DURATION
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import Array, DEGREE, Number
+from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, Number
 from gyro_calibration.model.compensation import (
     compensate,
     CompensatedSamples,
@@ -55,15 +56,8 @@ _OUTLIER_SIGMAS = 4.5
 _RESTART_DISTANCE = 5.0
 #: Assumed drift of the temperature after its last message, K/s, and its limit, K.
 _LOST_TEMPERATURE_RATE, _MAX_LOST_DISTANCE = 1.0 / 60.0, 15.0
-#: Interval at which the sensitivity at rest is computed, s.
-_REST_SENSITIVITY_INTERVAL = 0.5
-#: Interval at which the sensitivity in motion is computed, s, and change of the rate at which it
-#: is computed earlier, rad/s plus a share of the rate.
-_SENSITIVITY_INTERVAL, _RATE_TOLERANCE, _RELATIVE_RATE_TOLERANCE = 0.1, 0.5 * DEGREE, 0.02
 #: Age of a temperature, s, from which on it is held with a growing uncertainty.
 TEMPERATURE_TIMEOUT = 10.0
-#: Samples of a log in one chunk.
-_CHUNK_SAMPLES = 1 << 15
 #: Step of the clock, s, after which the age of a calibration is computed again, and largest time
 #: that a calibration may be dated in the future.
 _AGE_TOLERANCE = 3600.0
@@ -225,9 +219,7 @@ class HeadingEstimator:
                                else math.inf)
         self._bias_shift, self._unobserved_distance, self._age_changed = 0.0, 0.0, False
         self._sensitivity: Array = np.zeros(len(self.covariance))
-        self._rest_sensitivity: Array = self._sensitivity
-        self._rest_sensitivity_time, self._held_time_and_rate = -math.inf, (-math.inf, 0.0)
-        self._held_sensitivity: Array | None = None
+        self._rest_sensitivity, self._sensitivity_time = self._sensitivity, -math.inf
         self._stretch = None
         self._pending_stretches.clear()
         self.restart_count += 1
@@ -384,12 +376,13 @@ class HeadingEstimator:
         rate = float(result.rate)
         if change:
             rate -= change * (1.0 if calibration is None else calibration.scale)
-        if abs(time - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
-            self._rest_sensitivity_time = time
-            self._rest_sensitivity = self._uncertain_sensitivity(
-                output, 0.0, result.temperature, around, distance)
-        self._update_sensitivity(time, output, float(result.rate), around, distance)
-        message = tracker.add(time, rate, self._sensitivity, wheels, self._rest_sensitivity)
+        if self._is_outdated(time):
+            self._rest_sensitivity, self._sensitivity = (
+                self._uncertain_sensitivity(output, seen, result.temperature, around, distance)
+                for seen in (0.0, float(result.rate)))
+        message = tracker.add(
+            time, rate, self._rest_sensitivity if tracker.is_resting else self._sensitivity,
+            wheels, self._rest_sensitivity)
         self.corrected_rate, self.rate = rate, tracker.rate
         if message or not tracker.is_resting:
             self._end_rest()
@@ -407,19 +400,12 @@ class HeadingEstimator:
         return (-limit <= output <= limit and -_MAX_TIME <= time <= _MAX_TIME
                 and (force is None or -_MAX_SPECIFIC_FORCE <= force <= _MAX_SPECIFIC_FORCE))
 
-    def _update_sensitivity(self, time: float, output: float, rate: float, around: Channels | None,
-                            distance: float) -> None:
-        """Update the sensitivity, which is held at rest and for a short time at similar rates."""
-        if _is_outdated(time, rate, self._held_time_and_rate):
-            self._held_sensitivity, self._held_time_and_rate = None, (time, rate)
-            self._held_arguments = (output, rate, self.last_compensated.temperature, around,
-                                    distance)
-        if self.tracker.is_resting:
-            self._sensitivity = self._rest_sensitivity
-            return
-        if self._held_sensitivity is None:
-            self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
-        self._sensitivity = self._held_sensitivity
+    def _is_outdated(self, time: float) -> bool:
+        """Tell whether sensitivities, which are held for a block, are to be computed at a time."""
+        outdated = abs(time - self._sensitivity_time) > BLOCK_DURATION + TIME_TOLERANCE
+        if outdated:
+            self._sensitivity_time = time
+        return outdated
 
     def _uncertain_sensitivity(self, output: Number, rate: Number, temperature: Number,
                                around: Channels | None, distance: Number) -> Array:
@@ -514,7 +500,7 @@ class HeadingEstimator:
         # a complete stretch of rest may restart the tracker
         begin = self._stretch.start_time if self._stretch else float(time[place])
         end = int(np.searchsorted(time[place:], begin + STRETCH_DURATION - TIME_TOLERANCE)) + place
-        end = min(end + (self._stretch is not None), len(time), place + _CHUNK_SAMPLES)
+        end = min(end + (self._stretch is not None), len(time), place + CACHE_BLOCK_SAMPLES)
         rows, limit = slice(place, end), self.current_model.rate_limit
         known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= _MAX_TIME)
         if temperature is not None:
@@ -541,17 +527,14 @@ class HeadingEstimator:
         calibration = used.self_calibration
         scale = 1.0 if calibration is None else calibration.scale
         rate = np.asarray(result.rate) - change * scale
-        still = self._rest_sensitivities(time, output, result, distance)
-        found[:, :5] = tracker.follow(time, rate,
-                                      self._motion_sensitivities(time, output, result, distance),
-                                      wheels, still, still)
+        still, moving = self._held_sensitivities(time, output, result, distance)
+        found[:, :5] = tracker.follow(time, rate, moving, wheels, still, still)
         found[:, 5], found[:, 6] = rate, result.temperature_clipped
         found[:, 7] = result.beyond_range
         self.last_compensated = CompensatedSamples(
             *(float(np.asarray(values)[-1]) if np.ndim(values) else values
               for values in vars(result).values()))
         self.corrected_rate, self.rate = float(rate[-1]), float(found[-1, 2])
-        self._sensitivity = tracker.sensitivity
         interval = np.diff(time, prepend=last)
         moving = np.flatnonzero(
             (found[:, 4] < 0.5) | (interval < 0.0) | (interval > self._settings.maximum_gap))
@@ -563,47 +546,21 @@ class HeadingEstimator:
                                  float(np.sum(result.model_rate[first:])),
                                  float(temperature[first:].sum()), (still[first], still[-1]))
 
-    def _rest_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
-                            distance: Array) -> Array:
-        """Return the sensitivities at rest, held for half a second, shape (n, m)."""
-        places = list[int]()
-        for place, at in enumerate(time.tolist()):
-            if abs(at - self._rest_sensitivity_time) > _REST_SENSITIVITY_INTERVAL + TIME_TOLERANCE:
-                places.append(place)
-                self._rest_sensitivity_time = at
-        whole = self._hold_sensitivities(self._rest_sensitivity, places, output,
-                                         np.zeros(len(output)), result, distance)
-        self._rest_sensitivity = whole[-1]
-        return whole
-
-    def _motion_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
-                              distance: Array) -> Array:
-        """Return the sensitivities in motion, which are held for a short time, shape (n, m)."""
-        places, held_time_and_rate = list[int](), self._held_time_and_rate
-        rates = np.asarray(result.rate)
-        for place, (now, rate) in enumerate(zip(time.tolist(), rates.tolist())):
-            if _is_outdated(now, rate, held_time_and_rate):
-                places.append(place)
-                held_time_and_rate = now, rate
-        if (self._held_sensitivity is None and (not places or places[0])
-                and self._held_time_and_rate[0] > -math.inf):
-            self._held_sensitivity = self._uncertain_sensitivity(*self._held_arguments)
-        held = self._rest_sensitivity if self._held_sensitivity is None else self._held_sensitivity
-        self._held_time_and_rate = held_time_and_rate
-        whole = self._hold_sensitivities(held, places, output, rates, result, distance)
-        self._held_sensitivity = whole[-1]
-        return whole
-
-    def _hold_sensitivities(self, held: Array, places: list[int], output: Array, rate: Array,
-                            result: CompensatedSamples, distance: Array) -> Array:
-        """Return a sensitivity, and from each place on the one computed there, shape (n, m)."""
-        rows, temperature = [held], result.temperature
+    def _held_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
+                            distance: Array) -> Iterator[Array]:
+        """Give the sensitivities at rest and in motion, as `add` holds them, shape (n, m) each."""
+        places = [place for place, at in enumerate(time.tolist()) if self._is_outdated(at)]
+        rows = [[self._rest_sensitivity], [self._sensitivity]]
         if places:
+            temperature = result.temperature
             if isinstance(temperature, np.ndarray):
                 temperature = temperature[places]
-            rows.extend(self._uncertain_sensitivity(
-                output[places], rate[places], temperature, None, distance[places]).T)
-        return np.repeat(rows, np.diff([0, *places, len(output)]), axis=0)
+            for known, rate in zip(rows, (np.zeros(len(time)), np.asarray(result.rate))):
+                known.extend(self._uncertain_sensitivity(
+                    output[places], rate[places], temperature, None, distance[places]).T)
+        self._rest_sensitivity, self._sensitivity = rows[0][-1], rows[1][-1]
+        counts = np.diff([0, *places, len(time)])
+        return (np.repeat(known, counts, axis=0) for known in rows)
 
     # The bias at rest for the next run
 
@@ -689,12 +646,6 @@ class HeadingEstimator:
         """Return the channels that the model needs and that no message contains."""
         return [channel for channel in ('supply', 'specific_force')
                 if self.current_model.uses_channel(channel) and channel not in available]
-
-
-def _is_outdated(time: float, rate: float, held: tuple[float, float]) -> bool:
-    """Tell whether a sensitivity in motion, held since a time and a rate, is computed again."""
-    return (abs(time - held[0]) > _SENSITIVITY_INTERVAL + TIME_TOLERANCE
-            or abs(rate - held[1]) > _RATE_TOLERANCE + _RELATIVE_RATE_TOLERANCE * abs(rate))
 
 
 def _lost_temperature_distance(delay: float) -> float:

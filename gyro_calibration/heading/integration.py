@@ -9,25 +9,163 @@
 # under the License.
 
 """
-Integration of rates to a heading and its variance: threshold filter, and trapezoids on the stamps.
+Integration of rates to a heading and its variance: lost samples, threshold filter, trapezoids.
 
 The threshold is compared with the mean over a window, because single samples of a cheap gyro cross
 it half of the time. A window of 0 is the published decision. Rates are integrated by the trapezoid
 rule on the stamps: the rectangle rule has a delay of half a sample, and a nominal interval causes
 a scale factor error.
 
+Over a gap with lost samples the rate is interpolated linearly. If it differs at the ends by a step
+d, it may have changed at any time in the gap of T, so that the integral has the variance
+T² d² / 12. It depends on the two samples at the ends alone, each with the noise N² / dt, so that
+the variance by noise is T² N² / (2 dt) instead of N² T.
+
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
+import math
 
-from gyro_calibration.heading.gaps import GapModel, MAX_RATE
-from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE
+from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
 import numpy as np
+
+#: Tolerance of durations, s: the resolution of stamps in seconds since 1970.
+TIME_TOLERANCE = 1e-6
+#: Largest rate, rad/s, and gap, s, so that the variance after a gap is finite.
+MAX_RATE, MAX_GAP = 1e4, 1e9
+#: Number of intervals in the memory, and least number for the detection of a gap.
+_MAX_INTERVALS, _MIN_INTERVALS = 256, 16
+#: Ratio to the usual interval of a short one, as in a burst or after a late sample, and share of
+#: short intervals above which stamps come in bursts.
+_SHORT_RATIO, _MIN_BURST_SHARE = 0.5, 0.1
+
+
+class Intervals:
+    """
+    The usual interval of stamps that may jitter or come in bursts, and the samples lost in others.
+
+    Attributes
+    ----------
+    usual_interval : s; inf while it is not known
+    lost_samples : samples lost so far
+    longest_gap : gap, s; 0 where there was none
+
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing known."""
+        self.usual_interval, self.lost_samples, self.longest_gap = math.inf, 0, 0.0
+        self._history: deque[float] = deque(maxlen=_MAX_INTERVALS)
+        self._until_update, self._gap_limit = _MIN_INTERVALS, math.inf
+        self._even_interval, self._late_samples = math.inf, 0
+
+    def add(self, interval: float) -> int:
+        """Take the next interval, s; return how many samples are lost in it."""
+        self._history.append(interval)
+        self._until_update -= 1
+        if not self._until_update:
+            self._update_usual_interval()
+        return self.count_lost(interval)
+
+    def add_many(self, intervals: Array) -> tuple[Array, Array]:
+        """
+        Take intervals, s, as `add` does one by one.
+
+        Returns
+        -------
+        usual interval after each, s, and number of samples lost in it, shape (n,) each
+
+        """
+        taken, usual, lost = 0, np.empty(len(intervals)), np.zeros(len(intervals), int)
+        while taken < len(intervals):
+            part = intervals[taken:taken + self._until_update - 1]
+            even = part <= self._gap_limit
+            count = len(part) if even.all() else int(np.argmin(even))
+            if self._late_samples or not count:
+                count, lost[taken] = 1, self.add(float(intervals[taken]))
+            else:
+                self._history.extend(part[:count].tolist())
+                self._until_update -= count
+            usual[taken:taken + count] = self.usual_interval
+            taken += count
+        return usual, lost
+
+    def count_lost(self, interval: float) -> int:
+        """
+        Return how many samples are lost in an interval, s, and count them.
+
+        Called alone for an interval that is not integrated, which is excluded from the usual one.
+
+        """
+        if interval > self._gap_limit:
+            self._late_samples = max(round((interval - self._even_interval) / self.usual_interval),
+                                     1)
+            self.lost_samples += self._late_samples
+            self.longest_gap = max(self.longest_gap, interval)
+            return self._late_samples
+        if self._late_samples and interval < _SHORT_RATIO * self.usual_interval:  # late, not lost
+            self._late_samples -= 1
+            self.lost_samples -= 1
+        else:
+            self._late_samples = 0
+        return 0
+
+    def _update_usual_interval(self) -> None:
+        """Find the usual interval: the median, unless the stamps come in bursts."""
+        self._until_update = max(len(self._history) // 4, _MIN_INTERVALS)
+        steps = sorted(self._history)
+        mean = sum(steps) / len(steps)
+        usual = self._even_interval = steps[len(steps) // 2]
+        if steps[int(_MIN_BURST_SHARE * len(steps))] < _SHORT_RATIO * mean:
+            # the longest may be gaps
+            self._even_interval = steps[-1 - len(steps) // 100]
+            usual = sum(min(step, self._even_interval) for step in steps) / len(steps)
+        self.usual_interval = max(usual, MIN_SAMPLE_INTERVAL)
+        self._gap_limit = self._even_interval + _SHORT_RATIO * self.usual_interval
+
+
+def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[int]:
+    """
+    Return the numbers of samples up to the ends of blocks of `length` s or slightly longer.
+
+    Parameters
+    ----------
+    intervals : before each sample, s
+    length : s
+    elapsed : elapsed duration of the first block, s
+
+    """
+    until, ends = np.cumsum(intervals).tolist(), list[int]()
+    target, place = length - TIME_TOLERANCE - elapsed, 0
+    while (place := bisect_left(until, target, place)) < len(until):
+        target = until[place] + length - TIME_TOLERANCE
+        place += 1
+        ends.append(place)
+    return ends
+
+
+def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interval: Array | float,
+                  step: Array | float) -> tuple[Array | float, Array | float]:
+    """
+    Return the variance of the integral over a gap by motion, and the additional one by noise, rad².
+
+    Parameters
+    ----------
+    usual : interval, s
+    lost : number of samples
+    interval, step : between the samples around them, s, and change of the rate, rad/s
+
+    """
+    ends = noise.angle_random_walk ** 2 / usual
+    surplus = np.minimum(lost * usual, interval)
+    return (interval ** 2 * np.maximum(step ** 2 - 2.0 * ends, 0.0) / 12.0,
+            ends * surplus * (0.5 * surplus + usual))
 
 
 @dataclass(frozen=True)
@@ -148,8 +286,7 @@ class BlockIntegrator:
         self._window_samples: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self._last_sample: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
         self._integrals: Array = np.zeros(2 + len(covariance))
-        self._gaps, self._gap_variance, self._last_rate = GapModel(noise), 0.0, 0.0
-        self.intervals = self._gaps.intervals
+        self._gap_variance, self._last_rate, self.intervals = 0.0, np.zeros(0), Intervals()
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
         """
@@ -179,16 +316,17 @@ class BlockIntegrator:
 
     def _gap_variances(self, time: Array, rate: Array, kept: Array) -> Array:
         """Return the variance by the gaps so far, rad², shape (n,)."""
-        unseen, (last_time, last_rows) = np.zeros(len(time)), self._last_sample
-        before = ((float(last_time[0]), self._last_rate, bool(last_rows[1, 0])) if len(last_time)
-                  else None)
-        samples = zip(time.tolist(), rate.tolist(), (kept > 0.0).tolist())
-        for index, sample in enumerate(samples):
-            gap = self._gaps.add(sample[0] - before[0], sample[1], before[1]) if before else None
-            if gap is not None and before is not None and (sample[2] or before[2]):
-                self._gap_variance += gap.variance
-            unseen[index], before = self._gap_variance, sample
-        self._last_rate = float(rate[-1])
+        last_time, last_rows = self._last_sample
+        interval = np.diff(np.concatenate([last_time, time]))
+        step = np.diff(np.concatenate([self._last_rate, rate]))
+        known = np.concatenate([last_rows[1], kept])
+        usual, lost = self.intervals.add_many(interval)
+        gaps = np.flatnonzero((lost > 0) & ((known[1:] > 0.0) | (known[:-1] > 0.0)))
+        unseen = np.zeros(len(known))
+        unseen[gaps + 1] = sum(gap_variances(self._noise, usual[gaps], lost[gaps], interval[gaps],
+                                             step[gaps]))
+        unseen = self._gap_variance + np.cumsum(unseen)[len(last_time):]
+        self._gap_variance, self._last_rate = float(unseen[-1]), rate[-1:]
         return unseen
 
     def _filter_block(self, time: Array, rate: Array) -> Array:

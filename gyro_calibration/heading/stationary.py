@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 import math
 
-from gyro_calibration.heading.gaps import block_ends, TIME_TOLERANCE
+from gyro_calibration.heading.integration import block_ends, TIME_TOLERANCE
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX,
     heading_variances,
@@ -300,8 +300,6 @@ class SlowTurn:
 
 #: Time constant with which a pending correction of the heading is applied in motion, s.
 SETTLING_TIME = 1.0
-#: Blocks at rest whose samples are compared with one estimate of the bias.
-_LOOKAHEAD_BLOCKS = 12
 
 
 @dataclass(frozen=True)
@@ -402,7 +400,6 @@ class EvenSamples:
         sums.insert(2, np.multiply.reduceat(self._pending_retention, self.block_starts).tolist())
         self.block_sums = list(zip(*sums))
         self.epochs = list[Epoch]()
-        self._extremes: tuple[int, int, list[float], list[float]] = -1, 0, [], []
 
     def _integrate_sensitivity(self, rows: Array) -> Array:
         before = np.concatenate([self.used_sensitivity[:1], rows[:-1]])
@@ -419,21 +416,6 @@ class EvenSamples:
 
     def still(self, place: int) -> Array | None:
         return self._given.still_at(self._first + place)
-
-    def corrected_extremes(self, number: int, offset: float, values: Array,
-                           state_version: int) -> tuple[float, float]:
-        """Return the highest and the lowest corrected rate at rest of a block, rad/s."""
-        known, first, highest, lowest = self._extremes
-        if known != state_version or number >= first + len(highest):
-            first, last = number, min(number + _LOOKAHEAD_BLOCKS, len(self.block_stops))
-            rows = slice(self.block_starts[first], self.block_stops[last - 1])
-            rate = self.rate[rows] + self.rest_sensitivity[rows] @ values
-            rate -= offset
-            places = np.array(self.block_starts[first:last]) - self.block_starts[first]
-            highest, lowest = (which.reduceat(rate, places).tolist()
-                               for which in (np.maximum, np.minimum))
-            self._extremes = state_version, first, highest, lowest
-        return highest[number - first], lowest[number - first]
 
     def close_epoch(self, end: int) -> None:
         """End the last epoch before a sample."""

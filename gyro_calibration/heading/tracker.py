@@ -24,8 +24,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
-from gyro_calibration.heading.gaps import GapModel, MAX_GAP, MAX_RATE, TIME_TOLERANCE
-from gyro_calibration.heading.integration import Threshold, ThresholdFilter
+from gyro_calibration.heading.integration import (
+    gap_variances,
+    Intervals,
+    MAX_GAP,
+    MAX_RATE,
+    Threshold,
+    ThresholdFilter,
+    TIME_TOLERANCE,
+)
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX,
     HeadingState,
@@ -172,9 +179,9 @@ class HeadingTracker:
         self._bias_sensitivity: Array | None = None
         self._cached_rate_error, self._cached_bias = 0.0, (0.0, 0.0)
         self._still_sensitivity: Array | None = None
-        self._gaps, self._energy = GapModel(noise), EnergyDetector(noise, settings.false_alarms)
+        self.intervals = Intervals()
+        self._energy = EnergyDetector(noise, settings.false_alarms)
         self._detector_settings = (noise, settings.false_alarms)
-        self.intervals = self._gaps.intervals
         self._initialize_state(noise, covariance, 0.0, 0.0, age)
         self.configure(settings)
 
@@ -323,8 +330,8 @@ class HeadingTracker:
                 and 0.0 <= interval <= self._settings.maximum_gap)
 
     def _take_sample(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
-                     still: Array | None, lost: int | None = None) -> str:
-        """Take a sample; `lost` is the number of lost samples before it, if known already."""
+                     still: Array | None, gap: tuple[int, float] | None = None) -> str:
+        """Take a sample; `gap` is the number of lost samples and the usual interval, if known."""
         self._still_sensitivity = still
         filtered = self._filter.apply(time, rate)
         last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
@@ -339,13 +346,16 @@ class HeadingTracker:
             return message
         self._interval, self._last_time = interval, time
         self._integrate(interval, last)
-        gap = None if lost == 0 else self._gaps.add(interval, rate, last[1], lost)
-        if gap is not None and (filtered == rate or last[2] == last[1]):
-            self._block_integral.lost_variance += gap.motion_variance
-            self._block_integral.extra_noise_variance += gap.noise_variance
+        lost, usual = gap or (self.intervals.add(interval), self.intervals.usual_interval)
+        if lost:
+            if filtered == rate or last[2] == last[1]:
+                motion, noise = gap_variances(self._state.noise, usual, lost, interval,
+                                              rate - last[1])
+                self._block_integral.lost_variance += float(motion)
+                self._block_integral.extra_noise_variance += float(noise)
+            interval -= min(lost * usual, interval)
         if self._detects_rest:
-            self._detect_motion(interval if gap is None else interval - gap.duration, last[1],
-                                wheels)
+            self._detect_motion(interval, last[1], wheels)
         elif self._block_integral.duration >= BLOCK_DURATION - TIME_TOLERANCE:
             self._open_integral += self._block_integral
             self._block_integral, self._open_variance = self._new_integral(), None
@@ -386,15 +396,16 @@ class HeadingTracker:
             count = self._count_even(time[begin:begin + _CHUNK_SAMPLES],
                                      rate[begin:begin + _CHUNK_SAMPLES])
             if count:
-                begin = self._follow_even_samples(given, begin, begin + count, found)
+                self._follow_even_samples(given, begin, begin + count, found)
             else:
                 self.add(*given.sample(begin, self.is_resting))
-                found[begin] = self._result_row()
-                begin += 1
+                found[begin] = self._result_row(self.intervals.usual_interval)
+            begin += count or 1
         return found
 
-    def _result_row(self) -> tuple[float, float, float, float, bool]:
-        return self.heading, self.variance, self.rate, self.rate_variance, self.is_resting
+    def _result_row(self, usual: float) -> tuple[float, float, float, float, bool]:
+        return (self.heading, self.variance, self.rate, self._rate_variance(usual),
+                self.is_resting)
 
     def _count_even(self, time: Array, rate: Array) -> int:
         """Return how many samples come without a jump of stamps or rates."""
@@ -408,44 +419,50 @@ class HeadingTracker:
                     & (steps <= MAX_RATE_STEP + MAX_ACCELERATION * intervals))
         return len(even) if even.all() else int(np.argmin(even))
 
-    def _follow_even_samples(self, given: Samples, begin: int, end: int, found: Array) -> int:
-        """Take samples without jumps up to the next lost ones; return the index after the last."""
+    def _follow_even_samples(self, given: Samples, begin: int, end: int, found: Array) -> None:
+        """Take samples without jumps: whole pieces between lost samples, and these singly."""
         assert self._last_sample is not None
         usual, lost = self.intervals.add_many(
             np.diff(given.time[begin:end], prepend=self._last_sample[0]))
-        count = len(usual) - bool(lost)
-        if count:
-            piece = EvenSamples(given, slice(begin, begin + count), self._last_sample,
-                                self._block.duration, self.is_resting, found[begin:begin + count])
-            self._gaps.add_many(piece.intervals, piece.rate, self._last_sample[1])
-            if not self._block.duration:
-                piece.epochs.append(self._new_epoch(-1))
-            for number, until in enumerate(piece.block_stops):
-                if number in piece.whole_blocks and self._take_block(piece, number):
-                    if self._state_version != piece.epochs[-1].state_version:
-                        piece.close_epoch(until - 1)
-                        piece.epochs.append(self._new_epoch(until - 1))
-                    elif not self.is_resting:
-                        piece.epochs[-1].open_integrals.append(
-                            (until - 1, self._with_unbiased_sensitivity(self._open_integral)))
-                    continue
-                piece.close_epoch(piece.block_starts[number])
-                for place in range(piece.block_starts[number], until):
-                    piece.last_at_rest = self.is_resting
-                    sample = given.sample(begin + place, self.is_resting)
-                    piece.used_sensitivity[place + 1] = sample[2]
-                    self._take_sample(*sample, lost=0)
-                    found[begin + place] = self._result_row()
-                if not self._block.duration:
+        for gap in [*(np.flatnonzero(lost) + begin).tolist(), end]:
+            if gap > begin:
+                self._follow_piece(given, begin, gap, usual[begin - end:][:gap - begin], found)
+            if gap < end:
+                self._take_sample(*given.sample(gap, self.is_resting),
+                                  gap=(int(lost[gap - end]), float(usual[gap - end])))
+                found[gap] = self._result_row(float(usual[gap - end]))
+            begin = gap + 1
+
+    def _follow_piece(self, given: Samples, begin: int, end: int, usual: Array,
+                      found: Array) -> None:
+        """Take samples without jumps and gaps, with the usual interval after each."""
+        assert self._last_sample is not None
+        piece = EvenSamples(given, slice(begin, end), self._last_sample, self._block.duration,
+                            self.is_resting, found[begin:end])
+        if not self._block.duration:
+            piece.epochs.append(self._new_epoch(-1))
+        for number, until in enumerate(piece.block_stops):
+            if number in piece.whole_blocks and self._take_block(piece, number):
+                if self._state_version != piece.epochs[-1].state_version:
+                    piece.close_epoch(until - 1)
                     piece.epochs.append(self._new_epoch(until - 1))
+                elif not self.is_resting:
+                    piece.epochs[-1].open_integrals.append(
+                        (until - 1, self._with_unbiased_sensitivity(self._open_integral)))
+                continue
+            piece.close_epoch(piece.block_starts[number])
+            for place in range(piece.block_starts[number], until):
+                piece.last_at_rest = self.is_resting
+                sample, known = given.sample(begin + place, self.is_resting), float(usual[place])
+                piece.used_sensitivity[place + 1] = sample[2]
+                self._take_sample(*sample, gap=(0, known))
+                found[begin + place] = self._result_row(known)
             if not self._block.duration:
-                piece.close_epoch(count)
-            piece.fill_results(usual[:count])
-            self.rate = float(piece.results[-1, 2])
-        if lost:
-            self._take_sample(*given.sample(begin + count, self.is_resting), lost=lost)
-            found[begin + count] = self._result_row()
-        return begin + len(usual)
+                piece.epochs.append(self._new_epoch(until - 1))
+        if not self._block.duration:
+            piece.close_epoch(end - begin)
+        piece.fill_results(usual)
+        self.rate = float(piece.results[-1, 2])
 
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
@@ -457,16 +474,16 @@ class HeadingTracker:
         begin, end = piece.block_starts[number], piece.block_stops[number]
         moved = piece.wheels_in_block(number)
         driven = True in moved
+        rows = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
         if self.is_resting:
-            highest, lowest = piece.corrected_extremes(
-                number, self._wander_rate, self._calibration_errors, self._state_version)
+            rates = (piece.rate[begin:end] - self._wander_rate
+                     + rows[begin:end] @ self._calibration_errors)
             limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
-            if driven or highest > limit or lowest < -limit:
+            if driven or rates.max() > limit or rates.min() < -limit:
                 return False
         elif self._recognition_left > 0.0:
             return False
         part, block, sums = self._block_integral, self._block, piece.block_sums[number]
-        rows = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
         part.duration, part.angle, decayed, *block_sums = sums
         block.rate_sum, block.square_sum, block.difference_square_sum = block_sums
         part.sensitivity = piece.sensitivity_integrals[self.is_resting][number]
@@ -775,7 +792,6 @@ class HeadingTracker:
         self._block, self._wheels_moved = Block(), False
         self._energy.clear()
         self._filter.clear()
-        self._gaps.clear()
         self._search_rest_again()
         duration = max(interval, 0.0)
         if interval > 0.0:
@@ -865,7 +881,6 @@ class HeadingTracker:
         if walk != self._state.noise.angle_random_walk:
             self._state = replace(
                 self._state, noise=replace(self._model_noise, angle_random_walk=walk))
-        self._gaps.noise = self._state.noise
         self._wander_rate = self._state.wander_rate[0]
         self._calibration_errors = self._state.calibration_errors[0]
         self._error_sensitivity = self._bias_sensitivity = None
@@ -890,8 +905,6 @@ class HeadingTracker:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
         self._energy, self._block = EnergyDetector(*self._detector_settings), Block()
         self._wheels_moved = False
-        intervals, self._gaps = self.intervals, GapModel(self._model_noise)
-        self.intervals = self._gaps.intervals = intervals
         self._filter.clear()
         self._enter_motion(WINDOW_DURATION)
         self._open_variance, self._pending_correction = None, 0.0
@@ -933,7 +946,10 @@ class HeadingTracker:
     @property
     def rate_variance(self) -> float:
         """Return the variance of the last rate, (rad/s)², by noise, bias and scale."""
-        interval = max(min(self._interval, self.intervals.usual_interval), MIN_SAMPLE_INTERVAL)
+        return self._rate_variance(self.intervals.usual_interval)
+
+    def _rate_variance(self, usual: float) -> float:
+        interval = max(min(self._interval, usual), MIN_SAMPLE_INTERVAL)
         return self.bias[1] ** 2 + self._state.noise.rate_variance(
             WINDOW_DURATION if self.is_resting else interval)
 

@@ -19,8 +19,13 @@ samples, over many drives.
 import math
 
 from faulty_heading import one
-from gyro_calibration.heading.gaps import GapModel, Intervals
-from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
+from gyro_calibration.heading.integration import (
+    BlockIntegrator,
+    gap_variances,
+    integrate,
+    Intervals,
+    Threshold,
+)
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
@@ -59,13 +64,12 @@ def lost_heading(true, comes, generator, noise=WHITE):
     """Return the heading change by lost samples, rad, and the variance stated for it, rad²."""
     time = np.arange(len(true)) * INTERVAL
     rate = true + simulate_noise(noise, len(true), INTERVAL, generator)
-    gaps, variance = GapModel(noise), 0.0
-    late, values = time[comes].tolist(), rate[comes].tolist()
-    for index in range(1, len(late)):
-        gap = gaps.add(late[index] - late[index - 1], values[index], values[index - 1])
-        variance += gap.variance if gap else 0.0
-    assert gaps.intervals.lost_samples == (~comes).sum()
-    return integrate(time[comes], rate[comes])[-1] - integrate(time, rate)[-1], variance
+    intervals = np.diff(time[comes])
+    usual, lost = Intervals().add_many(intervals)
+    assert lost.sum() == (~comes).sum()
+    of_gaps = gap_variances(noise, usual, lost, intervals, np.diff(rate[comes]))
+    return (integrate(time[comes], rate[comes])[-1] - integrate(time, rate)[-1],
+            sum(values[lost > 0].sum() for values in of_gaps))
 
 
 # how many
