@@ -26,8 +26,8 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.driver.connection import AUTO, Connection, ConnectionState
-from gyro_calibration.driver.protocols import PROTOCOLS, Settings
+from gyro_calibration.driver.connection import Connection, ConnectionState
+from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.recorder import (
     CsvRecorder,
