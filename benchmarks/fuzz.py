@@ -48,7 +48,7 @@ PACKAGE = Path(__file__).parents[1] / 'gyro_calibration'
 GIGABYTE = 1 << 30
 #: What reads the bytes of a target, in the package.
 FILES = {'decoder': ('driver/protocols/protocol.py',),
-         'listening': ('driver/protocols/listening.py',),
+         'listening': ('driver/protocols/__init__.py',),
          'sample clock': ('driver/timestamps.py',),
          'log': ('logs/log.py',), 'compressed log': ('logs/log.py',),
          'model': ('model/model_file.py', 'model/settings_file.py'),

@@ -10,6 +10,7 @@
 
 """Sphinx builds these pages with `make docs`; rosdoc2 builds the same for docs.ros.org."""
 
+import math
 from pathlib import Path
 import re
 import sys
@@ -59,6 +60,29 @@ def _split_entry(line):
             else [line])
 
 
+def describe_formats(app, docname, source):
+    """Append the numbers of each wire format, and what its module states of it, to their page."""
+    if docname != 'reference/wire_formats':
+        return
+    from gyro_calibration.driver.protocols import PROTOCOLS, Settings
+    columns = ('`protocol`', 'baud', 'samples a second', 'unit, deg/s', 'positive',
+               'full scale, deg/s', 'noise, deg/s/√Hz')
+    rows = ['## The formats', '', f'| {" | ".join(columns)} |', '|---' * len(columns) + '|']
+    for name, format_ in PROTOCOLS.items():
+        unit, noise = format_.sensitivity, format_.noise_density
+        full_scale = math.degrees(format_.effective_full_scale(Settings()))
+        angles = ' since the last sample' if format_.increments else ''
+        rows.append(
+            f'| [`{name}`](#{name}) | {format_.baud} | {format_.rate:g} | '
+            f'{f"{math.degrees(unit):.5g}{angles}" if unit else "must be set"} | '
+            f'{"clockwise, inverted" if format_.invert else "counter-clockwise"} | '
+            f'{f"{full_scale:.6g}" if unit else f"{format_.largest_count} counts"} | '
+            f'{f"{math.degrees(noise):.2g}" if noise else "not known"} |')
+    sections = [f'### {name}\n\n{format_.text.strip()}' for name, format_ in PROTOCOLS.items()]
+    source[0] += '\n\n'.join(['\n' + '\n'.join(rows), *sections, ''])
+
+
 def setup(app):
     """Describe before napoleon (priority 500) reads the sections."""
     app.connect('autodoc-process-docstring', describe_entries, priority=400)
+    app.connect('source-read', describe_formats)

@@ -37,8 +37,13 @@ import zlib
 from gyro_calibration.cli.main import _make_parser
 from gyro_calibration.cli.plan import read_limits, write_motion
 from gyro_calibration.cli.verb import UsageError
-from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.protocols.listening import recognize_protocol
+from gyro_calibration.driver.protocols import (
+    Protocol,
+    PROTOCOLS,
+    recognize_protocol,
+    Sample,
+    Settings,
+)
 from gyro_calibration.driver.protocols.protocol import LineSplitter, Splitter
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.files import MAX_MAGNITUDE

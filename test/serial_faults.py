@@ -8,10 +8,15 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Faults of a serial line: bytes lost, doubled and flipped."""
+"""Faults of a serial line: bytes lost, doubled and flipped; and settings for every format."""
 
-
+from gyro_calibration.driver.protocols import PROTOCOLS, Settings
 import numpy as np
+
+#: With what a format cannot be without: one unit of fizoptika has 27880 counts per deg/s.
+SETTINGS = {
+    name: Settings(sensitivity=np.radians(1.0 / 27880.0) if protocol.sensitivity is None else None)
+    for name, protocol in PROTOCOLS.items()}
 
 
 def damaged(data, generator, lost=0.0, doubled=0.0, flipped=0.0):

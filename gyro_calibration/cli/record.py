@@ -12,11 +12,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-import math
+import csv
+from datetime import datetime, timezone
+import gzip
+import io
 import os
 import signal
 import sys
@@ -24,36 +26,30 @@ import threading
 import time
 from typing import Any
 
+from gyro_calibration import __version__
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.driver.connection import AUTO, Connection, ConnectionState
-from gyro_calibration.driver.protocols import PROTOCOLS, Settings
+from gyro_calibration.driver.connection import Connection, ConnectionState
+from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.recorder import (
-    CsvRecorder,
-    DiskFull,
-    FILE_SUFFIXES,
-    McapRecorder,
-    NotesCallback,
-    recording_notes,
-    WRITE_INTERVAL,
-)
-from gyro_calibration.driver.timestamps import ClockStepDetector, read_steady_clock
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
+from gyro_calibration.driver.timestamps import read_steady_clock
 from gyro_calibration.files import InputError, to_printable
 from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.logs.log import DataRefused, LogError, write_log
 from gyro_calibration.logs.recording import read_recording, topic_type_fault, Topics
-from gyro_calibration.logs.ros_bag import Message
+from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message, METADATA_NAME
 from tqdm import tqdm
 
-_Recorder = CsvRecorder | McapRecorder
-
+_FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
 _MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
+_WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
+_HEADER_WAIT = 1.5  # s; for which the header of a log waits for values that come once a second
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -61,7 +57,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                            'record a gyro, from its port or from topics, until Ctrl-C',
                            '--port /dev/ttyUSB0 --out drive.csv')
     parser.add_argument('--out', required=True, metavar='FILE',
-                        help=f'a new file, {", ".join(FILE_SUFFIXES)}')
+                        help=f'a new file, {", ".join(_FILE_SUFFIXES)}')
     parser.add_argument('--seconds', type=verb.positive_number, metavar='N',
                         help='duration, s; default: until interrupted')
     topics = parser.add_argument_group('from topics, with ROS 2')
@@ -96,13 +92,15 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _record(given: argparse.Namespace) -> Answer:
-    if not given.out.endswith(FILE_SUFFIXES):
+    if not given.out.endswith(_FILE_SUFFIXES):
         raise UsageError(f'{given.out} is no recording file; give a name that ends in '
-                         f'{", ".join(FILE_SUFFIXES[:-1])} or {FILE_SUFFIXES[-1]}')
+                         f'{", ".join(_FILE_SUFFIXES[:-1])} or {_FILE_SUFFIXES[-1]}')
+    if os.path.exists(given.out):
+        raise UsageError(f'{given.out}: exists already, and recordings are never overwritten; '
+                         'give a new name')
     with _stop_event(given.seconds) as stop:
         session = (_PortSession if given.port else _TopicSession)(given, stop)
-        session.run()
-    return session.answer()
+        return session.run()
 
 
 @contextmanager
@@ -115,10 +113,9 @@ def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
 
     """
     stop = threading.Event()
-    numbers = [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-               if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
     previous_handlers = {number: signal.signal(number, lambda *_: stop.set())
-                         for number in numbers}
+                         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+                         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN}
     timer = threading.Timer(seconds or 0.0, stop.set)
     timer.daemon = True
     if seconds:
@@ -131,96 +128,237 @@ def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-@contextmanager
-def _redirect_stdout() -> Iterator[None]:
-    """Redirect prints of the ROS 2 middleware to standard error; standard output is the answer."""
-    sys.stdout.flush()
-    stdout_copy = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        yield
-    finally:
-        os.dup2(stdout_copy, 1)
-        os.close(stdout_copy)
+# Files
 
 
-def _create_recorder(path: str, notes: NotesCallback) -> _Recorder:
-    try:
-        return (McapRecorder if path.endswith('.mcap') else CsvRecorder)(path, notes)
-    except FileExistsError:
-        raise UsageError(f'{path}: exists already, and recordings are never overwritten; '
-                         'give a new name') from None
+class DiskFull(OSError):
+    """Nothing more can be written; the written pieces remain."""
 
 
-class _Session(ABC):
-    """The common part of recordings from port and topics: file, pieces, progress, answer."""
+class _Recorder:
+    """
+    A new file that grows by complete pieces, and is removed at the end if it has none.
 
-    #: The remedy where no sample was received.
+    `size` is that of the complete pieces, bytes; `is_full` tells that one could not be written.
+
+    """
+
+    def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
+        """Create the file; `notes` is called with the first piece, when all are known."""
+        self.path, self.size, self.is_full, self._notes = path, 0, False, notes
+        self._file = io.FileIO(path, 'xb')
+
+    def append(self, piece: bytes) -> None:
+        """Write a piece; on an error truncate the file to the pieces before, raise `DiskFull`."""
+        left = memoryview(piece)
+        try:
+            while left:
+                left = left[self._file.write(left):]
+        except OSError as error:
+            self.is_full = True
+            self._file.truncate(self.size)
+            self._file.seek(self.size)
+            raise DiskFull(error.errno,
+                           f'{self.path}: writing has failed ({error.strerror})') from error
+        self.size += len(piece)
+
+    def flush(self, is_due: bool = False) -> None:
+        """Write what was added as a piece; a silence or the end makes it due."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Write the last piece."""
+        self.flush(is_due=True)
+
+    def close(self) -> None:
+        """Finish and close the file; nothing is written after a piece that failed."""
+        try:
+            if not self.is_full:
+                self.finish()
+        finally:
+            self._file.close()
+            if not self.size:
+                os.unlink(self.path)
+
+
+class McapRecorder(_Recorder):
+    """Messages in an MCAP file; `variance` is that of the rate of a sample, (rad/s)²."""
+
+    def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
+        super().__init__(path, notes)
+        self._writer, self.variance = McapWriter(), ASSUMED_NOISE ** 2
+
+    def add_sample(self, stamp: int, sample: Sample) -> None:
+        """Add a sample as messages on the topics of the driver; the stamp is in ns."""
+        force, temperature = sample.specific_force, sample.temperature
+        of_force = (cdr.NOT_REPORTED_COVARIANCE
+                    if force is None else cdr.z_axis_covariance(ASSUMED_FORCE_NOISE ** 2))
+        messages = [] if temperature is None else [
+            ('/imu/temperature', cdr.TEMPERATURE, [temperature, 0.0])]
+        messages.append(
+            ('/imu/data_raw', cdr.IMU,
+             [0.0, 0.0, 0.0, 1.0, *cdr.NOT_REPORTED_COVARIANCE, 0.0, 0.0, sample.output,
+              *cdr.z_axis_covariance(self.variance), 0.0, 0.0, force or 0.0, *of_force]))
+        for topic, kind, numbers in messages:
+            data = cdr.serialize(stamp, 'gyro', numbers)
+            self.add_message(Message(topic, kind, stamp, data), cdr.DEFINITIONS[kind])
+
+    def add_message(self, message: Message, definition: str) -> None:
+        """Add a message with the definition of its kind, as text."""
+        self._writer.add(message.topic, message.kind, definition, message.received, message.data)
+
+    def flush(self, is_due: bool = False) -> None:
+        """Write the messages so far as a chunk."""
+        if self._writer.pending_bytes:
+            head = b'' if self.size else self._writer.pack_header(
+                f'gyro_calibration {__version__}', METADATA_NAME, self._notes())
+            self.append(head + self._writer.pack_chunk())
+
+    def finish(self) -> None:
+        """Write the last chunk and the index."""
+        self.flush()
+        if self.size:
+            self.append(self._writer.pack_summary())
+
+    def close(self) -> None:
+        """Close the file, on a full disk with an end that readers understand."""
+        if self.is_full and self.size:
+            with suppress(DiskFull):  # a reader then takes the file for truncated
+                self.append(MCAP_END)
+        super().close()
+
+
+class CsvRecorder(_Recorder):
+    """
+    Samples as rows of the log format.
+
+    The columns are fixed with the first piece. Values that come less often than samples, such as
+    the temperature, are repeated until the next one. `late_columns` are those that came after the
+    first piece, and are not in the file.
+
+    """
+
+    def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
+        super().__init__(path, notes)
+        self._rows: list[tuple[int, dict[str, float]]] = []
+        self._held_values: dict[str, float] = {}
+        self._columns: list[str] = []
+        self._start_stamp = 0
+        self.late_columns: set[str] = set()
+
+    def add_sample(self, stamp: int, sample: Sample) -> None:
+        """Add a sample; the stamp is in ns."""
+        values = {'temperature_degc': sample.temperature,
+                  'acceleration_mps2': sample.specific_force, **sample.health}
+        self._held_values |= {name: value for name, value in values.items() if value is not None}
+        if self._columns:
+            self.late_columns |= set(self._held_values) - set(self._columns)
+        self._rows.append((stamp, {'gyro_rad_s': sample.output, **self._held_values}))
+
+    def flush(self, is_due: bool = False) -> None:
+        """Write the rows so far; the first ones after some seconds, when the columns are known."""
+        if not self._rows or not (self._columns or is_due or self._rows[-1][0]
+                                  - self._rows[0][0] > _HEADER_WAIT * NSEC_PER_SEC):
+            return
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator='\n')
+        if not self._columns:
+            # the first value of each column applies from the beginning
+            first: dict[str, float] = {}
+            for _, values in reversed(self._rows):
+                first |= values
+            self._rows = [(stamp, {**first, **values}) for stamp, values in self._rows]
+            self._columns, self._start_stamp = list(first), self._rows[0][0]
+            seconds, nanoseconds = divmod(self._start_stamp, NSEC_PER_SEC)
+            notes = {**self._notes(), 'time_s counts from': f'{seconds}.{nanoseconds:09d} s'}
+            for name, note in notes.items():
+                text.write(f'# {name}: {" ".join(note.split())}\n')
+            writer.writerow(['time_s', *self._columns])
+        for stamp, values in self._rows:
+            writer.writerow([repr((stamp - self._start_stamp) / NSEC_PER_SEC),
+                             *(repr(values[name]) for name in self._columns)])
+        data = text.getvalue().encode()
+        self.append(gzip.compress(data, mtime=0) if self.path.endswith('.gz') else data)
+        self._rows.clear()
+
+
+def recording_notes(**details: object) -> dict[str, str]:
+    """Return the notes of a recording: program, date, and details except empty ones."""
+    known = {name.replace('_', ' '): str(value)
+             for name, value in details.items() if value not in (None, '')}
+    date = datetime.now(timezone.utc).isoformat(timespec='seconds')
+    return {'recorded by': f'gyro_calibration {__version__}', 'date': date, **known}
+
+
+# Sources
+
+
+class _Session:
+    """
+    The common part of recordings from port and topics: pieces, progress, answer.
+
+    `samples` and `lost` count what came of the gyro; `remedy` is that where nothing came.
+
+    """
+
     remedy = ''
 
-    def __init__(self, given: argparse.Namespace, stop: threading.Event, path: str,
-                 notes: NotesCallback):
-        self._given, self._stop, self._path = given, stop, path
+    def __init__(self, given: argparse.Namespace, stop: threading.Event,
+                 recorder: CsvRecorder | McapRecorder):
+        self._given, self._stop, self._recorder = given, stop, recorder
         self._start_time = self._last_flush = time.monotonic()
-        self._disk_full: DiskFull | None = None
-        self._recorder = _create_recorder(path, notes)
 
-    @abstractmethod
-    def counts(self) -> tuple[int, int]:
-        """Return how many samples were received from the gyro, and how many are known as lost."""
-
-    @abstractmethod
-    def _record_until_stopped(self, tick: Callable[[], None]) -> None:
-        """Record; call `tick` after each chunk."""
-
-    def run(self) -> None:
-        """Record until the end, and close the file also after an error."""
+    def run(self) -> Answer:
+        """Record until the end, close the file also after an error, and return the answer."""
+        recorder = self._recorder
         try:
             with tqdm(desc=to_printable(self._given.out), unit=' samples', leave=False,
                       disable=None) as bar:
                 try:
-                    self._record_until_stopped(lambda: self._flush_if_due(bar))
+                    self._record_until_stopped(bar)
                 finally:
-                    self._recorder.close()
+                    recorder.close()
         except DiskFull as error:
-            self._disk_full = error
-
-    def _flush_if_due(self, bar: Any) -> None:
-        if time.monotonic() - self._last_flush < WRITE_INTERVAL:
-            return
-        self._recorder.flush()
-        self._last_flush = time.monotonic()
-        samples, lost = self.counts()
-        bar.set_postfix_str(f'{lost} lost', refresh=False)
-        bar.update(samples - bar.n)
-
-    def answer(self) -> Answer:
-        """Return what was recorded."""
-        (samples, lost), seconds = self.counts(), time.monotonic() - self._start_time
-        if self._disk_full is not None:
-            size = self._recorder.file.size
-            written = (f'{size} bytes remain in {self._path}, which is complete but for the last '
-                       f'{WRITE_INTERVAL:g} s' if size else 'nothing was written')
-            raise DataRefused(f'{self._disk_full.strerror}; {written}: make room, then record '
-                              'again')
+            written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but '
+                       f'for the last {_WRITE_INTERVAL:g} s' if recorder.size
+                       else 'nothing was written')
+            raise DataRefused(f'{error.strerror}; {written}: make room, then record '
+                              'again') from None
+        (samples, lost), seconds = self._counts(), time.monotonic() - self._start_time
         if not samples:
+            with suppress(FileNotFoundError):  # other messages may have come
+                os.unlink(recorder.path)
             raise DataRefused(f'no sample was received in {seconds:.1f} '
                               f's{self._describe_failure()}; no file was written: {self.remedy}')
-        remarks = self._remarks()
-        data = {'out': self._given.out, 'samples': samples, 'lost': lost, 'seconds': seconds,
-                'bytes': os.path.getsize(self._given.out), **self._answer_data()}
-        lines = [f'{samples} samples in {seconds:.1f} s, {lost} lost, '
-                 f'written to {self._given.out}.', *remarks]
-        return Answer(lines, {**data, 'remarks': remarks})
+        data, remarks = self._conclude()
+        out = self._given.out
+        return Answer([f'{samples} samples in {seconds:.1f} s, {lost} lost, written to {out}.',
+                       *remarks],
+                      {'out': out, 'samples': samples, 'lost': lost, 'seconds': seconds,
+                       'bytes': os.path.getsize(out), **data, 'remarks': remarks})
+
+    def _flush_if_due(self, bar: Any) -> None:
+        if time.monotonic() - self._last_flush >= _WRITE_INTERVAL:
+            self._recorder.flush()
+            self._last_flush = time.monotonic()
+            samples, lost = self._counts()
+            bar.set_postfix_str(f'{lost} lost', refresh=False)
+            bar.update(samples - bar.n)
+
+    def _counts(self) -> tuple[int, int]:
+        """Return how many samples were received from the gyro, and how many are known as lost."""
+        raise NotImplementedError
+
+    def _record_until_stopped(self, bar: Any) -> None:
+        """Record; call `_flush_if_due` after each chunk."""
+        raise NotImplementedError
+
+    def _conclude(self) -> tuple[dict[str, Any], list[str]]:
+        """Return further data and remarks of the answer."""
+        raise NotImplementedError
 
     def _describe_failure(self) -> str:
         return ''
-
-    @abstractmethod
-    def _answer_data(self) -> dict[str, Any]: ...
-
-    @abstractmethod
-    def _remarks(self) -> list[str]: ...
 
 
 class _PortSession(_Session):
@@ -246,19 +384,17 @@ class _PortSession(_Session):
         except ValueError as error:
             raise UsageError(str(error)) from None
         self._last_message = ''
-        # Constant, so that the stamps do not jump when the clock is set.
-        self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
-        super().__init__(given, stop, given.out, self._file_notes)
+        kind = McapRecorder if given.out.endswith('.mcap') else CsvRecorder
+        super().__init__(given, stop, kind(given.out, self._file_notes))
 
-    def counts(self) -> tuple[int, int]:
+    def _counts(self) -> tuple[int, int]:
         counts = self._connection.counts()
         return counts.samples, counts.lost_samples
 
     def _file_notes(self) -> dict[str, str]:
         """Return the notes; columns in rad/s or deg/s have the unit in the name, not here."""
         found, settings, scale = self._connection, self._settings, dict[str, str]()
-        protocol = found.protocol
-        if protocol:
+        if protocol := found.protocol:
             factor = protocol.unit_scale(settings)
             angles = (f', an angle at {protocol.nominal_rate(settings):g} Hz'
                       if protocol.sends_angles(settings) else '')
@@ -269,21 +405,21 @@ class _PortSession(_Session):
             port=self._given.port, device=found.path, protocol=protocol and protocol.name,
             baud=found.baud, axis=settings.axis, **scale)
 
-    def _record_until_stopped(self, tick: Callable[[], None]) -> None:
+    def _record_until_stopped(self, bar: Any) -> None:
+        # a constant, so that the stamps do not jump when the clock is set
+        offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         for chunk in self._connection.chunks(self._stop):
-            protocol = self._connection.protocol
-            if protocol and isinstance(self._recorder, McapRecorder):
-                self._recorder.variance = protocol.sample_variance(self._settings)
+            if self._connection.protocol and isinstance(self._recorder, McapRecorder):
+                self._recorder.variance = self._connection.protocol.sample_variance(self._settings)
             for sample, stamp in zip(chunk.samples, chunk.stamps, strict=True):
-                self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + self._clock_offset, sample)
-            tick()
+                self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + offset, sample)
+            self._flush_if_due(bar)
 
     def _report_state(self, state: ConnectionState) -> None:
         if state.name == 'failed':
-            self._recorder.flush()  # without samples no piece is written
+            self._recorder.flush(is_due=True)  # without samples no piece is written
         message, found = state.problem or state.name, self._connection
-        if (state.name == 'opening' or message == self._last_message
-                or state.name == 'listening' and self._last_message):
+        if message == self._last_message or state.name == 'listening' and self._last_message:
             return  # it listens again at each attempt
         self._last_message = message
         if state.name == 'reading' and found.protocol:
@@ -293,23 +429,20 @@ class _PortSession(_Session):
     def _describe_failure(self) -> str:
         return f' ({self._connection.last_error})' if self._connection.last_error else ''
 
-    def _answer_data(self) -> dict[str, Any]:
-        found = self._connection
-        return {'protocol': found.protocol and found.protocol.name, 'baud': found.baud,
-                'openings': found.open_count}
-
-    def _remarks(self) -> list[str]:
+    def _conclude(self) -> tuple[dict[str, Any], list[str]]:
         found, recorder = self._connection, self._recorder
         remarks = [f'{count} {name.replace("_", " ")}.'
                    for name, count in vars(found.counts()).items()
                    if name not in ('samples', 'lost_samples') and count]
-        if found.protocol and found.clock and found.clock.is_settled:
-            warning = found.protocol.sample_rate_warning(self._settings, found.clock.period)
-            remarks += [f'{warning}.'] if warning else []
+        if (found.protocol and found.clock and found.clock.is_settled and (
+                warning := found.protocol.sample_rate_warning(self._settings,
+                                                              found.clock.period))):
+            remarks.append(f'{warning}.')
         if isinstance(recorder, CsvRecorder) and recorder.late_columns:
             remarks.append(f'{", ".join(sorted(recorder.late_columns))} began after the header '
                            'of the log was written, and is not in it; record into .mcap instead.')
-        return remarks
+        return {'protocol': found.protocol and found.protocol.name, 'baud': found.baud,
+                'openings': found.open_count}, remarks
 
 
 class _TopicSession(_Session):
@@ -334,83 +467,53 @@ class _TopicSession(_Session):
             raise UsageError(f'topics need ROS 2, which is not available ({error}); '
                              'source it, or record from --port') from None
         self._take_messages = take_messages
-        roles = {'gyro': given.topic or _DEFAULT_TOPICS['gyro'],
+        names = {'gyro': given.topic or _DEFAULT_TOPICS['gyro'],
                  'temperature': given.temperature_topic or _DEFAULT_TOPICS['temperature'],
                  **dict(zip(('reference',), given.reference_topic))}
-        roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
-        self._roles = {topic: role for role, topic in roles.items()}
-        if len(self._roles) < len(roles):
-            raise UsageError(f'one topic was named twice, of {", ".join(roles.values())}; '
-                             f'name one each for {", ".join(roles)}')
+        self._roles = {'/' + topic.lstrip('/'): role for role, topic in names.items()}
+        if len(self._roles) < len(names):
+            raise UsageError(f'one topic was named twice, of {", ".join(names.values())}; '
+                             f'name one each for {", ".join(names)}')
         self._topics = [*self._roles, *given.reference_topic[1:]]
-        self._messages, self._samples, self._damaged_messages, self._is_waiting = 0, 0, 0, True
-        self._received: set[str] = set()
-        self._mismatched_topics: dict[str, str] = {}
+        self._messages, self._samples, self._is_waiting = 0, 0, True
+        self._received: set[str] = set()  # topics
         self._unknown_topics: dict[str, str] = {}
-        self._last_stamp, self._intervals = 0, Intervals()
-        # s; a message may be late, and a recording be played faster
-        self._clock_steps = ClockStepDetector(max_ahead=10.0, max_behind=math.inf,
-                                              max_backward=1.0)
+        self._previous, self._intervals = (0, 0), Intervals()
+        super().__init__(given, stop, McapRecorder(
+            given.out if self._is_mcap else f'{given.out}.mcap',
+            lambda: recording_notes(
+                topics='everything' if given.all else ', '.join(self._topics))))
 
-        def notes() -> dict[str, str]:
-            return recording_notes(topics='everything' if given.all else ', '.join(self._topics))
-
-        if not self._is_mcap:
-            _create_recorder(given.out, notes)  # fails now where the log cannot be written
-        super().__init__(given, stop, given.out if self._is_mcap else f'{given.out}.mcap', notes)
-
-    def counts(self) -> tuple[int, int]:
+    def _counts(self) -> tuple[int, int]:
         samples = self._samples or (self._messages if self._is_mcap else 0)
         return samples, self._intervals.lost_samples
 
-    def run(self) -> None:
-        """Record, and write the log; the recording is kept where that fails."""
-        super().run()
-        if self._is_mcap or self._disk_full:
-            return
-        if self._samples:
-            topics = {self._roles[topic]: topic for topic in self._received}
-            try:
-                if os.path.exists(self._given.out):
-                    raise LogError(f'{self._given.out}: another program has created it meanwhile')
-                write_log(self._given.out, read_recording(self._path, Topics(**topics)))
-            except (InputError, OSError) as error:
-                raise DataRefused(f'{error}; what was recorded is in {self._path}') from None
-        with suppress(FileNotFoundError):
-            os.unlink(self._path)
-
-    def _record_until_stopped(self, tick: Callable[[], None]) -> None:
+    def _record_until_stopped(self, bar: Any) -> None:
         with _redirect_stdout():
             self._take_messages(self._topics, self._given.all, self._add_message,
-                                lambda node: self._check_publishers(node, tick), self._stop)
+                                lambda node: self._tick(node, bar), self._stop)
 
     def _add_message(self, message: Message, definition: str) -> None:
         assert isinstance(self._recorder, McapRecorder)
         role = self._roles.get(message.topic)
-        wrong = topic_type_fault(role, message.topic, message.kind) if role else ''
-        if wrong and not self._is_mcap:
+        if role and (wrong := topic_type_fault(role, message.topic, message.kind)):
             raise LogError(wrong)
         self._messages += 1
         self._recorder.add_message(message, definition)
-        if wrong:
-            self._mismatched_topics[message.topic] = wrong
-        elif role:
+        if role:
             self._received.add(message.topic)
-            try:
+        if role == 'gyro':
+            with suppress(cdr.MessageError):
                 stamp = cdr.parse(message.data, cdr.LAYOUTS[message.kind])[0] or message.received
-            except cdr.MessageError:
-                self._damaged_messages += 1
-                return
-            if role == 'gyro':
                 self._samples += 1
-                was_set = self._clock_steps.update(
-                    message.received / NSEC_PER_SEC, stamp / NSEC_PER_SEC)
-                if self._last_stamp and not was_set and stamp > self._last_stamp:
-                    self._intervals.add((stamp - self._last_stamp) / NSEC_PER_SEC)
-                self._last_stamp = stamp
+                interval = stamp - self._previous[0]
+                # else the clock of the stamps was set; a recording may be played faster
+                if 0 < interval < message.received - self._previous[1] + 10 * NSEC_PER_SEC:
+                    self._intervals.add(interval / NSEC_PER_SEC)
+                self._previous = stamp, message.received
 
-    def _check_publishers(self, node: Any, tick: Callable[[], None]) -> None:
-        tick()
+    def _tick(self, node: Any, bar: Any) -> None:
+        self._flush_if_due(bar)
         self._unknown_topics = node.unknown_topics
         if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
             self._is_waiting = False
@@ -418,16 +521,31 @@ class _TopicSession(_Session):
                 verb.print_message(f'no publisher so far of {", ".join(missing)}; '
                                    f'there are {", ".join(node.known_topics()) or "none"}')
 
-    def _answer_data(self) -> dict[str, Any]:
-        return {'messages': self._messages}
+    def _conclude(self) -> tuple[dict[str, Any], list[str]]:
+        """Write the log; the recording is kept where that fails."""
+        recording, out = self._recorder.path, self._given.out
+        if not self._is_mcap:
+            topics = {self._roles[topic]: topic for topic in self._received}
+            try:
+                if os.path.exists(out):
+                    raise LogError(f'{out}: another program has created it meanwhile')
+                write_log(out, read_recording(recording, Topics(**topics)))
+            except (InputError, OSError) as error:
+                raise DataRefused(f'{error}; what was recorded is in {recording}') from None
+            os.unlink(recording)
+        return {'messages': self._messages}, [
+            f'{topic}: {reason}; it was not recorded.'
+            for topic, reason in self._unknown_topics.items()]
 
-    def _remarks(self) -> list[str]:
-        remarks = [f'{topic}: {reason}; it was not recorded.'
-                   for topic, reason in self._unknown_topics.items()]
-        remarks += [f'{wrong}; it was recorded as it is.'
-                    for wrong in self._mismatched_topics.values()]
-        if self._damaged_messages:
-            remarks.append(f'{self._damaged_messages} messages could not be read.')
-        if self._clock_steps.count:
-            remarks.append(f'The clock of the stamps was set {self._clock_steps.count} times.')
-        return remarks
+
+@contextmanager
+def _redirect_stdout() -> Iterator[None]:
+    """Redirect prints of the ROS 2 middleware to standard error; standard output is the answer."""
+    sys.stdout.flush()
+    stdout_copy = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)

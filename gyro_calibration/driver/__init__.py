@@ -11,7 +11,6 @@
 """
 From bytes on a serial port to stamped samples, with recovery from faults of the port.
 
-Reading order: `protocols` (wire formats), `timestamps`, `connection`, `recorder`,
-`emulator`.
+Reading order: `protocols` (wire formats), `timestamps`, `connection`, `emulator`.
 
 """

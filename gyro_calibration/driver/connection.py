@@ -31,8 +31,17 @@ import termios
 import threading
 from typing import NamedTuple, TypeVar
 
-from gyro_calibration.driver.protocols import Decoder, find_protocol, Protocol, Sample, Settings
-from gyro_calibration.driver.protocols.listening import BAUDS, Recognition, recognize_protocol
+from gyro_calibration.driver.protocols import (
+    AUTO,
+    BAUDS,
+    Decoder,
+    find_protocol,
+    Protocol,
+    Recognition,
+    recognize_protocol,
+    Sample,
+    Settings,
+)
 from gyro_calibration.driver.timestamps import read_steady_clock, SampleClock
 import serial
 
@@ -133,9 +142,6 @@ def _describe_error(error: BaseException) -> str:
     return f'{error}: set another port or baud'
 
 
-#: Name of the protocol that stands for recognition by listening.
-AUTO = 'auto'
-
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
 _SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
 _REOPEN_DELAYS = (0.1, 5.0)  # s; first and longest delay before a lost port is opened again
@@ -143,7 +149,6 @@ _RESTART_DURATION = 5.0  # s; longest silence of a board that restarts when its 
 _REQUEST_INTERVAL = 0.8  # s; of requests to send: a gyro that starts does not receive them
 _LISTENING_DURATION = 1.0  # s; listening time, in which a gyro of 10 Hz sends enough
 _RECOGNITION_INTERVAL = 0.1  # s; interval of attempts to recognize the protocol
-_MAX_RECOGNITION_BYTES = 16384  # last bytes that are used to recognize the protocol
 
 
 @dataclass(frozen=True)
@@ -345,7 +350,7 @@ class Connection:
         """Return the result of the recognition within 1 s after the first byte."""
         data, opened, end, due = b'', self._read_clock(), math.inf, 0.0
         while not stop.is_set():
-            data = (data + port.read())[-_MAX_RECOGNITION_BYTES:]
+            data += port.read()
             now = self._read_clock()
             if not data and now - opened > _SILENCE_TIMEOUT:
                 self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), deadline)

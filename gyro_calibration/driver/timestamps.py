@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 import math
 from statistics import median
@@ -45,14 +44,11 @@ _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a 
 _WINDOW_BLOCKS = 64  # number of blocks in the window
 _SETTLING_DURATION = 2.0  # s; least span of a line before its period shows lost samples
 _SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line
-_MIN_LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
-_LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
-_MIN_LATE_ARRIVALS = 3  # least number of late arrivals that prove a loss
+_LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
 _JITTER_DURATION = 10.0  # s; averaging time of the jitter
-_MAX_CLOCK_DRIFT = 2e-5  # largest increase of the device clock rate while counts are uncertain, 1
 _MIN_LATENESS = 0.5e-3  # s; that proves a loss: the host may wake up later than before
 _OUTLIER_LATENESS = 0.02  # s; largest lateness with a correct sequence, above the 16 ms of a burst
-_MAX_ODD_ADVANCES = 8  # in a row, which show that the mean advance is wrong
+_MEDIAN_SIZE = 8  # number of intervals of a device whose median is the usual one
 _MAX_TIME_JUMP = 3.0  # s; largest continuous step of the time of a device
 _CLOCK_STEP_THRESHOLD = 0.1  # s; largest difference of a clock that is slewed, not set
 _MIXED_STAMPS_DURATION = 10.0  # s; for which older stamps may arrive after a clock was set
@@ -134,7 +130,7 @@ def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
 
 class _SampleCounter:
     """
-    Numbers samples in nominal periods; the mean advance is `mean_advance`.
+    Numbers samples in nominal periods; the usual advance is `mean_advance`.
 
     By the sequence of the device, by its time, or by counting. The number may be wrong by a
     multiple of `ambiguity` samples; `ambiguity` is 0 where the device gives its time.
@@ -142,47 +138,41 @@ class _SampleCounter:
     """
 
     def __init__(self, rate: float, modulus: int):
-        self._rate, self.modulus = rate, modulus
+        self._rate, self._modulus = rate, modulus
         self.reset()
 
     def reset(self) -> None:
-        self.mean_advance, self.ambiguity, self._unevenness, self._is_sequence_frozen = (
-            1.0, 1, 0.0, False)
-        self._odd_advances = list[tuple[float, int]]()
+        self.mean_advance, self.ambiguity = 1.0, 1
+        self._advances = deque[float](maxlen=_MEDIAN_SIZE)
         self._sequence: int | None = None
         self._time: float | None = None
         self._outlier_time: float | None = None
 
-    def advance(self, sample: Sample, max_advance: float = math.inf,
-                may_wrap: bool = False) -> tuple[float, int]:
+    def advance(self, sample: Sample, max_advance: float) -> tuple[float, int]:
         """
         Return the advance to this sample, and the number of samples lost before it.
 
-        A time of the device beyond `max_advance` is wrong: the sample came too early. A repeated
-        sequence is frozen, unless a whole cycle of it fits into the time.
+        A time of the device beyond `max_advance` is wrong: the sample came too early.
 
         """
-        if self.modulus and sample.sequence is not None:
-            return self._advance_by_sequence(sample.sequence, sample.missing, may_wrap)
+        missing = sample.missing
+        if self._modulus and sample.sequence is not None:
+            last, self._sequence = self._sequence, sample.sequence
+            self.ambiguity = self._modulus
+            if last is None:
+                return 1, 0
+            if sample.sequence == last:  # it stands still
+                self.ambiguity = 1
+                return 1 + missing, missing
+            advance = (sample.sequence - last) % self._modulus
+            # The number of missing samples by damaged bytes gives the number of wraps.
+            advance += self._modulus * max(0, round((1 + missing - advance) / self._modulus))
+            return advance, advance - 1
         if sample.time is not None:
-            return self._advance_by_time(sample.time, sample.missing, max_advance)
-        advance = self.mean_advance * (1 + sample.missing)
-        self._time = None if self._time is None else self._time + advance / self._rate
-        return advance, sample.missing
-
-    def _advance_by_sequence(self, sequence: int, missing: int, may_wrap: bool) -> tuple[int, int]:
-        last, self._sequence, was_frozen = self._sequence, sequence, self._is_sequence_frozen
-        self._is_sequence_frozen = sequence == last and (was_frozen or not may_wrap)
-        self.ambiguity = 1 if self._is_sequence_frozen else self.modulus
-        if last is None:
-            return 1, 0
-        # after it was frozen, it counts from the next sample on
-        if self._is_sequence_frozen or was_frozen:
-            return 1 + missing, missing
-        advance = (sequence - last) % self.modulus or self.modulus
-        # The number of missing samples by damaged bytes gives the number of wraps.
-        advance += self.modulus * max(0, round((1 + missing - advance) / self.modulus))
-        return advance, advance - 1
+            return self._advance_by_time(sample.time, missing, max_advance)
+        usual = self.mean_advance * (1 + missing)
+        self._time = None if self._time is None else self._time + usual / self._rate
+        return usual, missing
 
     def _advance_by_time(self, time: float, missing: int, max_advance: float) -> tuple[float, int]:
         self.ambiguity = 0
@@ -196,87 +186,37 @@ class _SampleCounter:
             return advance, missing
         self._time, self._outlier_time = time, None
         advance = elapsed * self._rate
-        lost = self._count_lost(advance)
-        if lost >= 0:  # damaged bytes show losses that coarse times do not
-            lost = max(lost, min(missing, round(advance / self.mean_advance) - 1))
-        return advance, lost
-
-    def _count_lost(self, advance: float) -> int:
-        if self._unevenness == 0.0:
-            self.mean_advance, self._unevenness = advance, 0.01
-            return 0
-        steps = advance / self.mean_advance
-        # Times with a resolution near the period do not show single samples.
-        lost = round(steps) - 1 if steps > (1.5 if self._unevenness < 0.15 else 2.5) else 0
-        if 0.3 <= steps <= 2.5:
-            self._odd_advances.clear()
-            self.mean_advance += 0.05 * (advance - self.mean_advance)
-            self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
-            return lost
-        self._odd_advances.append((advance, lost))
-        if len(self._odd_advances) < _MAX_ODD_ADVANCES:
-            return lost
-        # the mean advance is wrong, and so are the losses that it showed
-        advances, losses = zip(*self._odd_advances, strict=True)
-        self._odd_advances.clear()
-        self.mean_advance = median(advances)
-        return lost - sum(losses)
+        self._advances.append(advance)
+        self.mean_advance = median(self._advances)
+        is_known = len(self._advances) == _MEDIAN_SIZE
+        return advance, max(0, round(advance / self.mean_advance) - 1) if is_known else 0
 
 
 class _LatenessTest:
-    """
-    Test whether samples have been late for so long that some must be lost.
-
-    Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly to a
-    period and falls to zero. So the step of the least lateness is tested; the lateness itself is
-    tested only after a longer time.
-
-    """
+    """Test whether samples have been late for so long that some must be lost."""
 
     def __init__(self) -> None:
-        self._last_on_time = math.inf  # time of the last arrival that was not late
-        # least lateness of arrivals that were not late, since the start of a window
-        self._least_on_time, self._window_start = math.inf, -math.inf
-        self.reset()
-
-    def reset(self) -> None:
         self.late_since: float | None = None
-        self.late_step, self._least = 0.0, math.inf
-        self._count, self._first_number, self._last_arrival = 0, 0.0, 0.0
+        self.least = math.inf
+        self._first_number = self._last_arrival = 0.0
 
     def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
                        period: float) -> bool:
-        """
-        Add an arrival; tell whether all have been late beyond the bound for long enough.
-
-        They are late by `late_step`, since `late_since`.
-
-        """
+        """Add an arrival; tell whether all since `late_since` have been late, by `least`, s."""
         if lateness <= bound:
-            self.reset()
-            self._last_on_time = arrival
-            if arrival - self._window_start > _LONG_LATE_DURATION:
-                self._window_start, self._least_on_time = arrival, math.inf
-            self._least_on_time = min(self._least_on_time, lateness)
+            self.late_since = None
             return False
+        silence, self._last_arrival = arrival - self._last_arrival, arrival
         # Lateness before a silence does not show losses in the silence.
-        if (self.late_since is None
-                or arrival - self._last_arrival > max(0.5 * _MIN_LATE_DURATION, 3.0 * period)):
-            self.late_since, self._first_number, self._count, self._least = (
-                arrival, number, 0, math.inf)
-        self._least, self._last_arrival = min(self._least, lateness), arrival
-        self._count += 1
-        lasts = arrival - self.late_since
-        before = 0.0 if lasts > _LONG_LATE_DURATION else max(0.0, self._least_on_time)
-        self.late_step = self._least - before
-        return (lasts >= _MIN_LATE_DURATION and self._count >= _MIN_LATE_ARRIVALS
-                and self.late_step > bound)
+        if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
+            self.late_since, self._first_number, self.least = arrival, number, math.inf
+        self.least = min(self.least, lateness)
+        return arrival - self.late_since >= max(_LATE_DURATION, 3.0 * period)
 
-    def is_loss_excluded(self, number: float, arrival: float, slope: float) -> bool:
-        """Tell whether the sample rate fell, or the lateness exceeds the time that it lasts."""
+    def has_slowed(self, number: float, arrival: float, slope: float) -> bool:
+        """Tell whether the samples are late since their rate fell."""
         assert self.late_since is not None
-        fell = (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
-        return fell or self._least > self.late_since - self._last_on_time + _MIN_LATE_DURATION
+        return (number - self._first_number) * slope < 0.5 * (arrival - self.late_since)
 
 
 class SampleClock:
@@ -305,12 +245,11 @@ class SampleClock:
 
     def __init__(self, rate: float, modulus: int = 0, min_stamp: float = -math.inf):
         self._counter = _SampleCounter(rate, modulus)
-        self._lateness, self._outlier_lateness = _LatenessTest(), _LatenessTest()
+        self._lateness = _LatenessTest()
         self._line = LowerLine(1.0 / rate)
         self._last_number, self._slew_offset = 0.0, 0.0
         self._uncertain_losses, self._uncertain_since, self._newly_lost = 0, 0.0, 0
-        self._last_stamp, self._last_arrival, self._previous_arrival = (
-            min_stamp, -math.inf, -math.inf)
+        self._last_stamp, self._last_arrival = min_stamp, -math.inf
         self._mean_squares = 0.0, 0.0
         self.lost_count = 0
 
@@ -338,9 +277,7 @@ class SampleClock:
         """Return stamps of samples by their time of arrival on a steady clock, s."""
         if not samples:
             return []
-        self._previous_arrival = self._last_arrival
-        self._last_arrival = max(arrival, self._last_arrival)
-        arrival = self._last_arrival
+        self._last_arrival = arrival = max(arrival, self._last_arrival)
         numbers = self._number_samples(samples, arrival)
         if shift := self._correct_losses(numbers[-1], arrival):
             numbers = [number + shift for number in numbers]
@@ -352,9 +289,7 @@ class SampleClock:
         number, before = self._last_number, self.lost_count
         numbers: list[float] = []
         for sample in samples:
-            most = self._max_advance(number, arrival)
-            round_fits = self.is_settled and most >= self._counter.modulus
-            advance, lost = self._counter.advance(sample, most, round_fits)
+            advance, lost = self._counter.advance(sample, self._max_advance(number, arrival))
             number += advance
             self.lost_count += lost
             numbers.append(number)
@@ -376,41 +311,28 @@ class SampleClock:
         """Correct the count of lost samples by the arrivals; return the correction."""
         if not self.is_settled:
             return 0
-        unit, lateness = self._counter.ambiguity, arrival - self._line.value_at(number)
-        bound = max((unit or 1) * self.period, _MIN_LATENESS)
-        if lateness < -0.5 * bound:
-            return self._remove_excess_losses(unit, lateness)
-        late = lateness, 0.75 * bound, number, arrival, self.period
-        if unit and self._lateness.is_loss_proven(*late):
-            return self._add_unnoticed_losses(unit, number, arrival)
+        unit, period = self._counter.ambiguity, self.period
+        lateness = arrival - self._line.value_at(number)
         # After a restart of the sequence, all samples are off by the same part of it.
-        least = max(3.0 * self.period, _OUTLIER_LATENESS)
-        if unit > 1 and (lateness < -least
-                         or lateness < 0.75 * bound and self._outlier_lateness.is_loss_proven(
-                             lateness, least, number, arrival, self.period)):
-            self._restart_line()
+        bound = max(period, _MIN_LATENESS) if unit < 2 else max(3.0 * period, _OUTLIER_LATENESS)
+        if lateness < -0.5 * bound:
+            excess = unit and unit * round(-lateness / (unit * period))
+            if excess and excess <= self._uncertain_losses:
+                return self._renumber(self._uncertain_since, -excess)
+            if not unit:  # a wrong time of the device: the apparent losses are cancelled
+                self.lost_count -= self._newly_lost
+            if unit != 1:
+                self._restart_line()
+        elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, number, arrival,
+                                                    period):
+            lost = unit * math.floor(self._lateness.least / (unit * period) + 0.25)
+            if not lost or self._lateness.has_slowed(number, arrival, self._line.slope):
+                self._restart_line()
+            else:
+                assert self._lateness.late_since is not None
+                self._uncertain_since, self._lateness.late_since = self._lateness.late_since, None
+                return self._renumber(self._uncertain_since, lost)
         return 0
-
-    def _remove_excess_losses(self, ambiguity: int, lateness: float) -> int:
-        excess = ambiguity and ambiguity * round(-lateness / (ambiguity * self.period))
-        if excess and excess <= self._uncertain_losses:
-            return self._renumber(self._uncertain_since, -excess)
-        if not ambiguity:  # a wrong time of the device: the apparent losses are cancelled
-            self.lost_count -= self._newly_lost
-        if ambiguity != 1:  # or a sequence that was restarted
-            self._restart_line()
-        return 0
-
-    def _add_unnoticed_losses(self, ambiguity: int, number: float, arrival: float) -> int:
-        late = self._lateness
-        lost = ambiguity * math.floor(late.late_step / (ambiguity * self.period) + 0.25)
-        if late.is_loss_excluded(number, arrival, self._line.slope):
-            self._restart_line()
-            return 0
-        assert late.late_since is not None
-        self._uncertain_since = late.late_since
-        late.reset()
-        return self._renumber(self._uncertain_since, lost)
 
     def _renumber(self, since: float, offset: int) -> int:
         self._line.shift(since, offset)
@@ -420,17 +342,15 @@ class SampleClock:
 
     def _restart_line(self) -> None:
         self._line = LowerLine(self._line.slope)
-        self._lateness.reset()
-        self._outlier_lateness.reset()
+        self._lateness = _LatenessTest()
         self._slew_offset, self._uncertain_losses = 0.0, 0
 
     def _update_line(self, number: float, arrival: float) -> None:
         line, is_first = self._line, not self._line.time_span()
-        before = line.value_at(number) + self._slew_offset
-        lowest = -math.inf
-        if (self.is_settled and self._uncertain_losses and self._counter.ambiguity
-                and arrival - self._uncertain_since < _MIN_LATE_DURATION):  # near the line
-            lowest = line.value_at(number) - _MAX_CLOCK_DRIFT * (arrival - self._previous_arrival)
+        before, lowest = line.value_at(number) + self._slew_offset, -math.inf
+        if self.is_settled and self._uncertain_losses and self._counter.ambiguity and (
+                arrival - self._uncertain_since < _LATE_DURATION):  # their number may be too large
+            lowest = line.value_at(number)
         line.add(number, max(arrival, lowest))
         elapsed, self._last_number = max(0.0, number - self._last_number) * line.slope, number
         slew = 0.0 if is_first else before - line.value_at(number)
@@ -475,33 +395,22 @@ class ClockStepDetector:
     """
     Detects that a clock was set, by comparison with a steady one; all in s.
 
-    A clock that was not set gains at most `max_ahead`, loses at most `max_behind` against the
-    steady one, and goes back by at most `max_backward`. `count` is the number of steps,
-    `last_step` the size of the last.
+    `count` is the number of steps, `last_step` the size of the last.
 
     """
 
-    def __init__(self, max_ahead: float = _CLOCK_STEP_THRESHOLD,
-                 max_behind: float = _CLOCK_STEP_THRESHOLD,
-                 max_backward: float = _CLOCK_STEP_THRESHOLD):
+    def __init__(self) -> None:
         self.count, self.last_step = 0, 0.0
-        self._max_ahead, self._max_behind, self._max_backward = max_ahead, max_behind, max_backward
         self._steady_time = self._other_time = math.nan
 
-    def find_step(self, steady_time: float, other_time: float) -> float:
-        """Return the step of the clock since the last `update`, s; 0 without one."""
+    def update(self, steady_time: float, other_time: float) -> float:
+        """Take the times of both clocks, s; return the step of the clock, 0 without one."""
         interval = other_time - self._other_time
         step = interval - (steady_time - self._steady_time)
-        was_set = (step > self._max_ahead or step < -self._max_behind
-                   or interval < -self._max_backward)
-        return step if was_set else 0.0
-
-    def update(self, steady_time: float, other_time: float) -> float:
-        """Take the times of both clocks, s, and return the step as `find_step` does."""
-        step = self.find_step(steady_time, other_time)
         self._steady_time, self._other_time = steady_time, other_time
-        if step:
-            self.count, self.last_step = self.count + 1, step
+        if not (abs(step) > _CLOCK_STEP_THRESHOLD or interval < -_CLOCK_STEP_THRESHOLD):
+            return 0.0
+        self.count, self.last_step = self.count + 1, step
         return step
 
 
@@ -538,15 +447,6 @@ class NodeTimeConverter:
         return self._last_stamp
 
 
-@dataclass
-class _ClockStep:
-    """A step of the clock, s, its time on the steady clock, and whether stamps showed it."""
-
-    size: float
-    seen_time: float
-    is_applied: bool = False
-
-
 class HostTimeConverter:
     """
     Conversion of stamps to a continuous time, s, also where the clock of the host is set.
@@ -559,17 +459,20 @@ class HostTimeConverter:
     def __init__(self) -> None:
         self.steps = ClockStepDetector()
         self._offset = 0.0
-        self._recent_steps: list[_ClockStep] = []
+        self._recent_steps: list[tuple[float, float]] = []  # size and time on the steady clock, s
 
     def update(self, steady_time: float, date: float) -> float:
         """Take the times of both clocks, s; return the step of the date."""
-        if (self._recent_steps
-                and steady_time - self._recent_steps[0].seen_time > _MIXED_STAMPS_DURATION):
-            del self._recent_steps[0]
+        self._recent_steps = [each for each in self._recent_steps
+                              if steady_time - each[1] <= _MIXED_STAMPS_DURATION]
         step = self.steps.update(steady_time, date)
         if step:
-            self._recent_steps.append(_ClockStep(step, steady_time))
+            self._recent_steps.append((step, steady_time))
         return step
+
+    def _shifts(self) -> list[float]:
+        """Return by how much a stamp may be off: from after a step, or from before one."""
+        return [0.0, *(sign * size for size, _ in self._recent_steps for sign in (1.0, -1.0))]
 
     def convert_sample(self, stamp: float, previous_time: float, usual_interval: float,
                        arrival_interval: float = 0.0) -> float:
@@ -586,27 +489,19 @@ class HostTimeConverter:
 
         """
         if previous_time == -math.inf:
-            for step in self._recent_steps:
-                step.is_applied = True
+            self._recent_steps.clear()
         interval = stamp - self._offset - previous_time
         # late arrivals of samples whose interval is the usual one are no step of the clock
-        late = interval - arrival_interval
-        unshown = [step for step in self._recent_steps if not step.is_applied]
-        found = min(unshown, key=lambda step: abs(late - step.size), default=None)
-        if (found is None or abs(interval - usual_interval) < 0.5 * usual_interval
-                or abs(late) < abs(late - found.size)
-                or not (arrival_interval or abs(interval - found.size) < 0.5 * abs(interval))):
+        if abs(interval - usual_interval) < 0.5 * usual_interval:
             return stamp - self._offset
-        found.is_applied = True
-        left = interval - found.size
-        least = usual_interval if usual_interval < math.inf else 0.0
-        bridged = left if left > 0.5 * least else least
-        self._offset += interval - bridged
-        return previous_time + bridged
+        shift = min(self._shifts(), key=lambda each: abs(interval - each - arrival_interval))
+        if shift:
+            least = usual_interval if usual_interval < math.inf else 0.0
+            bridged = interval - shift if interval - shift > 0.5 * least else least
+            self._offset += interval - bridged
+        return stamp - self._offset
 
     def convert_message(self, stamp: float, sample_time: float) -> float:
         """Return the time of another message, s, with a stamp from before or after a step."""
-        there = stamp - self._offset
-        shifts = [sign * step.size for step in self._recent_steps for sign in (1.0, -1.0)]
-        return min((there, *(there + shift for shift in shifts)),
+        return min((stamp - self._offset - shift for shift in self._shifts()),
                    key=lambda each: abs(each - sample_time))

@@ -25,14 +25,13 @@ import time
 from types import SimpleNamespace
 
 from gyro_calibration.driver.connection import (
-    AUTO,
     Connection,
     ConnectionCounts,
     ConnectionState,
     Decimator,
     SampleMean,
 )
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import AUTO, Sample, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
 from gyro_calibration.driver.timestamps import (
     NodeTimeConverter,
@@ -63,8 +62,7 @@ PARAMETERS = (
               'Serial port of the gyro, or a pattern that finds it under any name: '
               '/dev/serial/by-id/*A9003XYZ*.'),
     Parameter('protocol', 'kvh_dsp3000',
-              f'Wire format of the gyro; {AUTO} finds it by listening.',
-              choices=(*PROTOCOLS, AUTO)),
+              f'Wire format of the gyro, see wire formats; {AUTO} finds it by listening.'),
     Parameter('baud', 0,
               'Speed of the line; 0 is that of the protocol, or found by listening where that is '
               'auto.', 'bit/s', (0, 4000000)),

@@ -9,11 +9,11 @@
 # under the License.
 
 """
-A node that receives serialized messages from topics, for a recorder.
+A node that receives serialized messages from topics, for the verb record.
 
 Types come from the graph, so that any message whose package is installed can be recorded. A
 subscription requests the offered QoS: best effort publishers are received, and reliable ones lose
-nothing. Publishers may start late, stop, and start again with another QoS.
+nothing. Publishers may start late.
 
 """
 
@@ -37,7 +37,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 _TYPE_ALIASES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
 
@@ -55,17 +54,15 @@ class RecorderNode(Node):
                  on_message: Callable[[Message, str], None], context: rclpy.Context):
         super().__init__('gyro_calibration_recorder', context=context,
                          start_parameter_services=False, enable_rosout=False)
-        self.topics: list[str] = []
-        for topic in topics:
-            try:
-                self.topics.append(self.resolve_topic_name(topic))
-            except (RuntimeError, ValueError) as error:
-                raise LogError(f'{topic} is no topic name ({_describe_error(error)}); give '
-                               'another') from None
+        try:
+            self.topics = [self.resolve_topic_name(topic) for topic in topics]
+        except (RuntimeError, ValueError) as error:
+            raise LogError(f'{", ".join(topics)}: no topic name ({_describe_error(error)}); '
+                           'give another') from None
         self.unknown_topics: dict[str, str] = {}
         self.message_count = 0
         self._all_topics, self._on_message = all_topics, on_message
-        self._subscriptions_of: dict[str, tuple] = {}
+        self._taken: set[str] = set()  # topics
         self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         self.poll()
         call_every(self, 0.3, self.poll)
@@ -73,7 +70,7 @@ class RecorderNode(Node):
     @property
     def missing_topics(self) -> list[str]:
         """Return the requested topics without a publisher so far."""
-        return [topic for topic in self.topics if topic not in self._subscriptions_of]
+        return [topic for topic in self.topics if topic not in self._taken]
 
     def known_topics(self) -> list[str]:
         """Return the topics in the graph."""
@@ -82,18 +79,13 @@ class RecorderNode(Node):
     def poll(self) -> None:
         """Subscribe to new topics in the graph."""
         for topic, kinds in self.get_topic_names_and_types():
-            wanted = topic in self.topics or self._all_topics
-            publishers = self.get_publishers_info_by_topic(topic) if wanted else []
-            if publishers and topic not in self.unknown_topics:
-                self._subscribe(topic, kinds[0], _compatible_qos(publishers))
+            if topic not in self._taken and (topic in self.topics or self._all_topics):
+                offered = [each.qos_profile for each in self.get_publishers_info_by_topic(topic)]
+                if offered:
+                    self._taken.add(topic)
+                    self._subscribe(topic, kinds[0], offered)
 
-    def _subscribe(self, topic: str, kind: str, qos: QoSProfile) -> None:
-        offered = qos.reliability, qos.durability
-        before = self._subscriptions_of.get(topic)
-        if before is not None:
-            if before[0] == offered:
-                return
-            self.destroy_subscription(before[1])
+    def _subscribe(self, topic: str, kind: str, offered: Sequence[QoSProfile]) -> None:
         try:
             definition = _build_definition(kind)
         except (ImportError, AttributeError) as error:
@@ -106,25 +98,21 @@ class RecorderNode(Node):
             self._on_message(Message(topic, kind, self._clock_offset
                                      + round(read_steady_clock() * NSEC_PER_SEC), bytes(data)),
                              definition)
-        self._subscriptions_of[topic] = offered, self.create_subscription(
-            load_message_class(kind), topic, take, qos, raw=True)
+
+        best_effort = any(each.reliability == ReliabilityPolicy.BEST_EFFORT for each in offered)
+        latched = all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in offered)
+        quality = QoSProfile(  # compatible with all publishers
+            depth=SENSOR_QOS.depth,
+            reliability=(ReliabilityPolicy.BEST_EFFORT if best_effort
+                         else ReliabilityPolicy.RELIABLE),
+            durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched
+                        else DurabilityPolicy.VOLATILE))
+        self.create_subscription(load_message_class(kind), topic, take, quality, raw=True)
 
 
 def _describe_error(error: Exception) -> str:
     """Return the text of an error of rclpy, without the place in its source."""
     return str(error).partition(', at /')[0]
-
-
-def _compatible_qos(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
-    """Return a QoS compatible with all publishers; transient local only if all offer it."""
-    best_effort = any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-                      for each in publishers)
-    latched = all(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-                  for each in publishers)
-    return QoSProfile(
-        depth=SENSOR_QOS.depth,  # while a recorder is busy
-        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
 def load_message_class(kind: str) -> Any:

@@ -30,11 +30,9 @@ from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import numpy as np
 import pytest
-from serial_faults import damaged
+from serial_faults import damaged, SETTINGS
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
-SETTINGS = {name: Settings(sensitivity=1e-6 if name == 'fizoptika' else None)
-            for name in PROTOCOLS}
 NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of the gyro'
 
 
@@ -269,7 +267,7 @@ def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known():
     """The rest of the frame is no bytes of another format."""
     world = World(10.0)
     world.gyro('kvh_dsp3000', end=4.0)
-    world.send(iter([find_protocol('kvh_dsp3000').encode(Sample(0.5))[:9]]), begin=4.0, end=4.01)
+    world.send(iter([b'       0.015733   1'[:9]]), begin=4.0, end=4.01)
     reading = Reading(world)
     assert (reading.connection.protocol is find_protocol('kvh_dsp3000')
             and reading.problems[0] == NOTHING)

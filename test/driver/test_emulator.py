@@ -21,6 +21,7 @@ from gyro_calibration.driver.connection import PortError, SerialPort
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import pytest
+from serial_faults import SETTINGS
 
 
 def samples(count=None, rate=100.0):
@@ -46,13 +47,12 @@ def read_all(path, protocol, enough=None, settings=None, until=lambda received: 
 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_a_reader_gets_every_sample(name, tmp_path):
-    settings = Settings(sensitivity=1e-6 if name == 'fizoptika' else None)
-    emulator = Emulator(find_protocol(name), samples(200), settings, speed=math.inf,
+    settings, protocol = SETTINGS[name], find_protocol(name)
+    emulator = Emulator(protocol, samples(200), settings, speed=math.inf,
                         link=tmp_path / 'gyro', wait_for_reader=True)
     with emulator:
         received = read_all(emulator.path, name, 200, settings)
-    resolution = (1e-6 if name in ('csv', 'kvh_1750', 'fizoptika')
-                  else find_protocol(name).sensitivity)
+    resolution = settings.sensitivity or protocol.sensitivity
     assert [sample.output for sample in received] == pytest.approx(
         [sample.output for sample in samples(200)], abs=resolution)
 
@@ -166,7 +166,7 @@ def test_samples_are_numbered():
     sent = []
     protocol = replace(
         find_protocol('csv'),
-        writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
+        writer=lambda settings: lambda _, sample: sent.append(sample.sequence) or b'')
     with Emulator(protocol, samples(100, 1e4)) as gyro:
         gyro._thread.join()
     assert sent == list(range(100))

@@ -56,7 +56,7 @@ def test_the_frame_of_the_manual_is_read_field_by_field(axis):
 def test_a_frame_is_written_as_the_manual_has_it():
     """But for the axes that are not read, which an emulated unit leaves at zero."""
     sample, = decoded(GOLDEN)
-    written = PROTOCOL.encode(sample)
+    written = PROTOCOL.encoder()(sample)
     assert (written[:4] == GOLDEN[:4] and written[12:16] == GOLDEN[12:16]
             and written[24:32] == GOLDEN[24:32])
     assert written == sealed(written[:32])
@@ -74,7 +74,7 @@ def test_a_frame_is_written_as_the_manual_has_it():
 def test_the_rate_is_the_angle_by_the_interval_that_the_unit_is_set_to(settings, factor):
     sample, = decoded(GOLDEN, 'y', **settings)
     assert sample.output == pytest.approx(ROTATION['y'] * factor, rel=1e-6)
-    assert (decoded(PROTOCOL.encode(Sample(0.25), Settings(**settings)), **settings)[0].output
+    assert (decoded(PROTOCOL.encoder(Settings(**settings))(Sample(0.25)), **settings)[0].output
             == pytest.approx(0.25, rel=1e-6))
     assert PROTOCOL.nominal_rate(Settings(**settings)) == settings.get('sample_rate', 1000.0)
 
@@ -94,11 +94,12 @@ def test_only_the_bits_of_the_axis_count(axis):
 def test_the_temperature_has_a_sign(temperature):
     sample, = decoded(sealed(GOLDEN[:30] + struct.pack('>h', temperature)))
     assert sample.temperature == temperature
-    assert decoded(PROTOCOL.encode(Sample(0.1, temperature + 0.3)))[0].temperature == temperature
+    again, = decoded(PROTOCOL.encoder()(Sample(0.1, temperature + 0.3)))
+    assert again.temperature == temperature
 
 
 def test_the_sequence_wraps_at_128():
-    samples = decoded(b''.join(PROTOCOL.encode(Sample(0.1, sequence=number))
+    samples = decoded(b''.join(PROTOCOL.encoder()(Sample(0.1, sequence=number))
                                for number in range(300)))
     assert ([sample.sequence for sample in samples] == [number % 128 for number in range(300)]
             and PROTOCOL.modulus == 128)

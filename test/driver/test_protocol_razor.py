@@ -32,13 +32,13 @@ def test_axes_and_accelerations_are_turned_as_in_ros(axis, rate, force):
     sample, = decoded(LINE, axis)
     assert (sample.output == pytest.approx(rate)
             and sample.specific_force == pytest.approx(force * 9.80665))
-    again, = decoded(PROTOCOL.encode(sample, Settings(axis=axis)), axis)
+    again, = decoded(PROTOCOL.encoder(Settings(axis=axis))(sample), axis)
     assert (again.output == pytest.approx(sample.output)
             and again.specific_force == pytest.approx(sample.specific_force, abs=0.001))
 
 
 def test_a_line_is_written_as_the_firmware_prints_it():
-    assert (PROTOCOL.encode(Sample(-0.25, specific_force=9.80665))
+    assert (PROTOCOL.encoder()(Sample(-0.25, specific_force=9.80665))
             == b'#YPRAG=0.00,0.00,0.00,0.00,0.00,256.00,0.00,0.00,0.25\r\n')
 
 

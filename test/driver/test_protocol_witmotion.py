@@ -42,7 +42,7 @@ def test_the_axis_chooses_rate_and_acceleration():
 def test_the_temperature_has_a_sign(temperature):
     assert (decoded(frame(0x52, 0, 0, 0, round(100 * temperature)))[0].temperature
             == pytest.approx(temperature))
-    assert (decoded(PROTOCOL.encode(Sample(0.1, temperature)))[0].temperature
+    assert (decoded(PROTOCOL.encoder()(Sample(0.1, temperature)))[0].temperature
             == pytest.approx(temperature))
 
 
@@ -61,5 +61,5 @@ def test_frames_of_other_kinds_are_passed_over():
 
 
 def test_a_frame_is_written_byte_by_byte_as_the_data_sheet_has_it():
-    assert (PROTOCOL.encode(Sample(math.radians(31.25), 25.0))
+    assert (PROTOCOL.encoder()(Sample(math.radians(31.25), 25.0))
             == bytes.fromhex('5552000000000002C40976'))

@@ -9,9 +9,11 @@
 # under the License.
 
 r"""
-Wire formats of serial gyros: bytes to samples and back, and recognition of formats (`listening`).
+Wire formats of serial gyros: bytes to samples and back, and recognition of formats.
 
-This package uses no port, no ROS and no clock.
+A format is a module of this folder with one `Protocol`; it is found by being there. The driver,
+`record`, `emulate`, their help, the recognition and the page on wire formats are made from these
+records. No port, no ROS and no clock is used here.
 
 >>> decoder = find_protocol('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')
@@ -21,21 +23,31 @@ This package uses no port, no ROS and no clock.
 
 from __future__ import annotations
 
-from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.protocols.fizoptika import FIZOPTIKA
-from gyro_calibration.driver.protocols.kvh_1750 import KVH_1750
-from gyro_calibration.driver.protocols.kvh_dsp3000 import KVH_DSP3000
-from gyro_calibration.driver.protocols.kvh_ecore import KVH_ECORE
-from gyro_calibration.driver.protocols.minimu9 import MINIMU9
+from dataclasses import dataclass
+import importlib
+import pkgutil
+
 from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample, Settings
-from gyro_calibration.driver.protocols.razor import RAZOR
-from gyro_calibration.driver.protocols.witmotion import WITMOTION
 from gyro_calibration.files import suggest_nearest
 
-PROTOCOLS = {protocol.name: protocol for protocol in (KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA,
-                                                      MINIMU9, WITMOTION, RAZOR, CSV)}
+__all__ = ['AUTO', 'BAUDS', 'PROTOCOLS', 'Decoder', 'Protocol', 'Recognition', 'Sample',
+           'Settings', 'find_protocol', 'recognize_protocol']
 
-__all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find_protocol']
+#: The formats by name.
+PROTOCOLS = {
+    value.name: value for each in pkgutil.iter_modules(__path__)
+    for value in vars(importlib.import_module(f'{__name__}.{each.name}')).values()
+    if isinstance(value, Protocol)}
+#: Name that stands for recognition by listening.
+AUTO = 'auto'
+#: Bits per second, in order of the attempts: first the defaults of gyros, then others.
+BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
+
+_MAX_BYTES = 8192  # number of last bytes that are used, which limits the cost
+_MIN_FRAMES = 3  # least number of frames; fewer may be chance
+_MIN_EXPLAINED_SHARE = 0.5  # least share of the bytes in frames; a line may damage the rest
+_MIN_IDENTICAL_SHARE = 0.95  # least share where all frames are equal: zeros may pass a weak check
+_AMBIGUITY_RATIO = 0.8  # the result is ambiguous if another format has this times the best share
 
 
 def find_protocol(name: str) -> Protocol:
@@ -44,3 +56,60 @@ def find_protocol(name: str) -> Protocol:
         return PROTOCOLS[name]
     raise ValueError(f'protocol {name!r} is not known: choose one of {", ".join(PROTOCOLS)}'
                      f'{suggest_nearest(name, PROTOCOLS)}')
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """
+    The recognized format of some bytes.
+
+    The explained share, 0 to 1, is that of the bytes in frames of the best format, without an
+    incomplete frame at the beginning.
+
+    """
+
+    protocol: Protocol | None  # None if ambiguous, or too few bytes
+    explained_share: float
+    summary: str  # the result as a sentence
+
+
+def recognize_protocol(data: bytes, settings: Settings | None = None) -> Recognition:
+    """
+    Return the format that explains the last 8192 bytes.
+
+    The settings may be incomplete for the recognized format. `csv` is recognized by the number of
+    their columns. The data may begin anywhere in a frame; at a wrong baud they fit no format.
+
+    """
+    settings, data = settings or Settings(), data[-_MAX_BYTES:]
+    scores = [(*_explain(protocol, settings, data), protocol) for protocol in PROTOCOLS.values()]
+    (share, frames, best), (next_share, _, second) = sorted(scores, key=lambda each: -each[0])[:2]
+    if next_share and next_share >= _AMBIGUITY_RATIO * share:
+        return Recognition(None, share, f'the bytes may be {best.name} or {second.name}: set '
+                           'protocol')
+    least = _MIN_EXPLAINED_SHARE if len(set(frames)) >= _MIN_FRAMES else _MIN_IDENTICAL_SHARE
+    if len(frames) >= _MIN_FRAMES and share >= least:
+        following = f'; next is {second.name} with {next_share:.0%}' if next_share else ''
+        return Recognition(best, share, f'{best.name} explains {share:.0%} of {len(data)} bytes, '
+                           f'in {len(frames)} frames{following}')
+    if not data:
+        words = 'nothing came: check the power and the wires of the gyro'
+    elif frames:
+        words = (f'{len(data)} bytes came, of which too few are frames of {best.name}: listen '
+                 'longer, or set protocol')
+    else:
+        words = (f'{len(data)} bytes came, but in no known format: try another baud, set '
+                 'protocol, or for csv name as many columns as a line has numbers')
+    return Recognition(None, share, words)
+
+
+def _explain(protocol: Protocol, settings: Settings, data: bytes) -> tuple[float, list[bytes]]:
+    """Return the share of the bytes in frames of a protocol, and these frames."""
+    splitter, parse = protocol.splitter(), protocol.parser(settings)
+    frames = splitter.feed(data)
+    good = [frame.data for frame in frames if parse(frame.data) is not None]
+    if not good:
+        return 0.0, good
+    received = splitter.discarded_bytes + sum(len(frame.data) for frame in frames)
+    begun = min(frames[0].skipped_bytes, max(map(len, good)))
+    return sum(map(len, good)) / (received - begun), good

@@ -9,18 +9,26 @@
 # under the License.
 
 """
-Numbers separated by commas, one sample a line: any gyro behind a microcontroller.
+Any gyro behind a microcontroller: one line a sample, numbers separated by commas.
 
-The columns are named by `Settings.columns` in names of the log format. An empty or ``nan``
-temperature, time, acceleration or supply is unknown. An output that is ``nan`` or ``inf``, or
-beyond 2000 deg/s where no full scale is set, is refused: such values are mostly lines that lost
-their decimal point. A line without an output is discarded, as is a header.
+They stand in the order of the parameter ``columns``, whose names are those of the log format:
+``gyro_dps``, ``gyro_rad_s`` or ``gyro_counts``, ``time_s``, ``temperature_degc``,
+``acceleration_mps2``, ``supply_v``; columns with other names are skipped. Exactly one gyro column
+is needed. ``gyro_counts`` needs ``sensitivity``, in rad/s a count; the other two do not allow it.
+An empty value or ``nan`` in the other columns is unknown. A line with another number of values
+than columns, or without an output, is discarded, as is a header. An output of ``nan`` or ``inf``
+is refused, and one beyond full scale, for example from a line that lost its decimal point.
+
+With the default columns, ``12.5,-3.25,24.5`` is -3.25 deg/s at 24.5 degC, 12.5 s by the clock of
+the device.
+
+An XV-3500CB gives 0.67 mV per deg/s. A converter of 12 bits and 3.3 V has 1.2 deg/s a count:
+amplify or oversample.
 
 """
 
 from __future__ import annotations
 
-from functools import partial
 import math
 import re
 
@@ -31,10 +39,9 @@ from gyro_calibration.driver.protocols.protocol import (
     OPTIONAL_COLUMNS,
     Protocol,
     Reading,
-    refuse_increments,
+    Sample,
     Settings,
     stateless,
-    WrittenReading,
 )
 
 _NUMBER = re.compile(NUMBER)
@@ -42,8 +49,7 @@ _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)
 _MISSING_VALUES = (b'', b'nan')
 
 
-def _check_settings(settings: Settings) -> None:
-    refuse_increments(settings)
+def _check(settings: Settings) -> None:
     counts = 'gyro_counts' in settings.columns
     if counts and settings.sensitivity is None:
         raise ValueError('columns hold gyro_counts, but sensitivity is not set: set it to the '
@@ -76,16 +82,15 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
                    {} if supply is None else {'supply_v': supply})
 
 
-def _write(reading: WrittenReading, settings: Settings) -> bytes:
-    known = dict(zip(OPTIONAL_COLUMNS, (reading.temperature, reading.time, reading.specific_force,
-                                        reading.health.get('supply_v'))))
-    fields = {name: b'nan' if value is None else b'%.6f' % value for name, value in known.items()}
-    fields |= {name: b'%.9g' % (reading.value / unit) for name, unit in GYRO_COLUMNS.items()}
-    fields['gyro_counts'] = b'%d' % round(reading.value)
+def _write(value: float, sample: Sample, settings: Settings) -> bytes:
+    known = dict(zip(OPTIONAL_COLUMNS, (sample.temperature, sample.time, sample.specific_force,
+                                        sample.health.get('supply_v'))))
+    fields = {name: b'nan' if each is None else b'%.6f' % each for name, each in known.items()}
+    fields |= {name: b'%.9g' % (value / unit) for name, unit in GYRO_COLUMNS.items()}
+    fields['gyro_counts'] = b'%d' % round(value)
     return b','.join(fields.get(name, b'0') for name in settings.columns) + b'\r\n'
 
 
-CSV = Protocol(name='csv', description='numbers separated by commas, columns named by a parameter',
-               baud=115200, rate=100.0, sensitivity=1.0, splitter=partial(LineSplitter, 1024),
-               parser=stateless(_parse), writer=stateless(_write), full_scale=math.radians(2000.0),
-               preamble=b'\r\n', check_settings=_check_settings)
+CSV = Protocol(name='csv', text=__doc__,
+               baud=115200, rate=100.0, sensitivity=1.0, splitter=LineSplitter,
+               parser=stateless(_parse), writer=stateless(_write), preamble=b'\r\n', check=_check)

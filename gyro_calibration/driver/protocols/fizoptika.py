@@ -9,17 +9,24 @@
 # under the License.
 
 """
-Fizoptika fibre-optic gyros with one axis: frames of 8 bytes, ``DD low high mid id data sum sum``.
+Fizoptika fibre-optic gyros with one axis: frames of 8 bytes.
 
-The rate is a signed number of 24 bits in counts, whose meaning differs from unit to unit (27880
-counts per deg/s in one). The sum is that of the second to the sixth byte, most significant byte
-first. Each frame holds half of a value about the unit itself: the even numbers ``id`` have the
-high byte, the odd ones after them the low byte of a signed number of 16 bits. They are joined only
-if the two frames follow each other with nothing between.
+They are ``DD``, the low, the high and the middle byte of a signed 24-bit count, a number, a byte,
+and the sum of these five, most significant byte first. The value of a count differs from unit to
+unit, so ``sensitivity`` must be set; one unit has 27880 counts per deg/s, 6.260e-7 rad/s a count.
 
-Source: the public decoder `riptide_gyro` of Ohio State University, which names the numbers from 8
-to 15 as reserved; its sign extension is off by one count and was not adopted. No manual was seen:
-the sample rate, which is not given anywhere, and the sense of rotation are not verified.
+The number identifies the byte: 0 and 1 are the high and the low byte of the temperature, 2 and 3
+of the supply, 4 and 5 of the current of the light source, 6 and 7 of the diagnostic voltage; 8 to
+15 are reserved. The values are signed 16-bit numbers: at 32768 they are 250 degC (less 50 degC),
+10 V, 0.25 A and 2.5 V. Two bytes are joined if their frames follow each other with nothing
+between. A loss of exactly eight frames that leaves no other bytes is not detected.
+
+``DD E8 00 6C 02 13 01 69`` is a count of 27880, and the high byte of the supply, 13 hexadecimal.
+
+Source: the public decoder ``riptide_gyro`` of Ohio State University; its sign extension is off by
+one count and was not adopted. No manual was seen. The sample rate is not known: 1000 Hz is assumed
+until samples come, so set ``sample_rate``. The sense of rotation is not verified: the maker's
+glossary calls a clockwise turn positive, without the direction of view.
 
 """
 
@@ -31,10 +38,9 @@ from gyro_calibration.driver.protocols.protocol import (
     FrameSplitter,
     Protocol,
     Reading,
-    require_sensitivity,
+    Sample,
     Settings,
     to_signed_count,
-    WrittenReading,
 )
 
 _HEADER = 0xDD
@@ -77,23 +83,22 @@ class _Writer:
     def __init__(self, settings: Settings):
         self._latched: dict[int, bytes] = {}
 
-    def __call__(self, reading: WrittenReading) -> bytes:
-        number = reading.sequence % 8
+    def __call__(self, value: float, sample: Sample) -> bytes:
+        number = (sample.sequence or 0) % 8
         even = number & ~1
         if number == even or even not in self._latched:
             name, unit, offset, usual = _STATUS_VALUES[even]
-            value = reading.temperature if name == 'temperature' else reading.health.get(name)
-            half = to_signed_count(((usual if value is None else value) - offset) / unit)
+            known = sample.temperature if name == 'temperature' else sample.health.get(name)
+            half = to_signed_count(((usual if known is None else known) - offset) / unit)
             self._latched = {even: half.to_bytes(2, 'big', signed=True)}
-        high, middle, low = to_signed_count(reading.value, 24).to_bytes(3, 'big', signed=True)
+        high, middle, low = to_signed_count(value, 24).to_bytes(3, 'big', signed=True)
         frame = bytes([_HEADER, low, high, middle, number, self._latched[even][number - even]])
         return frame + _checksum(frame)
 
 
 FIZOPTIKA = Protocol(
-    name='fizoptika', description='Fizoptika fibre-optic gyros, binary with raw counts',
-    baud=921600, rate=1000.0, sensitivity=1.0,
+    name='fizoptika', text=__doc__,
+    baud=921600, rate=1000.0, sensitivity=None,
     splitter=partial(FrameSplitter, rb'\xdd.{7}', 8, lambda frame: _checksum(frame) == frame[6:]),
     parser=_Parser, writer=_Writer, largest_count=0x800000, normal_ranges={
-        'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15), 'diagnostic_v': (0.95, 1.05)},
-    check_settings=require_sensitivity)
+        'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15), 'diagnostic_v': (0.95, 1.05)})

@@ -11,20 +11,29 @@
 """
 KVH 1725, 1750, 1760 and 1775, fibre-optic gyros with up to three axes: frames of 36 bytes.
 
-After the header FE 81 FF 55 come three rotations and three accelerations in g (32-bit floats), a
-status, a sequence of 0 to 127, the temperature in whole degC and the CRC, all with the most
-significant byte first. A bit of the status stands for each axis: 0 to 2 for the gyros, 4 to 6 for
-the accelerometers, 1 for valid.
+After the header ``FE 81 FF 55`` come rotations about x, y, z and accelerations along them in g
+(32-bit floats), status, a sequence of 0 to 127, the temperature in whole degC, and a CRC, all with
+the most significant byte first. The CRC-32 has the polynomial 04C11DB7 and the initial value
+FFFFFFFF, is neither reflected nor inverted, and covers the first 32 bytes. Bits 0 to 2 of the
+status are 1 if the gyro of x, y, z is valid, bits 4 to 6 likewise for the accelerometers; only
+those of the ``axis`` are used. A turn is positive counter-clockwise, seen from the tip of the
+axis, and the acceleration of an axis that points up is 1 g. The line is RS-422.
 
-A rotation is the angle in rad since the last sample, unless the unit is set to send rates
-(``=ROTFMT,RATE``). An angle is divided by the interval of the data rate that the unit is set to
-(``=DR``): 1000 Hz, or `Settings.sample_rate`. A turn is positive counter-clockwise, seen from the
-tip of the axis, and the acceleration of an axis that points up is 1 g.
+A new unit sends the angle in rad since its last sample. The rate is that angle divided by the
+interval that was set with ``=DR``: 1000 Hz, or ``sample_rate``, also where a signal at MSYNC
+requests the samples. A wrong ``sample_rate`` makes all rates wrong by the same factor; the
+diagnostics and ``record`` warn of 5 % or more. After ``=ROTFMT,RATE`` set ``increments`` to never.
+If the unit sends degrees, set ``sensitivity`` to 0.0174533. A clock error of the unit of 100 ppm
+is a scale factor error of 100 ppm, which the calibration includes.
+
+``FE81FF55 37A96A6E 38586C1F B75BF862 BF803E78 BB650D28 3B0A37AC 77 3D 0028 4BFA34D8`` is
+2.0196e-5, 5.1599e-5 and -1.3111e-5 rad, -1.00191, -0.003495 and 0.002109 g, all valid, sequence
+61, 40 degC. At 1000 Hz these are 0.0202, 0.0516 and -0.0131 rad/s.
 
 Source: KVH 1775 IMU interface control document, 56-0298 revision B: format A (tables 5-1, 5-2),
-status (5-8), CRC (5-9), the example (5.2.1), data rates (8.8), senses (section 9); that a new unit
-sends at 1000 Hz is what public drivers expect. Formats B and C, and temperatures in other units,
-are not read.
+status (5-8), CRC (5-9), the example (5.2.1), data rates (8.8), senses (section 9). Not verified:
+models other than the 1775, and the 1000 Hz of a new unit, which public drivers expect. Not
+supported: formats B and C (headers ``FE 81 FF 56`` and ``57``), and temperatures in other units.
 
 """
 
@@ -40,16 +49,15 @@ from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
     ROOM_TEMPERATURE,
+    Sample,
     Settings,
     STANDARD_GRAVITY,
     stateless,
     to_signed_count,
-    WrittenReading,
 )
 
 _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')
-_MODULUS = 128
 _ALL_VALID = 0x77
 _REVERSED_BITS = bytes(int(f'{byte:08b}'[::-1], 2) for byte in range(256))
 
@@ -69,28 +77,26 @@ def _parse(frame: bytes, settings: Settings) -> Reading:
                    specific_force=values[3 + axis] * STANDARD_GRAVITY if has_force else None)
 
 
-def _write(reading: WrittenReading, settings: Settings) -> bytes:
+def _write(value: float, sample: Sample, settings: Settings) -> bytes:
     axis = 'xyz'.index(settings.axis)
     rotation, acceleration, status = [0.0] * 3, [0.0] * 3, _ALL_VALID
-    rotation[axis] = reading.value
-    if reading.specific_force is None:
+    rotation[axis] = value
+    if sample.specific_force is None:
         status &= ~(1 << 4 + axis)
     else:
-        acceleration[axis] = reading.specific_force / STANDARD_GRAVITY
-    if not reading.valid:
-        status &= ~(1 << axis)
-    temperature = ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
-    frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, reading.sequence % _MODULUS,
+        acceleration[axis] = sample.specific_force / STANDARD_GRAVITY
+    temperature = ROOM_TEMPERATURE if sample.temperature is None else sample.temperature
+    frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, (sample.sequence or 0) % 128,
                         to_signed_count(temperature))
     return frame + _checksum(frame)
 
 
 KVH_1750 = Protocol(
-    name='kvh_1750', description='KVH 1725, 1750, 1760, 1775 fibre-optic gyros, binary',
+    name='kvh_1750', text=__doc__,
     baud=921600, rate=1000.0, sensitivity=1.0,
     splitter=partial(FrameSplitter, rb'\xfe\x81\xff\x55.{32}', 36,
                      lambda frame: _checksum(frame[:32]) == frame[32:]),
     parser=stateless(_parse), writer=stateless(_write),
     full_scale=math.radians(500.0),  # the input range is 490 deg/s
     noise_density=math.radians(1.0 / 3600.0),  # 1 deg/h/√Hz for the 1725, others less
-    increments=True, modulus=_MODULUS, check_settings=lambda settings: None)
+    increments=True, modulus=128)

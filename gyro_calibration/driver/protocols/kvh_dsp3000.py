@@ -11,14 +11,20 @@
 """
 KVH DSP-3000, a fibre-optic gyro with one axis: lines like ``       0.015733   1``.
 
-They hold the rate in deg/s and 1 for valid. The rate is positive clockwise, seen from above. The
-clock is 2 to 3 % off from unit to unit, so samples must never be integrated with the nominal
-interval. The letter R, sent three times, asks for rates in place of increments or angles.
+They hold the rate in deg/s, positive clockwise seen from above, and 1 if the gyro marks it as
+valid, else 0: this line is -0.015733 deg/s. Blanks on the left distinguish a whole line from a
+part of one. The letter R, sent three times at the start, selects rates. The clock is 2 to 3 % off
+from unit to unit, so samples must never be integrated with the nominal interval.
 
 Source: KVH DSP-3000 technical manual, 54-0215 revision C, section 2, for the unit with the
-asynchronous interface of 100 Hz (part 02-1222-01); that of 1000 Hz (02-1222-07) sends binary and
-is not read here. The linearity is given up to 375 deg/s, and beyond 500 deg/s the output is
-unreliable, whatever the valid bit is (table 2).
+asynchronous interface of 100 Hz (part 02-1222-01). The linearity is given up to 375 deg/s, and
+beyond 500 deg/s the output is unreliable, whatever the valid bit is (table 2).
+
+Not supported: the unit that sends binary at 1000 Hz (part 02-1222-07). Section 3.1 of the manual
+states 115200 baud and a message of 32 bits, most significant byte first: bit 31 valid, 30 and 29
+synchronization, 28 and 27 type (0 rate, 1 increment, 2 integrated angle), 26 odd parity, 25 to 0
+the value, 60 micro-deg/s a count for rates. Section 3.1.4 defines the two bits of synchronization,
+without which the first byte of a message cannot be identified; no public copy of it was found.
 
 """
 
@@ -45,9 +51,9 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
 
 
 KVH_DSP3000 = Protocol(
-    name='kvh_dsp3000', description='KVH DSP-3000 fibre-optic gyro, text with deg/s',
+    name='kvh_dsp3000', text=__doc__,
     baud=38400, rate=100.0, sensitivity=math.radians(1.0),
-    splitter=partial(LineSplitter, 64, (b' ',)), parser=stateless(_parse),
-    writer=lambda settings: lambda reading: b'%15.6f   %d\r\n' % (reading.value, reading.valid),
+    splitter=partial(LineSplitter, (b' ',)), parser=stateless(_parse),
+    writer=lambda settings: lambda value, sample: b'%15.6f   1\r\n' % value,
     invert=True, full_scale=math.radians(500.0), startup=b'RRR',
     noise_density=math.radians(4.0 / 3600.0))  # data sheet: 4 deg/h/√Hz, 0.067 deg/√h

@@ -11,11 +11,14 @@
 """
 KVH E-Core 2000 family, fibre-optic gyros with one axis: frames of 8 bytes.
 
-Bit 7 is set in the first byte only. The 56 low bits, most significant first, make seven bytes m[0]
-to m[6]. They add up to 0 modulo 256, and m[5], m[6] are the rate, a signed 16-bit number; the
-meaning of m[1] to m[4] is not known. One count is 0.00183 deg/s in a unit for 60 deg/s and half of
-that in a unit for 30 deg/s. The RD2100 is assumed to have the same format. Baud and sense of
-rotation were inferred, not read in a manual.
+Only the first byte has bit 7 set. Their low seven bits, most significant first, are seven bytes
+with the sum 0 modulo 256. The last two are the rate, a signed 16-bit number, most significant byte
+first; the meaning of bytes two to five is not known. A unit for 60 deg/s has 0.00183 deg/s a
+count, a unit for 30 deg/s half of that: set ``sensitivity: 1.597e-5``. The RD2100 is assumed to
+have the same format. Baud and sense of rotation were inferred, not read in a manual: check sign
+and scale on your unit.
+
+``8A 40 00 00 00 00 07 68`` is a count of 1000, which is 1.83 deg/s.
 
 """
 
@@ -28,13 +31,11 @@ from gyro_calibration.driver.protocols.protocol import (
     FrameSplitter,
     Protocol,
     Reading,
+    Sample,
     Settings,
     stateless,
     to_signed_count,
-    WrittenReading,
 )
-
-_RATE_PER_COUNT = math.radians(0.00183)
 
 
 def _unpack_content(frame: bytes) -> bytes:
@@ -44,8 +45,8 @@ def _unpack_content(frame: bytes) -> bytes:
     return bits.to_bytes(7, 'big')
 
 
-def _write(reading: WrittenReading, settings: Settings) -> bytes:
-    rate = to_signed_count(reading.value).to_bytes(2, 'big', signed=True)
+def _write(value: float, sample: Sample, settings: Settings) -> bytes:
+    rate = to_signed_count(value).to_bytes(2, 'big', signed=True)
     bits = int.from_bytes(bytes([-sum(rate) % 256, 0, 0, 0, 0]) + rate, 'big')
     frame = bytes(bits >> shift & 0x7F for shift in range(49, -1, -7))
     return bytes([frame[0] | 0x80]) + frame[1:]
@@ -53,8 +54,8 @@ def _write(reading: WrittenReading, settings: Settings) -> bytes:
 
 KVH_ECORE = Protocol(
     name='kvh_ecore',
-    description='KVH E-Core 2000 fibre-optic gyro (also RD2100, not verified), binary', baud=9600,
-    rate=10.0, sensitivity=_RATE_PER_COUNT,
+    text=__doc__, baud=9600,
+    rate=10.0, sensitivity=math.radians(0.00183),
     splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8,
                      lambda frame: sum(_unpack_content(frame)) % 256 == 0),
     parser=lambda settings: lambda frame: Reading(

@@ -20,11 +20,13 @@ scale are applied here for all formats, as are the counts of discarded, refused 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 import math
 import re
 from typing import NamedTuple, TypeVar
+
+OutputT = TypeVar('OutputT')
 
 STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
 ROOM_TEMPERATURE = 25.0  # degC; default of an emulated device
@@ -137,14 +139,6 @@ class Reading:
     health: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class WrittenReading(Reading):
-    """A reading that an emulated device writes: with a value, and a sequence without wraps."""
-
-    value: float
-    sequence: int = 0
-
-
 def to_signed_count(value: float, bits: int = 16) -> int:
     """Return the nearest signed integer of a number of bits, with saturation."""
     return min(max(round(value), -1 << bits - 1), (1 << bits - 1) - 1)
@@ -152,17 +146,14 @@ def to_signed_count(value: float, bits: int = 16) -> int:
 
 #: Parses a frame to a reading, or None if it is not valid; may use earlier frames.
 ParseFrame = Callable[[bytes], 'Reading | None']
-#: Makes the bytes of a reading; may use earlier readings.
-WriteFrame = Callable[[WrittenReading], bytes]
-
-InputT = TypeVar('InputT')
-OutputT = TypeVar('OutputT')
+#: Makes the bytes that an emulated device sends of a value, in its unit, and the further values
+#: of a sample; may use earlier samples. The sequence counts from 0 and never wraps.
+WriteFrame = Callable[[float, Sample], bytes]
 
 
-def stateless(convert: Callable[[InputT, Settings], OutputT]) -> Callable[
-        [Settings], Callable[[InputT], OutputT]]:
+def stateless(convert: Callable[..., OutputT]) -> Callable[[Settings], Callable[..., OutputT]]:
     """Return the `Protocol.parser` or `writer` of a format with independent frames."""
-    return lambda settings: lambda given: convert(given, settings)
+    return lambda settings: lambda *given: convert(*given, settings)
 
 
 class Frame(NamedTuple):
@@ -196,21 +187,6 @@ class Splitter:
         return Frame(data, garbage)
 
 
-def refuse_increments(settings: Settings) -> None:
-    """Raise ValueError if increments are set for a device that sends rates only."""
-    if settings.increments:
-        raise ValueError('increments is set, but this gyro sends rates, not angles: leave '
-                         'increments out')
-
-
-def require_sensitivity(settings: Settings) -> None:
-    """Raise ValueError if a device that sends counts has no sensitivity."""
-    refuse_increments(settings)
-    if settings.sensitivity is None:
-        raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the rad/s '
-                         'of one count, which its data sheet gives')
-
-
 @dataclass(frozen=True)
 class Protocol:
     """
@@ -218,10 +194,12 @@ class Protocol:
 
     Attributes
     ----------
-    name, description : str
+    name : of the parameter ``protocol``
+    text : what documents state of it: devices, layout of a frame, sources, what is not verified
     baud : bits per second, with 8 data bits, no parity and 1 stop bit
     rate : nominal samples per second; see `nominal_rate`
-    sensitivity : rad/s per unit of the device, or rad where it sends increments
+    sensitivity : rad/s per unit of the device, or rad where it sends increments; None for counts
+        that differ from unit to unit, whose sensitivity must be set
     splitter : returns a new `Splitter`
     parser : ``parser(settings)`` returns the parser of one connection, see `ParseFrame` and
         `stateless`
@@ -232,22 +210,21 @@ class Protocol:
     largest_count : of a device that sends counts; the full scale is this times the sensitivity
     noise_density : white noise of the rate, rad/s/√Hz, by the data sheet of the gyro; None if not
         known
-    increments : whether the device sends angles since its last sample by default
+    increments : whether the device sends angles since its last sample, unless it is set to rates
     startup : request to the device to send
     preamble : first bytes of the emulated device, so that its first sample is not taken for the
         rest of a line
     modulus : of the sequence of the device; 0 where it has none
     normal_ranges : normal ranges of the values of `Sample.health`
-    check_settings : ``check_settings(settings)`` raises ValueError if settings are missing or
-        wrong
+    check : ``check(settings)`` raises ValueError if settings are missing or wrong
 
     """
 
     name: str
-    description: str
+    text: str
     baud: int
     rate: float
-    sensitivity: float
+    sensitivity: float | None
     splitter: Callable[[], Splitter]
     parser: Callable[[Settings], ParseFrame]
     writer: Callable[[Settings], WriteFrame]
@@ -260,15 +237,25 @@ class Protocol:
     preamble: bytes = b''
     modulus: int = 0
     normal_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    check_settings: Callable[[Settings], None] = refuse_increments
+    check: Callable[[Settings], None] = lambda settings: None
+
+    def check_settings(self, settings: Settings) -> None:
+        """Raise ValueError if settings are missing, or do not fit the device."""
+        if settings.increments and not self.increments:
+            raise ValueError('increments is set, but this gyro sends rates, not angles: leave '
+                             'increments out')
+        if settings.sensitivity is None and self.sensitivity is None:
+            raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the '
+                             'rad/s of one count, which its data sheet gives')
+        self.check(settings)
 
     def decoder(self, settings: Settings | None = None) -> Decoder:
         """Return a decoder for one connection, or raise as `check_settings` does."""
         return Decoder(self, settings or Settings())
 
-    def encoder(self, settings: Settings | None = None) -> Callable[..., bytes]:
+    def encoder(self, settings: Settings | None = None) -> Callable[[Sample], bytes]:
         """
-        Return ``encode(sample, valid=True)`` of one device, which gives the bytes that it sends.
+        Return ``encode(sample)`` of one device, which gives the bytes that it sends.
 
         Beyond full scale it saturates. It raises as `check_settings` does.
 
@@ -278,20 +265,15 @@ class Protocol:
         limit, factor, write = (self.effective_full_scale(settings), self.unit_scale(settings),
                                 self.writer(settings))
 
-        def encode(sample: Sample, valid: bool = True) -> bytes:
-            value = min(max(sample.output, -limit), limit) / factor
+        def encode(sample: Sample) -> bytes:
             # a log has nan where a sensor failed
             temperature, force = (each if each is not None and math.isfinite(each) else None
                                   for each in (sample.temperature, sample.specific_force))
-            return write(WrittenReading(value, valid, temperature, sample.time,
-                                        sample.sequence or 0, force, sample.health))
+            return write(min(max(sample.output, -limit), limit) / factor,
+                         replace(sample, temperature=temperature, specific_force=force,
+                                 sequence=sample.sequence or 0))
 
         return encode
-
-    def encode(self, sample: Sample, settings: Settings | None = None,
-               valid: bool = True) -> bytes:
-        """Return the bytes of a device that was just turned on for a sample; see `encoder`."""
-        return self.encoder(settings)(sample, valid)
 
     def nominal_rate(self, settings: Settings) -> float:
         """Return the samples per second, as set or of the format."""
@@ -312,7 +294,7 @@ class Protocol:
     def unit_scale(self, settings: Settings) -> float:
         """Return the rad/s, counter-clockwise positive, of one unit of the device."""
         invert = self.invert if settings.invert is None else settings.invert
-        factor = settings.sensitivity or self.sensitivity
+        factor = settings.sensitivity or self.sensitivity or math.nan
         if self.sends_angles(settings):
             factor *= self.nominal_rate(settings)
         return -factor if invert else factor
@@ -322,7 +304,7 @@ class Protocol:
         if settings.full_scale is not None:
             return settings.full_scale
         if self.largest_count is not None:
-            return self.largest_count * (settings.sensitivity or self.sensitivity)
+            return self.largest_count * (settings.sensitivity or self.sensitivity or math.nan)
         return self.full_scale
 
     def sample_variance(self, settings: Settings) -> float:
@@ -406,6 +388,7 @@ class Decoder:
 NUMBER = rb'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?'
 
 _LINE_END = re.compile(rb'[\r\n]')
+_MAX_LINE = 1024  # bytes; a longer line is discarded, so that an endless one fills no memory
 
 
 class LineSplitter(Splitter):
@@ -417,14 +400,13 @@ class LineSplitter(Splitter):
 
     Parameters
     ----------
-    max_length : bytes; a longer line is discarded, so that an endless one does not fill the memory
     line_starts : first bytes that occur only at the beginning of a line
 
     """
 
-    def __init__(self, max_length: int, line_starts: tuple[bytes, ...] = ()):
+    def __init__(self, line_starts: tuple[bytes, ...] = ()):
         super().__init__()
-        self._max_length, self._line_starts = max_length, line_starts
+        self._line_starts = line_starts
         self._has_line_start = self._is_too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
@@ -433,7 +415,7 @@ class LineSplitter(Splitter):
         *lines, tail = self._tail + first, *rest
         whole = []
         for line in lines:
-            good = not self._is_too_long and len(line) <= self._max_length
+            good = not self._is_too_long and len(line) <= _MAX_LINE
             good = good and (self._has_line_start or line.startswith(self._line_starts))
             self._has_line_start, self._is_too_long = True, False
             if not good:
@@ -441,7 +423,7 @@ class LineSplitter(Splitter):
             elif line:
                 whole.append(self._make_frame(line))
         self._tail = tail
-        if self._is_too_long or len(tail) > self._max_length:
+        if self._is_too_long or len(tail) > _MAX_LINE:
             self._discard(len(tail))
             self._tail, self._is_too_long = b'', True
         return whole

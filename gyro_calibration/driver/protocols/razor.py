@@ -12,14 +12,19 @@
 Razor AHRS firmware (SparkFun 9DoF Razor IMU, Sensor Stick, OpenLog Artemis): lines ``#YPRAG=``.
 
 Their nine numbers are yaw, pitch and roll, the accelerations and the rates about x, y and z. The
-rates are in rad/s, with two decimals: 0.01 rad/s is 0.57 deg/s, which is coarse. The accelerations
-are in 1/256 g and negated, so that the axis that points down has 256. The axes of the firmware
-point forward, right and down; here they are turned to forward, left and up (REP-103), so that y
-and z change their sign. ``#ox`` asks for these lines, and ``#o1`` for a stream of them.
+driver requests them at the start with ``#ox#o1``; earlier lines ``#YPR=`` are skipped. The rates
+in rad/s have two decimals, a step of 0.57 deg/s: too coarse for a calibration, unless the noise is
+larger than the step. Print more decimals in the firmware. The accelerations are in 1/256 g and
+negated, so that the axis that points down has 256. The axes of the firmware point forward, right
+and down; here they are turned to forward, left and up (REP-103), so that y and z change their
+sign.
 
-Source: the comments of the firmware and the driver in `razor_imu_9dof` 1.3.0 (file Razor_AHRS.ino,
-on axes and serial commands; node imu_node.py). Older firmware may send counts: set the sensitivity
-then.
+``#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03`` is 0.03 rad/s about z,
+counter-clockwise from above, and 9.81 m/s² up.
+
+Source: the comments of the firmware and the driver in ``razor_imu_9dof`` 1.3.0 (file
+Razor_AHRS.ino, on axes and serial commands; node imu_node.py). For older firmware that sends
+counts set ``sensitivity``.
 
 """
 
@@ -34,10 +39,10 @@ from gyro_calibration.driver.protocols.protocol import (
     NUMBER,
     Protocol,
     Reading,
+    Sample,
     Settings,
     STANDARD_GRAVITY,
     stateless,
-    WrittenReading,
 )
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
@@ -58,18 +63,18 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
                    specific_force=force if math.isfinite(force) else None)
 
 
-def _write(reading: WrittenReading, settings: Settings) -> bytes:
-    turned, force = _AXIS_SIGNS[settings.axis], reading.specific_force
+def _write(value: float, sample: Sample, settings: Settings) -> bytes:
+    turned, force = _AXIS_SIGNS[settings.axis], sample.specific_force
     force = STANDARD_GRAVITY if force is None else force
     accelerations, rates = [0.0] * 3, [0.0] * 3
     axis = 'xyz'.index(settings.axis)
-    accelerations[axis], rates[axis] = -turned * force / _FORCE_PER_COUNT, turned * reading.value
+    accelerations[axis], rates[axis] = -turned * force / _FORCE_PER_COUNT, turned * value
     return b'#YPRAG=0.00,0.00,0.00,%.2f,%.2f,%.2f,%.2f,%.2f,%.2f\r\n' % (*accelerations, *rates)
 
 
 RAZOR = Protocol(
-    name='razor', description='Razor AHRS firmware, text with rad/s',
-    baud=57600, rate=50.0, sensitivity=1.0, splitter=partial(LineSplitter, 256, (b'#',)),
+    name='razor', text=__doc__,
+    baud=57600, rate=50.0, sensitivity=1.0, splitter=partial(LineSplitter, (b'#',)),
     parser=stateless(_parse), writer=stateless(_write), startup=b'#ox#o1',
     # just above the 16 bits of an ITG-3200, 0.06957 deg/s each, the widest range of these gyros
     full_scale=40.0)

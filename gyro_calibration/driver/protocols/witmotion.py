@@ -9,16 +9,20 @@
 # under the License.
 
 """
-WitMotion modules (WT901 and similar): frames of 11 bytes, ``55 type``, four numbers and a sum.
+WitMotion modules (WT901 and similar): frames of 11 bytes.
 
-The numbers are signed, with 16 bits, low byte first. Frames 52 hold the rates about x, y and z,
-2000 deg/s at 32768, and the temperature in hundredths of a degC. Frames 51, which come directly
-before, hold the accelerations, 16 g at 32768. Others (time, angle, field and more) are skipped.
-The sum is the low byte of the sum of the ten bytes before.
+They are ``55``, a type from 50 to 5F, eight bytes, and the low byte of the sum of the ten. Type 52
+has the rates about x, y, z, 2000 deg/s at 32768, and the temperature in hundredths of a degC; all
+are signed 16-bit numbers, low byte first. Type 51, directly before it, has the accelerations, 16 g
+at 32768. Other types are skipped. A new module sends ten samples a second at 9600 baud. For 200 a
+second it needs 115200 baud: set ``baud``, and ``sample_rate`` to the rate of the module.
 
-Source: WT901 data sheet v20-0702, sections 5.1.2 and 5.1.3. Older modules (BWT61CL data sheet
-v20-0630) have the temperature as count/340 + 36.53 degC, which is not distinguished here; whether
-a module that lies flat reports +1 g was not verified.
+``55 52 00 00 00 00 00 02 C4 09 76`` is 31.25 deg/s about z at 25 degC.
+
+Source: WT901 data sheet v20-0702, sections 5.1.2 and 5.1.3. Older modules (BWT61CL, data sheet
+v20-0630) send the temperature as count/340 + 36.53 degC. The frames do not identify the module, so
+the temperature of older modules is wrong. Not verified: whether a module that lies flat reports
++1 g.
 
 """
 
@@ -33,14 +37,13 @@ from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
     ROOM_TEMPERATURE,
+    Sample,
     Settings,
     STANDARD_GRAVITY,
     stateless,
     to_signed_count,
-    WrittenReading,
 )
 
-_RATE_PER_COUNT = math.radians(2000.0) / 0x8000
 _FORCE_PER_COUNT = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
 _ACCELERATION, _RATE = 0x51, 0x52
 _NUMBERS = struct.Struct('<2x4h')
@@ -63,12 +66,12 @@ class _Parser:
         return Reading(numbers[self._axis], temperature=numbers[3] * 0.01, specific_force=force)
 
 
-def _write(reading: WrittenReading, settings: Settings) -> bytes:
-    degrees = ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
-    rate = _frame(_RATE, reading.value, 100.0 * degrees, settings.axis)
-    if reading.specific_force is None:
+def _write(value: float, sample: Sample, settings: Settings) -> bytes:
+    degrees = ROOM_TEMPERATURE if sample.temperature is None else sample.temperature
+    rate = _frame(_RATE, value, 100.0 * degrees, settings.axis)
+    if sample.specific_force is None:
         return rate
-    force = reading.specific_force / _FORCE_PER_COUNT
+    force = sample.specific_force / _FORCE_PER_COUNT
     return _frame(_ACCELERATION, force, 100.0 * degrees, settings.axis) + rate
 
 
@@ -78,8 +81,8 @@ def _frame(kind: int, value: float, temperature: float, axis: str) -> bytes:
     return frame + bytes([sum(frame) & 0xFF])
 
 
-WITMOTION = Protocol(name='witmotion', description='WitMotion modules, binary', baud=9600,
-                     rate=10.0, sensitivity=_RATE_PER_COUNT,
+WITMOTION = Protocol(name='witmotion', text=__doc__, baud=9600,
+                     rate=10.0, sensitivity=math.radians(2000.0) / 0x8000,
                      splitter=partial(FrameSplitter, rb'\x55[\x50-\x5f].{9}', 11,
                                       lambda frame: sum(frame[:10]) & 0xFF == frame[10]),
                      parser=_Parser, writer=stateless(_write), largest_count=0x8000)

@@ -10,17 +10,10 @@
 
 """What is recorded is in the file, whole piece by whole piece: rows of a log, chunks of MCAP."""
 
-
+from gyro_calibration.cli.record import CsvRecorder, McapRecorder
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
-from gyro_calibration.driver.recorder import (
-    AtomicAppender,
-    CsvRecorder,
-    DiskFull,
-    McapRecorder,
-    recording_notes,
-)
-from gyro_calibration.logs.log import LogError, read_log
+from gyro_calibration.logs.log import read_log
 from gyro_calibration.logs.recording import read_recording
 import numpy as np
 import pytest
@@ -91,89 +84,11 @@ def test_rosbags_reads_what_is_recorded(tmp_path):
         assert covariance.tolist() == [1e6, 0.0, 0.0, 0.0, 1e6, 0.0, 0.0, 0.0, deviation ** 2]
 
 
-def test_a_file_that_is_there_is_never_written_to(tmp_path):
-    for name in ('a.csv', 'a.mcap'):
-        (tmp_path / name).write_text('precious')
-        with pytest.raises(FileExistsError):
-            AtomicAppender(str(tmp_path / name))
-        assert (tmp_path / name).read_text() == 'precious'
-
-
 def test_a_recording_of_nothing_leaves_no_file(tmp_path):
     for recorder in recorders(tmp_path):
         recorder.flush()
         recorder.close()
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize('name', ['a.csv', 'a.csv.gz', 'a.mcap'])
-def test_what_is_killed_before_its_first_piece_takes_no_name(tmp_path, name):
-    recorder = (McapRecorder if name.endswith('.mcap') else CsvRecorder)(
-        str(tmp_path / name), notes)
-    for stamp, sample in samples(50):
-        recorder.add_sample(stamp, sample)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_place_that_is_taken_meanwhile_is_not_written_to(tmp_path):
-    pieces = AtomicAppender(str(tmp_path / 'a.csv'))
-    (tmp_path / 'a.csv').write_text('precious')
-    with pytest.raises(LogError, match='another program has created it meanwhile'):
-        pieces.append(b'a piece')
-    pieces.close()
-    assert (tmp_path / 'a.csv').read_text() == 'precious'
-
-
-def test_a_piece_that_does_not_fit_is_taken_back(tmp_path, monkeypatch):
-    pieces = AtomicAppender(str(tmp_path / 'a.csv'))
-    pieces.append(b'whole\n')
-
-    class Full:
-        """A file on a disk that has room for three bytes."""
-
-        def __init__(self, file):
-            self.file, self.room = file, 3
-
-        def write(self, data):
-            if not self.room:
-                raise OSError(28, 'No space left on device')
-            count, self.room = self.file.write(data[:self.room]), 0
-            return count
-
-        def __getattr__(self, name):
-            return getattr(self.file, name)
-
-    file = pieces._file
-    monkeypatch.setattr(pieces, '_file', Full(file))
-    with pytest.raises(DiskFull, match='No space left on device'):
-        pieces.append(b'no longer whole\n')
-    monkeypatch.setattr(pieces, '_file', file)
-    pieces.append(b'there is room again\n')
-    pieces.close()
-    assert (tmp_path / 'a.csv').read_bytes() == b'whole\nthere is room again\n'
-
-
-def test_other_programs_read_the_whole_pieces_of_a_recording_on_a_full_disk(tmp_path, monkeypatch):
-    reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
-    recorder, append = McapRecorder(str(tmp_path / 'a.mcap'), notes), AtomicAppender.append
-
-    def without_room(pieces, piece):
-        if len(piece) > 100:
-            pieces.is_full = True
-            raise DiskFull(28, 'No space left on device')
-        append(pieces, piece)
-    for stamp, sample in samples(200):
-        recorder.add_sample(stamp, sample)
-    recorder.flush()
-    monkeypatch.setattr(AtomicAppender, 'append', without_room)
-    for stamp, sample in samples(400)[200:]:
-        recorder.add_sample(stamp, sample)
-    with pytest.raises(DiskFull):
-        recorder.flush()
-    recorder.close()
-    with open(tmp_path / 'a.mcap', 'rb') as file:
-        assert len(list(reading.make_reader(file).iter_messages(topics=['/imu/data_raw']))) == 200
-    assert len(read(tmp_path / 'a.mcap')) == 200
 
 
 def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
@@ -186,8 +101,3 @@ def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
     recorder.close()
     np.testing.assert_array_equal(read_log(tmp_path / 'a.csv').supply, 200 * [5.0] + 200 * [4.9])
     assert recorder.late_columns == {'source_current_a'}
-
-
-def test_about_names_the_program_and_leaves_out_what_is_not_known():
-    known = recording_notes(port='/dev/ttyUSB0', protocol='', baud=None)
-    assert set(known) == {'recorded by', 'date', 'port'}
