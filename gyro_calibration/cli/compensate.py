@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb compensate: add compensated rates, and for samples in time the heading, to a log."""
+"""
+Add compensated rates, and for samples in time the heading, to a log.
+
+example: gyro_calibration compensate drive.csv --model model.yaml --out compensated.csv
+
+"""
 
 from __future__ import annotations
 
@@ -41,10 +46,7 @@ from gyro_calibration.model.model_file import read_model
 import numpy as np
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'compensate', _compensate,
-                           'add compensated rates, and for samples in time the heading, to a log',
-                           'drive.csv --model model.yaml --out compensated.csv')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')
@@ -58,10 +60,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'the heading is held there, and the bias is estimated')
     parser.add_argument('--hindsight', action='store_true',
                         help='as --rest, and smooth the heading by all later samples')
-    return parser
 
 
-def _compensate(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Totals()
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
         raise UsageError('--rest and --hindsight need no --threshold and a model with an angle '

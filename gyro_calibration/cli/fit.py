@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb fit: from logs with a reference to a model and its accuracy."""
+"""
+Calibrate from a rate table, a turntable, an encoder, or any log with a reference.
+
+example: gyro_calibration fit table.csv --out model.yaml
+
+"""
 
 from __future__ import annotations
 
@@ -51,9 +56,7 @@ _DISPLAY_UNITS = {'1': ('%', 100.0), '1/K': ('ppm/K', 1e6), 'rad/s': ('deg/s', 1
                   's/rad': ('s/deg', DEGREE), 's²/rad²': ('s²/deg²', DEGREE ** 2)}
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an '
-                           'encoder, or any log with a reference', 'table.csv --out model.yaml')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
@@ -79,7 +82,6 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'matrix C of Ojeda et al., in deg/s and degC')
     verb.add_picture_option(parser, 'the errors before and after')
     verb.add_picture_option(parser, 'the error over rate and temperature', '--surface')
-    return parser
 
 
 def _parse_effects(text: str) -> list[Effect]:
@@ -102,7 +104,7 @@ def _parse_orders(text: str) -> list[Effect]:
     return [rate_temperature_polynomial(rate_order, temperature_order)]
 
 
-def _fit(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     logs = dict(zip(given.log, verb.read_each(given)))
     for log in logs.values():
         refuse_mismatch(log)

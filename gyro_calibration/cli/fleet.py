@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb fleet: many logs of many gyros, calibrated, diagnosed and pooled."""
+"""
+Calibrate and diagnose many logs, and attribute errors to unit, type and reference.
+
+example: gyro_calibration fleet drives/ --out fleet
+
+"""
 
 from __future__ import annotations
 
@@ -57,10 +62,7 @@ from gyro_calibration.model.model_file import format_model
 import numpy as np
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'fleet', _fleet,
-                           'calibrate and diagnose many logs of many gyros, and attribute '
-                           'errors to the unit, the type and the reference', 'drives/ --out fleet')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('logs', metavar='LOGS', nargs='+', help='logs, folders or globs of them, '
                         'a list (.txt), or a table (.csv) with the columns log and any of unit, '
                         'type, drive, date, temperature')
@@ -85,7 +87,6 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='memory limit per worker; default: an equal share of this machine')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
                         'as tcp://host:8786; its workers need the same files')
-    return parser
 
 
 def _parse_pattern(text: str) -> re.Pattern[str]:
@@ -95,7 +96,7 @@ def _parse_pattern(text: str) -> re.Pattern[str]:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def _fleet(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     logs = find_logs(given.logs, excluded_folder=given.out)
     folder = os.path.abspath(given.out)
     verb.require_folder(given.out)

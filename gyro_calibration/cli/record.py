@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb record: samples of a gyro, from its port or from topics, into a log or an MCAP file."""
+"""
+Record a gyro, from its port or from topics, until Ctrl-C.
+
+example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
+
+"""
 
 from __future__ import annotations
 
@@ -56,10 +61,7 @@ _MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'record', _record,
-                           'record a gyro, from its port or from topics, until Ctrl-C',
-                           '--port /dev/ttyUSB0 --out drive.csv')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', required=True, metavar='FILE',
                         help=f'a new file, {", ".join(FILE_SUFFIXES)}')
     parser.add_argument('--seconds', type=verb.positive_number, metavar='N',
@@ -92,10 +94,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                       'default: that of the protocol')
     port.add_argument('--sample-rate', type=verb.positive_number, metavar='HZ',
                       help='sample rate of the gyro; default: that of the protocol')
-    return parser
 
 
-def _record(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if not given.out.endswith(FILE_SUFFIXES):
         raise UsageError(f'{given.out} is no recording file; give a name that ends in '
                          f'{", ".join(FILE_SUFFIXES[:-1])} or {FILE_SUFFIXES[-1]}')
