@@ -32,7 +32,15 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio
 from gyro_calibration.files import to_printable, write_atomically
-from gyro_calibration.fleet.report import render_report, table_files
+from gyro_calibration.fleet.logs import (
+    compile_file_pattern,
+    DONE,
+    find_logs,
+    LogTask,
+    make_refused_record,
+    NO_EVIDENCE,
+    process_log,
+)
 from gyro_calibration.fleet.run import (
     cluster_executors,
     count_cores,
@@ -45,18 +53,12 @@ from gyro_calibration.fleet.summary import (
     COMPONENT_LABELS,
     describe_type,
     FALSE_ALARM_RATE,
+    render_report,
     summarize_types,
+    table_files,
     TypeSummary,
 )
 from gyro_calibration.fleet.summary import data as type_data
-from gyro_calibration.fleet.table import compile_file_pattern, find_logs
-from gyro_calibration.fleet.work import (
-    DONE,
-    LogTask,
-    make_refused_record,
-    NO_EVIDENCE,
-    process_log,
-)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model
 import numpy as np
@@ -185,7 +187,7 @@ def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
         memory = 1e9 * given.memory if given.memory else 0.8 * machine / workers
-        with process_executors(workers, memory, ['gyro_calibration.fleet.work']) as create:
+        with process_executors(workers, memory, ['gyro_calibration.fleet.logs']) as create:
             yield workers, create
         return
     try:
