@@ -11,14 +11,16 @@
 """
 Calibrate a gyro on half of a drive against its course over ground, and correct the other half.
 
-    python benchmarks/courses.py drives FOLDER      recordings, as `wheeled_drives`
-    python benchmarks/courses.py simulated [DRIVES] drives of a simulator of its own
+    python benchmarks/courses.py drives FOLDER      recordings, as `wheeled_drives`, by `fit`
+    python benchmarks/courses.py diagnoses FOLDER   the same by `diagnose`
+    python benchmarks/courses.py simulated [DRIVES] drives of a simulator of its own, by `fit`
 
 A model is judged by the heading that it gives in the half that it was not fitted on: the output is
 corrected and integrated, and compared with the course within windows of 60 s, each less its mean,
 at the lag where it fits best. Three models compete: nothing (no correction), a robust least
 squares (course = (1 + s) integral + b t + c at the best lag, residuals by their size), and
-`calibrate_encoder` as the verb `fit` calls it. A refusal counts as nothing.
+`calibrate_encoder` or `diagnose` as the verbs call them. A refusal counts as nothing. Of diagnoses
+it prints how many causes are found in the other half too, and how many values agree.
 
 The simulated car follows a bicycle model with side slip, its course comes at 10 Hz, smoothed over
 some tenths of a second, late or early, with noise that is correlated over a second, gaps below a
@@ -29,48 +31,40 @@ bias. None of it is code of the package.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import math
 from pathlib import Path
 import sys
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.logs.log import Array, DataRefused, Log, read_log, select_rows
+from gyro_calibration.diagnosis.findings import Finding
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log, select_rows
 import numpy as np
 
-DEGREE = math.pi / 180.0
 #: Length and distance of the windows, s; lags that are tried, s; distance of the points, s.
 WINDOW, STEP, LAGS, POINT = 60.0, 15.0, np.arange(-100, 101) * 0.02, 0.1
+#: What corrects the output of a log; what is said of it; the established causes.
+Answer = tuple[Callable[[Log], Array], str, list[Finding]]
 
 
-def half(log: Log, second: bool) -> Log:
-    """Return the first or the second half of a log."""
-    return select_rows(log, (log.time > log.time[0] + 0.5 *
-                             (log.time[-1] - log.time[0])) == second)
-
-
-def points(log: Log, lag: float, bias: float = 0.0,
-           scale: float = 1.0) -> tuple[Array, Array, Array]:
-    """
-    Return times, corrected headings and courses at points where the course is known.
-
-    The gyro being `lag` s late.
-    """
+def points(log: Log, rate: Array, lag: float) -> tuple[Array, Array, Array]:
+    """Return times, headings by rates, and courses where known, the gyro being `lag` s late."""
     known = np.flatnonzero(np.isfinite(log.reference_heading))
     at = known[np.unique(
         np.searchsorted(log.time[known], np.arange(log.time[known[0]], log.time[known[-1]],
                                                    POINT)))]
     at = at[(log.time[at] + lag >= log.time[0]) & (log.time[at] + lag <= log.time[-1])]
-    interval = np.diff(log.time, prepend=log.time[0])
-    rate = (log.output - bias) / scale
-    turned = np.cumsum(0.5 * (rate + np.append(rate[:1], rate[:-1])) * interval)
-    return log.time[at], np.interp(log.time[at] + lag, log.time, turned), log.reference_heading[at]
+    turned = np.interp(log.time[at] + lag, log.time, integrate(log.time, rate))
+    return log.time[at], turned, log.reference_heading[at]
 
 
-def error(log: Log, bias: float, scale: float) -> float:
-    """Return the heading error over windows, rms at the best lag, rad."""
+def error(log: Log, rate: Array) -> float:
+    """Return the heading error by rates over windows, rms at the best lag, rad."""
     def at(lag: float) -> float:
-        time, turned, course = points(log, lag, bias, scale)
+        time, turned, course = points(log, rate, lag)
         parts = []
         for start in np.arange(time[0], max(time[-1] - WINDOW, time[0]) + 1e-6, STEP):
             inside = (time >= start) & (time < start + WINDOW)
@@ -82,14 +76,10 @@ def error(log: Log, bias: float, scale: float) -> float:
 
 
 def robust(log: Log) -> tuple[float, float]:
-    """
-    Return bias and scale by least squares of the course on the integral.
-
-    Residuals counting by their size, at the best lag.
-    """
+    """Return bias and scale by least squares of the course, residuals counting by their size."""
     best = (math.inf, 0.0, 1.0)
     for lag in LAGS:
-        time, turned, course = points(log, lag)
+        time, turned, course = points(log, log.output, lag)
         columns, weights = np.column_stack([turned, time - time[0],
                                             np.ones(len(time))]), np.ones(len(time))
         for _ in range(8):
@@ -101,39 +91,70 @@ def robust(log: Log) -> tuple[float, float]:
     return best[1:]
 
 
-def judged(name: str, log: Log) -> Iterator[tuple[str, float, float, float, str]]:
-    """Give for each half the errors with nothing, by least squares, and by the calibration."""
+def fitted(log: Log) -> Answer:
+    """Calibrate as `fit` does."""
+    found = calibrate_encoder(log).fit
+    deviation = np.sqrt(np.diag(found.covariance))
+    return (lambda other: (other.output - found.bias) / (1.0 + found.scale_factor_error),
+            f's {100 * found.scale_factor_error:+.2f} +- {100 * deviation[0]:.2f} %, '
+            f'b {found.bias / DEGREE:+.4f} +- {deviation[1] / DEGREE:.4f} deg/s, lag '
+            f'{found.time_offset:+.2f} s', [])
+
+
+def diagnosed(log: Log) -> Answer:
+    """Calibrate as `diagnose` does, without a model."""
+    found = diagnose([log], np.random.default_rng(0))
+    causes = [each for each in found.findings if each.status == 'established']
+    return (lambda other: compensate_log(found.model, other),
+            f'{found.verdict}: {", ".join(each.effect for each in causes)}', causes)
+
+
+def agree(one: Finding, other: Finding) -> bool:
+    """Tell whether two values of a cause are within their intervals of 95 % of each other."""
+    a, b = one.parameters[one.effect], other.parameters[one.effect]
+    half = math.hypot(*(0.5 * (each.interval[1] - each.interval[0]) for each in (a, b)))
+    return abs(a.estimate - b.estimate) <= half + 1e-9 * abs(a.estimate)
+
+
+def judged(name: str, log: Log, calibrate: Callable[[Log], Answer]
+           ) -> Iterator[tuple[tuple[float, float, float], list[Finding]]]:
+    """Print and give for each half the errors with nothing, by least squares, and by an answer."""
+    is_second = log.time > log.time[0] + 0.5 * (log.time[-1] - log.time[0])
     for second in (False, True):
-        mine, other = half(log, second), half(log, not second)
-        nothing, squares = error(other, 0.0, 1.0), error(other, *robust(mine))
+        mine, other = (select_rows(log, is_second == each) for each in (second, not second))
+        bias, scale = robust(mine)
+        nothing, squares = error(other, other.output), error(other, (other.output - bias) / scale)
         try:
-            found = calibrate_encoder(mine).fit
-            ours = error(other, found.bias, 1.0 + found.scale_factor_error)
-            deviation = np.sqrt(np.diag(found.covariance))
-            words = (f's {100 * found.scale_factor_error:+.2f} +- {100 * deviation[0]:.2f} %, '
-                     f'b {found.bias / DEGREE:+.4f} +- {deviation[1] / DEGREE:.4f} deg/s, lag '
-                     f'{found.time_offset:+.2f} s')
+            correct, words, causes = calibrate(mine)
+            ours = error(other, correct(other))
         except DataRefused as refusal:
-            ours, words = math.nan, f'refused: {refusal}'
-        s = robust(mine)
-        words += f' | squares s {100 * (s[1] - 1):+.2f} % b {s[0] / DEGREE:+.4f}'
-        yield f'{name} {"second" if second else "first"}', nothing, squares, ours, words
+            ours, words, causes = math.nan, f'refused: {refusal}', []
+        print(f'{name} {"second" if second else "first":6s} {nothing / DEGREE:8.3f} '
+              f'{squares / DEGREE:8.3f} {ours / DEGREE:8.3f}  {words} | squares '
+              f's {100 * (scale - 1):+.2f} % b {bias / DEGREE:+.4f}', flush=True)
+        yield (nothing, squares, ours), causes
 
 
-def table(rows: list[tuple[str, float, float, float, str]]) -> Iterator[str]:
-    """Give a line a half, and the ratios to the better of nothing and least squares."""
-    for name, nothing, squares, ours, words in rows:
-        yield (f'{name:28s} {nothing / DEGREE:8.3f} {squares / DEGREE:8.3f} '
-               f'{ours / DEGREE:8.3f}  {words}')
-    values = np.array([row[1:4] for row in rows])
-    refused = np.isnan(values[:, 2])
-    ratio = np.where(refused, values[:, 0], values[:, 2]) / np.minimum(values[:, 0], values[:, 1])
-    yield (f'{len(rows)} halves, {refused.sum()} refused; error over the better of nothing and '
-           'least squares: median '
-           f'{np.median(ratio):.2f}, nine in ten {np.quantile(ratio, 0.9):.2f}, worst '
-           f'{ratio.max():.2f}; over least squares alone: median '
-           f'{np.nanmedian(values[:, 2] / values[:, 1]):.2f}, nine in ten '
-           f'{np.nanquantile(values[:, 2] / values[:, 1], 0.9):.2f}')
+def summary(halves: list[tuple[tuple[float, float, float], list[Finding]]]) -> Iterator[str]:
+    """Give the ratios to the better of nothing and least squares, and the causes found twice."""
+    nothing, squares, ours = np.array([errors for errors, _ in halves]).T
+    refused = np.isnan(ours)
+    ratio = np.where(refused, nothing, ours) / np.minimum(nothing, squares)
+    yield (f'{len(halves)} halves, {refused.sum()} refused; error over the better of nothing and '
+           f'least squares: median {np.median(ratio):.2f}, nine in ten '
+           f'{np.quantile(ratio, 0.9):.2f}, worst {ratio.max():.2f}; over least squares alone: '
+           f'median {np.nanmedian(ours / squares):.2f}, nine in ten '
+           f'{np.nanquantile(ours / squares, 0.9):.2f}')
+    causes, twins = [each for _, found in halves for each in found], []
+    for place, (_, found) in enumerate(halves):
+        twins += [next((other for other in halves[place ^ 1][1]
+                        if {each.effect, *each.ambiguous_with}
+                        & {other.effect, *other.ambiguous_with}), None) for each in found]
+    same = [agree(each, twin) for each, twin in zip(causes, twins) if twin is not None
+            and each.effect == twin.effect and each.effect in each.parameters]
+    if causes:
+        yield (f'{sum(each is not None for each in twins)} of {len(causes)} causes in the other '
+               f'half too; {sum(same)} of {len(same)} values agree')
 
 
 # a simulator of its own
@@ -208,7 +229,7 @@ def held(drives: int) -> Iterator[str]:
 
 def main(arguments: list[str]) -> None:
     """Print the table."""
-    if arguments[:1] == ['drives']:
+    if arguments[:1] in (['drives'], ['diagnoses']):
         files = sorted(Path(arguments[1]).glob('*.csv.gz'))
         logs = ((path.name.removesuffix('.csv.gz'), read_log(path)) for path in files
                 if 'as_recorded' not in path.name)
@@ -220,8 +241,9 @@ def main(arguments: list[str]) -> None:
                 for seed in range(max(drives // 4, 1)))
     else:
         raise SystemExit(__doc__)
-    rows = [row for name, log in logs for row in judged(name, log)]
-    print('\n'.join(table(rows)))
+    calibrate = diagnosed if arguments[0] == 'diagnoses' else fitted
+    print('\n'.join(summary([half for name, log in logs
+                             for half in judged(f'{name:24s}', log, calibrate)])))
 
 
 if __name__ == '__main__':

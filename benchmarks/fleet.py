@@ -32,6 +32,7 @@ from typing import Any
 from fleet_tasks import calibrate
 from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_calibrate
 from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.fleet.logs import find_logs, fit_slow_effects, LogTask, process_log
 from gyro_calibration.fleet.pooling import (
     DRIVES,
     Observations,
@@ -47,8 +48,6 @@ from gyro_calibration.fleet.summary import (
     find_missing_effects,
     summarize_types,
 )
-from gyro_calibration.fleet.table import find_logs
-from gyro_calibration.fleet.work import fit_slow_effects, LogTask, process_log
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, read_log, select_rows

@@ -201,7 +201,8 @@ def main(runs: int) -> None:
               flush=True)
     print(f'\n| scatter | {header}', flush=True)
     for seed, (name, table) in enumerate(SCATTERS.items()):
-        for words, terms in (('cubic', CUBIC), ('sine', SINE)):
+        for words, terms in (('cubic', CUBIC), ('sine', SINE),
+                             ('polynomial 3,2', (POLYNOMIAL,))):
             print(row(f'{name}; {words}', coverage(terms, table, runs, 100 + seed)), flush=True)
 
 

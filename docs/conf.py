@@ -10,6 +10,8 @@
 
 """Sphinx builds these pages with `make docs`; rosdoc2 builds the same for docs.ros.org."""
 
+from contextlib import redirect_stdout, suppress
+import io
 import math
 from pathlib import Path
 import re
@@ -48,6 +50,18 @@ html_css_files = ['tables.css']
 html_show_sourcelink = False
 
 
+def write_verbs(app):
+    """Write the page of the verbs, by their own help."""
+    from gyro_calibration.cli.main import find_verbs, make_parser
+    helps = {}
+    for name in find_verbs():
+        with redirect_stdout(io.StringIO()) as text, suppress(SystemExit):
+            make_parser(name).parse_args([name, '--help'])
+        helps[name] = text.getvalue()
+    (ROOT / 'docs/reference/verbs.md').write_text('# Options of the verbs\n\n' + '\n'.join(
+        f'## {name}\n\n```text\n{text}```\n' for name, text in helps.items()))
+
+
 def describe_entries(app, what, name, obj, options, lines):
     """Put what docstrings write as `name : description` in the place of a description."""
     lines[:] = [part for line in lines for part in _split_entry(line)]
@@ -83,6 +97,7 @@ def describe_formats(app, docname, source):
 
 
 def setup(app):
-    """Describe before napoleon (priority 500) reads the sections."""
+    """Write pages; describe before napoleon (priority 500) reads the sections."""
+    app.connect('builder-inited', write_verbs)
     app.connect('autodoc-process-docstring', describe_entries, priority=400)
     app.connect('source-read', describe_formats)

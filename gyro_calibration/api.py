@@ -33,25 +33,19 @@ from gyro_calibration.allan import (
     fit_noise,
     NoiseFit,
 )
-from gyro_calibration.calibration.dwells import extract_dwells, join_dwells
-from gyro_calibration.calibration.encoder import (
-    calibrate_encoder,
-    EncoderCalibration,
-    is_continuous_motion,
-)
+from gyro_calibration.calibration.encoder import EncoderCalibration
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
-from gyro_calibration.calibration.rate_table import fit_effects
-from gyro_calibration.calibration.selection import select_effects, Selection
+from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
 from gyro_calibration.cli import allan as allan_answer
 from gyro_calibration.cli import plots
 from gyro_calibration.cli.compensate import CompensatedBlock, integrate_log, track_log
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
-from gyro_calibration.cli.fit import draw_headings, dwell_lines, heading_lines
+from gyro_calibration.cli.fit import calibrate, draw_headings, dwell_lines, heading_lines
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.gates import REFERENCE_KINDS, refuse_mismatch
+from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
@@ -293,27 +287,21 @@ class Fitted(_PrintedResult):
     Attributes
     ----------
     model : with the fitted effects and their covariance
-    selection : effects, dwells and residuals; None where a reference heading was fitted
-    encoder : the fit of a reference heading; None where dwells were fitted
+    found : effects, dwells and residuals; or the fit of a reference heading
 
     """
 
     model: GyroModel
-    selection: Selection | None = field(default=None, repr=False)
-    encoder: EncoderCalibration | None = field(default=None, repr=False)
+    found: Selection | EncoderCalibration = field(repr=False)
 
     def __str__(self) -> str:
-        if self.selection is not None:
-            return '\n'.join(dwell_lines(self.model, self.selection))
-        assert self.encoder is not None
-        return '\n'.join(heading_lines(self.model, self.encoder, self.encoder.remarks))
+        return '\n'.join(dwell_lines(self.model, self.found) if isinstance(self.found, Selection)
+                         else heading_lines(self.model, self.found, self.found.remarks))
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the errors before and after the fit."""
-        if self.selection is not None:
-            return plots.draw_residuals(path, self.selection.calibration)
-        assert self.encoder is not None
-        return draw_headings(path, self.encoder)
+        return (plots.draw_residuals(path, self.found.calibration)
+                if isinstance(self.found, Selection) else draw_headings(path, self.found))
 
 
 def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,
@@ -333,26 +321,12 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
         _require_choice('effects', name, STATIC_EFFECTS)
     _require_choice('technology', technology, TECHNOLOGY_PRIORS)
     _require_choice('method', method, ('dwells', 'likelihood', 'course', 'rate'))
-    for log in logs:
-        refuse_mismatch(log)
-    alone = len(logs) == 1 and logs[0].time is not None and logs[0].reference_rate is None
-    if method in (None, 'likelihood', 'course', 'rate') and (
-            method or alone and not set(effects or ()) - {'bias', 'scale_factor_error'}):
-        if len(logs) != 1:
-            raise InputError('a reference heading is fitted in one log; give them one by one')
-        found = calibrate_encoder(logs[0], method, technology=technology or 'mems')
-        return Fitted(_set_technology(found.model, technology), encoder=found)
-    table = join_dwells([extract_dwells(log, name=str(number) if len(logs) > 1 else '')
-                         for number, log in enumerate(logs)])
-    if method is None and not effects and is_continuous_motion(logs, table):
-        return fit(logs[0], technology=technology, method='likelihood')
-    selection = (Selection(fit_effects(table, [STATIC_EFFECTS[name] for name in effects]), (), ())
-                 if effects else select_effects(table, technology))
-    return Fitted(_set_technology(selection.calibration.model, technology), selection)
-
-
-def _set_technology(model: GyroModel, technology: str | None) -> GyroModel:
-    return replace(model, gyro={'technology': technology}) if technology else model
+    found = calibrate({str(number): log for number, log in enumerate(logs)},
+                      [STATIC_EFFECTS[name] for name in effects or ()], method, technology)
+    model = found.calibration.model if isinstance(found, Selection) else found.model
+    if technology:
+        model = replace(model, gyro={'technology': technology})
+    return Fitted(model, found)
 
 
 @dataclass(frozen=True)

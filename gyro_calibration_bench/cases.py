@@ -32,8 +32,8 @@ from gyro_calibration_bench.hidden import (
     OUTSIDE_CATALOGUE,
     record_separating,
 )
+from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
 from gyro_calibration_bench.hidden.effects import MODEL_FINDINGS
-from gyro_calibration_bench.hidden.reference import hide_with_reference, ImperfectReference
 import numpy as np
 
 #: In the order of the tables.

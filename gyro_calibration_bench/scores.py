@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-import itertools
 from typing import Any
 
 from gyro_calibration_bench.hidden import Cause, OUTSIDE_CATALOGUE
 from gyro_calibration_bench.hidden.effects import COUNTED_FAULTS, STEP_EFFECTS
+import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.stats import binomtest
 
 #: Causes that no log can distinguish.
@@ -94,17 +95,20 @@ def judge_answer(causes: Sequence[Cause], findings: Sequence[NamedCause],
     wanted = {EQUIVALENT_CAUSES.get(cause.name, cause.name) for cause in causes}
     findings = [each for each in findings if each.effect not in allowed or each.effect in wanted]
     sets = [_names_in_set(each) for each in findings]
-    matched = _match_causes(sorted(wanted - set(OUTSIDE_CATALOGUE)), sets)
+    # as many hidden causes as possible have a separate finding that contains the cause
+    fits = np.array([[name in each for each in sets] for name in wanted], bool).reshape(
+        len(wanted), len(sets))
+    matched = int(fits[linear_sum_assignment(fits, maximize=True)].sum())
     extra = tuple(each.effect for each, names in zip(findings, sets) if not names & wanted)
     sizes = tuple(len(each) for each in sets if each & wanted)
-    complete = (len(matched) == len(wanted) == len(sizes) and max(sizes, default=0) <= MAX_SET_SIZE
+    complete = (matched == len(wanted) == len(sizes) and max(sizes, default=0) <= MAX_SET_SIZE
                 and not extra and not unexplained_variables)
     right = (bool(unexplained_variables) and not findings if wanted & set(OUTSIDE_CATALOGUE)
              else complete)
     return Judgement(
         bool(findings or unexplained_variables),
         bool(findings) and EQUIVALENT_CAUSES.get(findings[0].effect, findings[0].effect) in wanted,
-        len(matched) == len(wanted), sizes, extra, tuple(unexplained_variables), right,
+        matched == len(wanted), sizes, extra, tuple(unexplained_variables), right,
         interval_holds(causes, findings))
 
 
@@ -112,20 +116,6 @@ def _names_in_set(finding: NamedCause) -> set[str]:
     """Return the set of a finding; causes that no log can distinguish are one."""
     return {EQUIVALENT_CAUSES.get(name, name)
             for name in (finding.effect, *finding.ambiguous_with)}
-
-
-def _match_causes(wanted: Sequence[str], sets: Sequence[set[str]]) -> dict[str, int]:
-    """Assign to as many hidden causes as possible a separate finding that contains the cause."""
-    places: list[list[int | None]] = [
-        [*(place for place, each in enumerate(sets) if name in each), None] for name in wanted]
-    ways = (way for way in itertools.product(*places) if _is_injective(way))
-    best = max(ways, key=lambda way: sum(place is not None for place in way))
-    return {name: place for name, place in zip(wanted, best) if place is not None}
-
-
-def _is_injective(assignment: Sequence[int | None]) -> bool:
-    given = [place for place in assignment if place is not None]
-    return len(set(given)) == len(given)
 
 
 def interval_holds(causes: Iterable[Cause], findings: Sequence[NamedCause],

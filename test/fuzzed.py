@@ -34,7 +34,7 @@ import tempfile
 from typing import Any
 import zlib
 
-from gyro_calibration.cli.main import _make_parser
+from gyro_calibration.cli.main import find_verbs, make_parser
 from gyro_calibration.cli.plan import read_limits, write_motion
 from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.protocols import (
@@ -492,7 +492,7 @@ def _parameter_seeds() -> list[bytes]:
     return [bytes([place]) + value for place in range(0, 60, 4) for value in values]
 
 
-_program = cache(_make_parser)
+_verbs, _program = cache(find_verbs), cache(make_parser)
 
 
 def check_arguments(data: bytes) -> bool:
@@ -501,7 +501,7 @@ def check_arguments(data: bytes) -> bool:
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(
             io.StringIO()) as said:
         try:
-            _program().parse_args(words)
+            _program(words[0] if words[0] in _verbs() else '').parse_args(words)
         except SystemExit as end:
             assert end.code in (0, 2), end.code
             assert end.code == 0 or said.getvalue().endswith(' --help\n')

@@ -29,7 +29,7 @@ import sys
 import tracemalloc
 
 from fuzzed import SECONDS, TARGETS, WIRES
-from gyro_calibration.cli.main import _make_parser
+from gyro_calibration.cli.main import find_verbs, make_parser
 import pytest
 
 FUZZER = Path(__file__).parents[1] / 'benchmarks' / 'fuzz.py'
@@ -138,8 +138,9 @@ ODD = ['', ' ', 'nan', 'inf', '-inf', '1e999', '-1', '0', '1e-999', '9' * 5000, 
 
 def test_arbitrary_arguments_end_with_2_or_are_taken():
     """Each option of each verb with each odd value, as far as they are parsed; nothing is run."""
-    parser = _make_parser()
-    for verb, its in next(iter(parser._subparsers._group_actions)).choices.items():
+    for verb in find_verbs():
+        parser = make_parser(verb)
+        its = next(iter(parser._subparsers._group_actions)).choices[verb]
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             for option, value in itertools.product(its._option_string_actions, ODD):
                 try:

@@ -197,7 +197,8 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     fit = (fit_likelihood(time, output, motion, MAX_ENCODER_OFFSET, lag_deviation=2e-4)
            if method == 'likelihood' else _fit_by_rate(time, output, motion))
     refuse_unit_error(1.0 + fit.scale_factor_error, 'reference')
-    refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
+    refuse_scale(fit.scale_factor_error, 'reference',
+                 'give or omit --invert, or turn the gyro over')
     corrected = (output - fit.bias) / (1.0 + fit.scale_factor_error)
     drift = _estimate_drift(motion, _heading_residual(
         time - np.nan_to_num(fit.time_offset), corrected, motion).heading, fit.bias, technology)

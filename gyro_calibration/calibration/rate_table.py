@@ -527,7 +527,7 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
                           'record faster turns, or several sweeps')
     turns = select_dwells(dwells, wanted)
     scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
-    refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
+    refuse_scale(scale - 1.0, 'reference', 'give or omit --invert, or turn the gyro over')
     rests, remark = _find_rests(dwells)
     nearest = _find_nearest(dwells, turns, rests)
     static, modelled = (

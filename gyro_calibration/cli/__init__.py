@@ -11,11 +11,8 @@
 """
 The command line: one file for each verb.
 
-Each file has a function ``add`` that describes the verb to argparse, and a function from its
-arguments to an `Answer`. Units of the command line are converted to SI here.
+A file with a function ``run`` is a verb of its name. Its docstring is the help: a summary and an
+example. ``add`` describes the arguments to argparse, and ``run`` makes an `Answer` of them. Units
+of the command line are converted to SI here.
 
 """
-
-#: The files of the verbs, in the order of the help. Only that of the called verb is imported.
-VERBS = ('fit', 'compensate', 'self_calibrate', 'plan', 'allan', 'turn', 'diagnose', 'fleet',
-         'simulate', 'export', 'emulate', 'record', 'reproduce', 'demo')

@@ -8,7 +8,13 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb allan: Allan deviation and noise figures of a gyro at rest."""
+"""
+Find the noise figures of a gyro in a record at rest, by its Allan deviation.
+
+example: gyro_calibration allan rest.csv --rate 100 --picture allan.png --model model.yaml
+--out model.yaml
+
+"""
 
 from __future__ import annotations
 
@@ -39,21 +45,16 @@ DISPLAY_UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGRE
                  'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(
-        verbs, 'allan', _allan,
-        'find the noise figures of a gyro in a record at rest, by its Allan deviation',
-        'rest.csv --rate 100 --picture allan.png --model model.yaml --out model.yaml')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     verb.add_picture_option(parser, 'the chart')
     parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model to add the '
                         'noise figures to; default: a new one')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with these noise figures')
-    return parser
 
 
-def _allan(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if given.model and not given.out:
         raise UsageError('--model was given without --out; give the file to write with --out')
     model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)

@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb compensate: add compensated rates, and for samples in time the heading, to a log."""
+"""
+Add compensated rates, and for samples in time the heading, to a log.
+
+example: gyro_calibration compensate drive.csv --model model.yaml --out compensated.csv
+
+"""
 
 from __future__ import annotations
 
@@ -23,9 +28,8 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.integration import Intervals
 from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
-from gyro_calibration.heading.integration import BlockIntegrator, Threshold
+from gyro_calibration.heading.integration import BlockIntegrator, Intervals, Threshold
 from gyro_calibration.heading.log_compensation import (
     LogCompensation,
     no_plausible_row_message,
@@ -41,10 +45,7 @@ from gyro_calibration.model.model_file import read_model
 import numpy as np
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'compensate', _compensate,
-                           'add compensated rates, and for samples in time the heading, to a log',
-                           'drive.csv --model model.yaml --out compensated.csv')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')
@@ -58,10 +59,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'the heading is held there, and the bias is estimated')
     parser.add_argument('--hindsight', action='store_true',
                         help='as --rest, and smooth the heading by all later samples')
-    return parser
 
 
-def _compensate(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Totals()
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
         raise UsageError('--rest and --hindsight need no --threshold and a model with an angle '

@@ -8,29 +8,30 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb demo: all nodes on this machine, with an emulated gyro."""
+"""
+Run an emulated gyro, its driver, compensation, self-calibration and a drive here.
+
+example: gyro_calibration demo --out demo
+
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'demo', _demo, 'run an emulated gyro, its driver, compensation, '
-                           'self-calibration and a drive on this machine', '--out demo')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', default='demo', metavar='DIR',
                         help='folder for picture, table and log; default: %(default)s')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0,
                         help='seed of the noise; default: %(default)s')
-    return parser
 
 
-def _demo(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     try:
         from gyro_calibration.cli.demo_run import run_demo
     except ImportError as error:

@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb diagnose: the error of a simulation, its cause, the extended model and the gain."""
+"""
+Measure the error of a simulation, name the cause, extend the model, measure the gain.
+
+example: gyro_calibration diagnose drive.csv --model gyro.yaml --out diagnosis
+
+"""
 
 from __future__ import annotations
 
@@ -17,7 +22,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 import json
 from pathlib import Path
-from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError
@@ -35,10 +39,7 @@ from gyro_calibration.model.model_file import format_model, read_model
 import numpy as np
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'diagnose', _diagnose,
-                           'measure the error of a simulation, name the cause, extend the model, '
-                           'measure the gain', 'drive.csv --model gyro.yaml --out diagnosis')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
                         'ideal gyro with the bias and scale factor error that fit the logs best')
@@ -48,10 +49,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'model.yaml, the extended model')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
                         help='seed of the random draws of significance tests; default: 0')
-    return parser
 
 
-def _diagnose(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if given.out:
         verb.require_folder(given.out)
     logs = list(verb.read_each(given))
@@ -59,12 +59,7 @@ def _diagnose(given: argparse.Namespace) -> Answer:
     with show_progress('diagnosis') as on_progress:
         found = diagnose_logs(logs, model, given.seed, given.reference_kind, given.log,
                               on_progress)
-    found = replace(
-        found, logs=tuple(given.log),
-        findings=tuple(replace(each, remedy=verb.adapt_remedy(given, each.remedy))
-                       for each in found.findings),
-        gates=tuple(replace(each, remedy=verb.adapt_remedy(given, each.remedy))
-                    for each in found.gates))
+    found = replace(found, logs=tuple(given.log))
     if found.model is not model:
         origin = {**found.model.origin, **verb.make_origin(found.logs)}
         found = replace(found, model=replace(found.model, origin=origin))

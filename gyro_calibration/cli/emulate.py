@@ -8,7 +8,13 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb emulate: a gyro on a pseudo-terminal."""
+"""
+Emulate a gyro on a pseudo-terminal, from a model and a motion or from a log.
+
+example: gyro_calibration emulate --protocol kvh_dsp3000 --model model.yaml --motion robot
+--link /tmp/gyro
+
+"""
 
 from __future__ import annotations
 
@@ -29,11 +35,7 @@ from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(
-        verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from a model and a '
-        'motion or from a log; prints its path',
-        '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--protocol', required=True, metavar='NAME',
                         help=f'one of {", ".join(PROTOCOLS)}')
     source = parser.add_mutually_exclusive_group(required=True)
@@ -55,10 +57,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--repeat', action='store_true', help='start again at the end')
     verb.add_topic_options(parser)
     parser.set_defaults(**verb.DEFAULT_LOG_OPTIONS)
-    return parser
 
 
-def _emulate(given: argparse.Namespace) -> None:
+def run(given: argparse.Namespace) -> None:
     """Print the path at once, since this verb sends until it ends."""
     try:
         protocol, settings = find_protocol(given.protocol), Settings(

@@ -8,13 +8,17 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb export: a model as robot simulators read it."""
+"""
+Write a model as robot simulators read it.
+
+example: gyro_calibration export --to sdf model.yaml --sample-rate 100
+
+"""
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
@@ -23,9 +27,7 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.simulator_export import export_model, simulator_parameters, SIMULATORS
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'export', _export, 'write a model as robot simulators read it',
-                           '--to sdf model.yaml --sample-rate 100')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('model', metavar='MODEL.yaml')
     parser.add_argument('--to', required=True, choices=SIMULATORS,
                         help='sdf: noise of an <imu> of Gazebo; isaac: noise of an observation '
@@ -37,10 +39,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--span', type=verb.positive_number, default=3600.0, metavar='S',
                         help='longest time over which the bias drifts as modelled; default: 3600')
     parser.add_argument('--out', metavar='FILE', help='default: the text is printed')
-    return parser
 
 
-def _export(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     model = read_model(given.model)
     if given.span * given.sample_rate < 2.0:
         raise UsageError(f'--span {given.span:g} is shorter than two samples; give at least '

@@ -8,12 +8,17 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb fit: from logs with a reference to a model and its accuracy."""
+"""
+Calibrate from a rate table, a turntable, an encoder, or any log with a reference.
+
+example: gyro_calibration fit table.csv --out model.yaml
+
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -50,9 +55,7 @@ _DISPLAY_UNITS = {'1': ('%', 100.0), '1/K': ('ppm/K', 1e6), 'rad/s': ('deg/s', 1
                   's/rad': ('s/deg', DEGREE), 's²/rad²': ('s²/deg²', DEGREE ** 2)}
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an '
-                           'encoder, or any log with a reference', 'table.csv --out model.yaml')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
@@ -78,7 +81,6 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'matrix C of Ojeda et al., in deg/s and degC')
     verb.add_picture_option(parser, 'the errors before and after')
     verb.add_picture_option(parser, 'the error over rate and temperature', '--surface')
-    return parser
 
 
 def _parse_effects(text: str) -> list[Effect]:
@@ -101,52 +103,69 @@ def _parse_orders(text: str) -> list[Effect]:
     return [rate_temperature_polynomial(rate_order, temperature_order)]
 
 
-def _fit(given: argparse.Namespace) -> Answer:
-    logs = dict(zip(given.log, verb.read_each(given)))
-    for log in logs.values():
-        refuse_mismatch(log)
-    if _select_method(given, logs) == 'dwells':
-        return _fit_dwells(given, logs)
-    return _fit_heading(given, logs)
-
-
-def _select_method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
-    """Return the method, given or by the logs; '' selects it by the reference heading."""
-    if given.method:
-        return str(given.method)
-    chosen = ({effect.name for effect in given.effects or ()} - {'bias', 'scale_factor_error'}
-              or given.polynomial)
-    heading_alone = all(log.time is not None and log.reference_rate is None
-                        and log.reference_heading is not None for log in logs.values())
-    return '' if heading_alone and not chosen else 'dwells'
-
-
-def _store_model(given: argparse.Namespace, model: GyroModel) -> GyroModel:
-    """Return the model with its origin, and write it where --out is given."""
-    identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
-                'technology': given.technology}
-    model = replace(model, gyro={name: value for name, value in identity.items() if value},
-                    origin=verb.make_origin(given.log))
-    if given.out:
-        write_model(given.out, model)
-    return model
-
-
-def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if given.matrix and not given.polynomial:
         raise UsageError('--matrix needs --polynomial: other effects have no matrix')
-    effects = given.effects or given.polynomial
-    with show_progress('dwells') as on_progress:
+    effects = given.effects or given.polynomial or ()
+    logs = dict(zip(given.log, verb.read_each(given)))
+    with show_progress('fit of effects'):
+        found = calibrate(logs, effects, given.method, given.technology)
+    identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
+                'technology': given.technology}
+    model = replace(found.calibration.model if isinstance(found, Selection) else found.model,
+                    gyro={name: value for name, value in identity.items() if value},
+                    origin=verb.make_origin(given.log))
+    if given.surface and not isinstance(found, Selection):
+        raise UsageError(_HEADING_ALONE)
+    if given.out:
+        write_model(given.out, model)
+    lines, data = (_answer_dwells if isinstance(found, Selection) else _answer_heading)(
+        given, logs, model, found)
+    return Answer(lines, {'out': given.out, **_model_data(model), **data},
+                  (given.picture, given.surface, given.out))
+
+
+_HEADING_ALONE = ('a reference heading determines bias and scale_factor_error only; for other '
+                  'effects, --matrix and --surface use --method dwells')
+
+
+def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
+              technology: str | None = None) -> Selection | EncoderCalibration:
+    """
+    Calibrate by dwells, or by the reference heading of a single log.
+
+    Parameters
+    ----------
+    logs : of one gyro, by their names
+    effects : to fit; without any, those that the data support
+    method : dwells, likelihood, course or rate; None takes what the logs hold
+    technology : of the gyro, one of `TECHNOLOGY_EFFECTS`
+
+    """
+    for log in logs.values():
+        refuse_mismatch(log)
+    others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
+    by_dwells = method == 'dwells' or method is None and (bool(others) or not all(
+        log.time is not None and log.reference_rate is None and log.reference_heading is not None
+        for log in logs.values()))
+    if by_dwells:
         table = join_dwells([extract_dwells(log, name=Path(path).name if len(logs) > 1 else '')
                              for path, log in logs.items()])
-        if (not effects and given.method is None
-                and is_continuous_motion(list(logs.values()), table)):
-            return _fit_heading(given, logs)
-        on_progress(None, 'fit of effects')
-        selection = (Selection(fit_effects(table, effects), (), ()) if effects
-                     else select_effects(table, given.technology))
-    fit = selection.calibration
-    model = _store_model(given, fit.model)
+        if effects or method or not is_continuous_motion(list(logs.values()), table):
+            return (Selection(fit_effects(table, effects), (), ()) if effects
+                    else select_effects(table, technology))
+    if len(logs) > 1:
+        raise UsageError(f'--method {method or "likelihood"} takes one log; '
+                         'give one log, or use --method dwells')
+    if others:
+        raise UsageError(_HEADING_ALONE)
+    return calibrate_encoder(*logs.values(), method, technology=technology or 'mems')
+
+
+def _answer_dwells(given: argparse.Namespace, logs: Mapping[str, Log], model: GyroModel,
+                   found: Selection) -> tuple[list[str], dict[str, Any]]:
+    """Draw the dwells, and return lines for people and data."""
+    fit = found.calibration
     if given.picture:
         plots.draw_residuals(given.picture, fit)
     if given.surface:
@@ -154,52 +173,38 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
                                  fit.used)
     matrix = next((polynomial_to_matrix(term.effect, term.values).tolist() for term in model.terms
                    if term.effect.name == POLYNOMIAL), None)
-    lines = list(dwell_lines(model, selection))
-    if effects and given.technology:
+    lines = list(dwell_lines(model, found))
+    if given.technology and not found.choices:
         lines.append(f'--technology {given.technology} is stored in the model; it had no '
                      'influence, since the effects were given.')
     if given.matrix and matrix is not None:
         lines += ['', 'C of eq. 11 for deg/s and degC, highest powers of temperature above, '
                   'of the output to the left:',
                   *(' '.join(f'{value: .8e}' for value in row) for row in matrix)]
-    return Answer(lines, {'out': given.out, 'method': 'dwells', **_dwell_data(selection),
-                          **_model_data(model), 'matrix_dps': matrix,
-                          'remarks': list(table.remarks)},
-                  (given.picture, given.surface, given.out))
+    return lines, {'method': 'dwells', **_dwell_data(found), 'matrix_dps': matrix,
+                   'remarks': list(fit.dwells.remarks)}
 
 
-def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
-    """Fit a reference heading, or a reference rate without dwells."""
-    if len(logs) > 1:
-        raise UsageError(f'--method {given.method or "likelihood"} takes one log; '
-                         'give one log, or use --method dwells')
-    others = {effect.name for effect in given.effects or ()} - {'bias', 'scale_factor_error'}
-    if others or given.polynomial or given.surface or given.matrix:
-        raise UsageError('a reference heading determines bias and scale_factor_error only; for '
-                         'other effects, --matrix and --surface use --method dwells')
-    (path, log), = logs.items()
-    with show_progress('fit of scale factor error, bias and delay'):
-        found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
-    model, fit = _store_model(given, found.model), found.fit
+def _answer_heading(given: argparse.Namespace, logs: Mapping[str, Log], model: GyroModel,
+                    found: EncoderCalibration) -> tuple[list[str], dict[str, Any]]:
+    """Draw the headings, and return lines for people and data."""
+    ((path, log),), fit, remarks = logs.items(), found.fit, list(found.remarks)
     if given.picture:
         draw_headings(given.picture, found)
-    remarks = list(found.remarks)
     if log.reference_heading is None:
         remarks.insert(
             0, f'the log has a reference rate, and fewer than {MIN_DWELLS} stretches of '
             'constant rate; so the rate is integrated, and headings are compared. For other '
             'effects than bias and scale factor error, hold each rate for some seconds')
-    return Answer([f'{len(log)} samples of {path}, {found.lost_samples} lost.',
-                   *heading_lines(model, found, remarks)],
-                  {'out': given.out, 'method': found.method, **_model_data(model),
-                   'time_offset_s': fit.time_offset,
-                   'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
-                   'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
-                   'rms_heading_before_rad': found.residual_before.rms,
-                   'rms_heading_after_rad': found.residual_after.rms,
-                   'largest_heading_before_rad': found.residual_before.largest,
-                   'largest_heading_after_rad': found.residual_after.largest, 'remarks': remarks},
-                  (given.picture, given.out))
+    return ([f'{len(log)} samples of {path}, {found.lost_samples} lost.',
+             *heading_lines(model, found, remarks)],
+            {'method': found.method, 'time_offset_s': fit.time_offset,
+             'angle_random_walk_rad_per_root_s': fit.angle_random_walk,
+             'reference_noise_rad': fit.reference_noise, 'lost_samples': found.lost_samples,
+             **{f'{name}_heading_{when}_rad': getattr(residual, name)
+                for name in ('rms', 'largest') for when, residual in (
+                    ('before', found.residual_before), ('after', found.residual_after))},
+             'remarks': remarks})
 
 
 def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:

@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb fleet: many logs of many gyros, calibrated, diagnosed and pooled."""
+"""
+Calibrate and diagnose many logs, and attribute errors to unit, type and reference.
+
+example: gyro_calibration fleet drives/ --out fleet
+
+"""
 
 from __future__ import annotations
 
@@ -27,7 +32,15 @@ from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import is_degree_ratio
 from gyro_calibration.files import to_printable, write_atomically
-from gyro_calibration.fleet.report import render_report, table_files
+from gyro_calibration.fleet.logs import (
+    compile_file_pattern,
+    DONE,
+    find_logs,
+    LogTask,
+    make_refused_record,
+    NO_EVIDENCE,
+    process_log,
+)
 from gyro_calibration.fleet.run import (
     cluster_executors,
     count_cores,
@@ -40,27 +53,18 @@ from gyro_calibration.fleet.summary import (
     COMPONENT_LABELS,
     describe_type,
     FALSE_ALARM_RATE,
+    render_report,
     summarize_types,
+    table_files,
     TypeSummary,
 )
 from gyro_calibration.fleet.summary import data as type_data
-from gyro_calibration.fleet.table import compile_file_pattern, find_logs
-from gyro_calibration.fleet.work import (
-    DONE,
-    LogTask,
-    make_refused_record,
-    NO_EVIDENCE,
-    process_log,
-)
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import format_model
 import numpy as np
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'fleet', _fleet,
-                           'calibrate and diagnose many logs of many gyros, and attribute '
-                           'errors to the unit, the type and the reference', 'drives/ --out fleet')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('logs', metavar='LOGS', nargs='+', help='logs, folders or globs of them, '
                         'a list (.txt), or a table (.csv) with the columns log and any of unit, '
                         'type, drive, date, temperature')
@@ -85,7 +89,6 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='memory limit per worker; default: an equal share of this machine')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
                         'as tcp://host:8786; its workers need the same files')
-    return parser
 
 
 def _parse_pattern(text: str) -> re.Pattern[str]:
@@ -95,7 +98,7 @@ def _parse_pattern(text: str) -> re.Pattern[str]:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def _fleet(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     logs = find_logs(given.logs, excluded_folder=given.out)
     folder = os.path.abspath(given.out)
     verb.require_folder(given.out)
@@ -184,7 +187,7 @@ def _make_executors(given: argparse.Namespace) -> Iterator[Any]:
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
         memory = 1e9 * given.memory if given.memory else 0.8 * machine / workers
-        with process_executors(workers, memory, ['gyro_calibration.fleet.work']) as create:
+        with process_executors(workers, memory, ['gyro_calibration.fleet.logs']) as create:
             yield workers, create
         return
     try:

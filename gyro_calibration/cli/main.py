@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
@@ -30,8 +31,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
 from gyro_calibration import __version__
-from gyro_calibration.cli import VERBS
-from gyro_calibration.cli.verb import adapt_remedy, print_message, UsageError
+from gyro_calibration.cli.verb import print_message, UsageError
 from gyro_calibration.diagnosis.causes import add_causes
 from gyro_calibration.files import (
     describe_error,
@@ -48,7 +48,7 @@ import numpy as np
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb, print its answer, and return 0 (done), 1 (no answer) or 2 (wrong use)."""
     words = sys.argv[1:] if arguments is None else arguments
-    given = _make_parser(words[0] if words else '').parse_args(words)
+    given = make_parser(str(words[0]) if words else '').parse_args(words)
     try:
         for name, value in vars(given).items():
             # for example from a shell variable that is not set
@@ -56,11 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise UsageError(f'{name.replace("_", "-")} is empty; give a value or omit it')
         for path in given.catalogue:
             _load_effects(path)
-        answer = given.verb(given)
+        answer = given.run(given)
         text = (None if answer is None else answer.text if not given.json
                 else json.dumps(_replace_non_finite(answer.data), allow_nan=False))
     except DataRefused as error:
-        print_message(adapt_remedy(given, str(error)))
+        print_message(error)
         return 1
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
         print_message(f'the values exceed the range of computation ({describe_error(error)}); '
@@ -141,19 +141,31 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f'{self.prog}: {message}; see {self.prog} --help\n')
 
 
-def _make_parser(verb_name: str = '') -> argparse.ArgumentParser:
-    """Return the parser of the called verb, or of all verbs."""
+def find_verbs() -> dict[str, str]:
+    """Return the docstring of each verb, which are the files with a function ``run``."""
+    texts = {path.stem: path.read_text() for path in sorted(Path(__file__).parent.glob('*.py'))}
+    return {name.replace('_', '-'): ast.get_docstring(ast.parse(text)) or name
+            for name, text in texts.items() if '\ndef run(' in text}
+
+
+def make_parser(called: str = '') -> argparse.ArgumentParser:
+    """Return the parser of the verbs; only the called one is imported, and has its arguments."""
     parser = _Parser(prog='gyro_calibration',
                      description='Calibrate, compensate and diagnose gyros with one axis.')
     parser.add_argument('--version', action='version', version=__version__)
     verbs = parser.add_subparsers(required=True, metavar='VERB')
-    name = str(verb_name).replace('-', '_')
-    for verb in [name] if name in VERBS else VERBS:
-        verb_parser = import_module(f'gyro_calibration.cli.{verb}').add(verbs)
-        verb_parser.add_argument('--json', action='store_true',
-                                 help='print one JSON object and nothing else')
-        verb_parser.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
-                                 help='Python file, which is executed, with EFFECTS, a list of '
-                                 'further effects for models and diagnoses')
-        parser.options = re.findall(r'--[\w-]+', verb_parser.format_usage())
+    for name, text in find_verbs().items():
+        summary, example = (' '.join(part.split()) for part in text.split('\n\n'))
+        verb = verbs.add_parser(name, help=f'{summary[0].lower()}{summary[1:-1]}',
+                                description=summary, epilog=example)
+        if name == called:
+            module = import_module(f'gyro_calibration.cli.{name.replace("-", "_")}')
+            module.add(verb)
+            verb.set_defaults(run=module.run, name=name)
+            verb.add_argument('--json', action='store_true',
+                              help='print one JSON object and nothing else')
+            verb.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
+                              help='Python file, which is executed, with EFFECTS, a list of '
+                              'further effects for models and diagnoses')
+            parser.options = re.findall(r'--[\w-]+', verb.format_usage())
     return parser

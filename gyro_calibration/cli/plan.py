@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb plan: the motion that calibrates best within the limits of a robot."""
+"""
+Compute the motion that calibrates best within the limits of a robot.
+
+example: gyro_calibration plan --limits limits.yaml --seconds 20 --out profile.csv
+
+"""
 
 from __future__ import annotations
 
@@ -55,10 +60,7 @@ LIMIT_FIELDS = {
 COMPARED_DURATIONS, MAX_DURATION = (20.0, 30.0, 60.0, 120.0), 300.0
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'plan', _plan,
-                           'compute the motion that calibrates best within the limits of a robot',
-                           '--limits limits.yaml --seconds 20 --out profile.csv')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
                         help='limits of the robot; config/limits.yaml is an example')
     parser.add_argument('--seconds', type=verb.positive_number, default=20.0, metavar='S',
@@ -75,10 +77,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='length of that drive, which is repeated; default: its own length')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=1,
                         help='seed of the search; default: 1')
-    return parser
 
 
-def _plan(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if given.seconds > MAX_DURATION:
         raise UsageError(f'--seconds {given.seconds:g} is above {MAX_DURATION:g}; '
                          'plan a shorter motion and repeat it')

@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb record: samples of a gyro, from its port or from topics, into a log or an MCAP file."""
+"""
+Record a gyro, from its port or from topics, until Ctrl-C.
+
+example: gyro_calibration record --port /dev/ttyUSB0 --out drive.csv
+
+"""
 
 from __future__ import annotations
 
@@ -52,10 +57,7 @@ _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
 _HEADER_WAIT = 1.5  # s; for which the header of a log waits for values that come once a second
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'record', _record,
-                           'record a gyro, from its port or from topics, until Ctrl-C',
-                           '--port /dev/ttyUSB0 --out drive.csv')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', required=True, metavar='FILE',
                         help=f'a new file, {", ".join(_FILE_SUFFIXES)}')
     parser.add_argument('--seconds', type=verb.positive_number, metavar='N',
@@ -88,10 +90,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                       'default: that of the protocol')
     port.add_argument('--sample-rate', type=verb.positive_number, metavar='HZ',
                       help='sample rate of the gyro; default: that of the protocol')
-    return parser
 
 
-def _record(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if not given.out.endswith(_FILE_SUFFIXES):
         raise UsageError(f'{given.out} is no recording file; give a name that ends in '
                          f'{", ".join(_FILE_SUFFIXES[:-1])} or {_FILE_SUFFIXES[-1]}')

@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb reproduce: published numbers of the sources and those reproduced here."""
+"""
+Compare published numbers of the sources with those reproduced here.
+
+example: gyro_calibration reproduce hong_park
+
+"""
 
 from __future__ import annotations
 
@@ -28,19 +33,15 @@ import numpy as np
 TABLE_HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'reproduce', _reproduce,
-                           'compare published numbers of the sources with those reproduced here',
-                           'hong_park')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
                         help=f'one of {", ".join(SOURCES)}; default: all')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0,
                         help='seed of the noise; default: 0, as in '
                         'docs/explanation/reproduction.md')
-    return parser
 
 
-def _reproduce(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     """Reproduce each source with a generator of its own, independent of the other sources."""
     names = [given.source] if given.source else list(SOURCES)
     with show_progress(names[0]) as on_progress:

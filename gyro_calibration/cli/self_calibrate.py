@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb self-calibrate: scale factor error and bias from a known motion or from whole turns."""
+"""
+Find scale factor error and bias from about 20 s of known motion, or from whole turns.
+
+example: gyro_calibration self-calibrate run.csv --profile profile.csv --out model.yaml
+
+"""
 
 from __future__ import annotations
 
@@ -55,10 +60,7 @@ import numpy as np
 _NEAREST = 'nearest'
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'self-calibrate', _self_calibrate,
-                           'find scale factor error and bias from about 20 s of known motion',
-                           'run.csv --profile profile.csv --out model.yaml')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
                         'rate_dps; default: the reference of the log')
@@ -82,7 +84,6 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     verb.add_picture_option(parser, 'the run, and its heading error before and after')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with this self-calibration')
-    return parser
 
 
 def _parse_turns(text: str) -> int | str:
@@ -98,7 +99,7 @@ def _parse_turns(text: str) -> int | str:
     return value
 
 
-def _self_calibrate(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if given.turns is not None and given.profile:
         raise UsageError('--turns and --profile were both given; '
                          'give one of them as the reference')

@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb simulate: the log of a simulated gyro."""
+"""
+Write the log of a simulated gyro.
+
+example: gyro_calibration simulate --model model.yaml --motion robot --out log.csv --seed 1
+
+"""
 
 from __future__ import annotations
 
@@ -41,16 +46,13 @@ def add_motion_options(parser: argparse.ArgumentParser, **options: Any) -> None:
                         help='seed of the noise; default: random')
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'simulate', _simulate, 'write the log of a simulated gyro',
-                           '--model model.yaml --motion robot --out log.csv --seed 1')
+def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     add_motion_options(parser, required=True)
     parser.add_argument('--out', required=True, metavar='LOG.csv', help='.csv or .csv.gz')
-    return parser
 
 
-def _simulate(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     log, seed = simulate_log(given)
     duration = float(verb.require_time(given, log)[-1])
     write_log(given.out, replace(

@@ -8,7 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb turn: the error of a full turn, with a static bias only and with a model."""
+"""
+Compute the error of a full turn, with a static bias only and with a model.
+
+example: gyro_calibration turn table.csv --picture turn.png
+
+"""
 
 from __future__ import annotations
 
@@ -51,10 +56,7 @@ import numpy as np
 Bins: TypeAlias = 'list[tuple[float, float, Mask]]'
 
 
-def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb.add_verb(verbs, 'turn', _turn, 'compute the error of a full turn over rate and '
-                           'temperature, with a static bias only and with a model',
-                           'table.csv --picture turn.png')
+def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model to evaluate; default: the effects that the data support, '
@@ -69,10 +71,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--out', metavar='TURN.csv', help='write the table, one row per turn, in '
                         'SI units')
     verb.add_picture_option(parser, 'the errors over the rate')
-    return parser
 
 
-def _turn(given: argparse.Namespace) -> Answer:
+def run(given: argparse.Namespace) -> Answer:
     if given.model and given.technology:
         raise UsageError('--technology selects effects, and --model has its own; give one of '
                          'the two')

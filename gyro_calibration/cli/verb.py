@@ -118,15 +118,6 @@ def wrap_line(text: str, indent: int = 0) -> str:
                          break_on_hyphens=False)
 
 
-def add_verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None],
-             summary: str, example: str) -> argparse.ArgumentParser:
-    parser = verbs.add_parser(name, help=summary,
-                              description=f'{summary[0].upper()}{summary[1:]}.',
-                              epilog=f'example: gyro_calibration {name} {example}')
-    parser.set_defaults(verb=function, name=name)
-    return parser
-
-
 def add_picture_option(parser: argparse.ArgumentParser, what: str,
                        option: str = '--picture') -> None:
     parser.add_argument(option, type=_picture_file, metavar='FILE',
@@ -304,12 +295,6 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
 def sensitivity(given: argparse.Namespace) -> float | None:
     """Return --sensitivity, rad/s per count."""
     return None if given.sensitivity is None else given.sensitivity * DEGREE
-
-
-def adapt_remedy(given: argparse.Namespace, text: str) -> str:
-    """Return the remedy for a wrong sense that fits the options given."""
-    return (text.replace('give --invert', 'leave --invert out')
-            if getattr(given, 'invert', False) else text)
 
 
 def _orient_output(given: argparse.Namespace, log: Log) -> Log:

@@ -568,7 +568,7 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
                     '--sensitivity)')
     if name == '-1' or name is None and not is_implausible_factor(-factor):
         yield Gate('sense', False, f'{evidence}: the two count in opposite senses',
-                   'give --invert, or change the sign of the column of the gyro', known)
+                   'give or omit --invert, or change the sign of the column of the gyro', known)
     elif (name is None and power and log.reference_rate is None
             and 1.0 / MAX_GYRO_RATIO < abs(factor) / slower < MAX_GYRO_RATIO
             and _SAMPLE_INTERVAL_RANGE[0] < interval / slower < _SAMPLE_INTERVAL_RANGE[1]):

@@ -11,9 +11,8 @@
 """
 A fleet: many logs of many gyros, with errors attributed to the unit, the type and the reference.
 
-Reading order, each imports only from those before it: `table` (the unit of each log), `work` (on
-one log), `run` (of many tasks), `pooling` (of one value over the logs of a type, and its
-outliers), `summary` (of a type, and models for its units), `report` (the page, and tables for
-other programs).
+Reading order, each imports only from those before it: `logs` (the unit of each log, and the work
+on it), `run` (of many tasks), `pooling` (of one value over the logs of a type, and its outliers),
+`summary` (of a type: sentences, data, models, the page and tables).
 
 """

@@ -507,17 +507,24 @@ def _mixture_quantile(mean: Array, variance: Array, weight: Array, probability: 
 
 
 @dataclass(frozen=True)
-class Outlier:
-    """An outlying unit or drive."""
+class Alarm:
+    """An outlying unit or drive, or a unit whose value changed."""
 
-    group: int  # number of the unit or drive
-    excess: float  # difference from the prediction by the others, in the unit of the value
-    p_value: float  # of the largest difference of as many units or drives
+    name: str  # of the unit or drive
+    size: float  # of the difference from the prediction by the others, or of the change
+    p_value: float  # of the largest of as many units, drives or possible changes
+    since: str = ''  # first date after a change
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as data."""
+        size = {'since': self.since, 'size': self.size} if self.since else {'excess': self.size}
+        return {'name': self.name, **size, 'chance': self.p_value}
 
 
-def find_outliers(pooled: PooledValue, kind: str, significance: float) -> list[Outlier]:
+def find_outliers(pooled: PooledValue, kind: str, names: Sequence[str],
+                  significance: float) -> list[Alarm]:
     """
-    Return the outlying units or drives; `kind` is `UNITS` or `DRIVES`.
+    Return the outlying units or drives with these names; `kind` is `UNITS` or `DRIVES`.
 
     The significance is the probability of an outlier where there is none.
 
@@ -526,27 +533,18 @@ def find_outliers(pooled: PooledValue, kind: str, significance: float) -> list[O
     groups = np.unique(number[number >= 0]).tolist()
     if len(groups) < 4 or len(number) < 5 or kind not in pooled.variance_names:
         return []
-    found: list[Outlier] = []
+    found: list[Alarm] = []
     # Rosner's levels hold from 15 on
     for _ in range(min(len(groups) // 5, 10) if len(groups) >= 15 else 1):
-        place, pooled, excess, p_value = pooled.add_strongest([number == each for each in groups])
-        found.append(Outlier(groups.pop(place), excess, p_value))
+        place, pooled, size, p_value = pooled.add_strongest([number == each for each in groups])
+        found.append(Alarm(names[groups.pop(place)], size, p_value))
     last = max((place for place, each in enumerate(found, 1) if each.p_value < significance),
                default=0)
     return found[:last]
 
 
-@dataclass(frozen=True)
-class Change:
-    """A unit whose value changes at some date."""
-
-    unit: int
-    first_date: int  # number of the first date after the change
-    size: float  # of the change, in the unit of the value
-    p_value: float  # of the largest of as many possible changes
-
-
-def find_changes(pooled: PooledValue, date: IntegerArray, significance: float) -> list[Change]:
+def find_changes(pooled: PooledValue, date: IntegerArray, units: Sequence[str],
+                 dates: Sequence[str], significance: float) -> list[Alarm]:
     """
     Return the most significant change of a unit between dates, beyond the scatter of power-ons.
 
@@ -561,4 +559,5 @@ def find_changes(pooled: PooledValue, date: IntegerArray, significance: float) -
         return []
     place, _, size, p_value = pooled.add_strongest(
         [(unit == one) & (date >= since) for one, since in candidates])
-    return [Change(*candidates[place], size, p_value)] if p_value < significance else []
+    one, since = candidates[place]
+    return [Alarm(units[one], size, p_value, dates[since])] if p_value < significance else []

@@ -153,7 +153,7 @@ def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[in
 def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interval: Array | float,
                   step: Array | float) -> tuple[Array | float, Array | float]:
     """
-    Return the variance of the integral over a gap by motion, and the additional one by noise, rad².
+    Return the variance of the integral over a gap by motion, and the one by noise, rad².
 
     Parameters
     ----------

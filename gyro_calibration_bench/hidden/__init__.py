@@ -13,8 +13,7 @@ Logs with hidden effects, made independently of the package: nothing of it is im
 
 `hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE_CATALOGUE`
 those that are not in it; `hide_look_alike` and `record_separating` make the logs on which two
-causes are confounded, and on which they are distinguishable; `oracle_gain` is the improvement with
-the truth known.
+causes are confounded, and on which they are distinguishable.
 
 A size is a multiple of the minimum detectable effect beside a bias of each recording and one scale
 (`size`), with these exceptions: faults of samples are counted, and three are just detectable;
@@ -22,31 +21,32 @@ quantization and encoder steps have the size whose added variance is just detect
 has no size; a figure of the noise changes until its spectrum is as far from the expected one as a
 just detectable effect is from none.
 
-Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `likeness`, `log`,
-`twins`, `oracle`.
+Reading order: `motion`, `noise`, `effects`, `size`, `log`, `conditions`.
 
 """
 
-from gyro_calibration_bench.hidden.effects import FORMS
+from gyro_calibration_bench.hidden.conditions import (
+    hide_look_alike,
+    LOOK_ALIKES,
+    record_separating,
+)
+from gyro_calibration_bench.hidden.effects import FORMS, OUTSIDE_CATALOGUE
 from gyro_calibration_bench.hidden.log import (
-           ALL,
-           Cause,
-           draw_gyro,
-           Gyro,
-           HiddenLog,
-           hide,
-           record,
-           Truth,
+    ALL,
+    Cause,
+    draw_gyro,
+    Gyro,
+    HiddenLog,
+    hide,
+    record,
+    Truth,
 )
 from gyro_calibration_bench.hidden.motion import Session, session, session_from_motion
 from gyro_calibration_bench.hidden.noise import KINDS, NoiseFigures
-from gyro_calibration_bench.hidden.oracle import oracle_gain, OracleGain
-from gyro_calibration_bench.hidden.outside import OUTSIDE_CATALOGUE
 from gyro_calibration_bench.hidden.size import DETECTION_SIGMAS
-from gyro_calibration_bench.hidden.twins import hide_look_alike, LOOK_ALIKES, record_separating
 
 __all__ = [
     'ALL', 'DETECTION_SIGMAS', 'FORMS', 'KINDS', 'OUTSIDE_CATALOGUE', 'LOOK_ALIKES', 'Cause',
-    'Gyro', 'HiddenLog', 'NoiseFigures', 'OracleGain', 'Session', 'Truth', 'session_from_motion',
-    'draw_gyro', 'hide', 'oracle_gain', 'record_separating', 'record', 'session', 'hide_look_alike'
+    'Gyro', 'HiddenLog', 'NoiseFigures', 'Session', 'Truth', 'session_from_motion', 'draw_gyro',
+    'hide', 'record_separating', 'record', 'session', 'hide_look_alike'
 ]

@@ -32,6 +32,7 @@ from gyro_calibration_bench.hidden.effects import (
     effect_errors,
     EffectForm,
     FORMS,
+    OUTSIDE_CATALOGUE,
     sensed_rate,
     Shapes,
     slip_angle,
@@ -41,13 +42,12 @@ from gyro_calibration_bench.hidden.effects import (
     UNIT_FACTORS,
     WITHOUT_COLUMN,
 )
-from gyro_calibration_bench.hidden.likeness import Likeness
 from gyro_calibration_bench.hidden.motion import Session, session
 from gyro_calibration_bench.hidden.noise import draw_figures, generate_noise, NoiseFigures
-from gyro_calibration_bench.hidden.outside import OUTSIDE_CATALOGUE
 from gyro_calibration_bench.hidden.size import (
     DETECTION_SIGMAS,
     InformationMetric,
+    Likeness,
     solve_noise,
     solve_size,
 )

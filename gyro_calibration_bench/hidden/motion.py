@@ -15,10 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gyro_calibration_bench.hidden.filters import lag
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 #: Knots of the rate, s. A cubic B-spline through them is zero at rest, and its integral is exact.
 KNOT_INTERVAL = 0.05
@@ -231,10 +231,6 @@ PIECES = {
 }
 
 
-def _one_speed_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
-    return np.full(round(duration / KNOT_INTERVAL), top)
-
-
 def _two_way_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
     """Draw rests and turns of one speed both ways, with short ramps."""
     pieces, length = [], 0
@@ -248,10 +244,6 @@ def _two_way_motion(generator: np.random.Generator, duration: float, top: float)
                                                   top)])[:round(duration / KNOT_INTERVAL)], 2.0)
 
 
-def _slow_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
-    return _rich_motion(generator, duration, 0.3)
-
-
 def _smooth_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
     """Swing so slowly that lag and delay cannot be distinguished."""
     shape = gaussian_filter1d(generator.standard_normal(round(duration / KNOT_INTERVAL)),
@@ -263,17 +255,11 @@ def _smooth_motion(generator: np.random.Generator, duration: float, top: float) 
 
 MOTIONS = {
     'rich': _rich_motion,
-    'one_speed': _one_speed_motion,
+    'one_speed': lambda generator, duration, top: np.full(round(duration / KNOT_INTERVAL), top),
     'two_way': _two_way_motion,
-    'slow': _slow_motion,
+    'slow': lambda generator, duration, top: _rich_motion(generator, duration, 0.3),
     'smooth': _smooth_motion
 }
-
-
-def _chamber_temperature(generator: np.random.Generator, time: np.ndarray, corners: np.ndarray,
-                         degc: np.ndarray) -> np.ndarray:
-    """Follow a plan of straight lines with the lag of a heat capacity."""
-    return lag(np.interp(time, corners, degc), time[1] - time[0], generator.uniform(15.0, 40.0))
 
 
 def _warm_up_and_cycles(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
@@ -285,16 +271,8 @@ def _warm_up_and_cycles(generator: np.random.Generator, time: np.ndarray) -> np.
         len(corners)) * generator.choice([-1.0, 1.0])
     warm_up = generator.uniform(0.0, 8.0) * -np.exp(-time / generator.uniform(60.0, 250.0))
     return (generator.uniform(18.0, 35.0) + warm_up
-            + _chamber_temperature(generator, time, corners, swing))
-
-
-def _ramp_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    return generator.uniform(15.0, 25.0) + generator.uniform(8.0, 20.0) * time / time[-1]
-
-
-def _cold_start_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    return generator.uniform(30.0, 40.0) - generator.uniform(8.0, 15.0) * np.exp(
-        -time / (0.2 * time[-1]))
+            + lag(np.interp(time, corners, swing), time[1] - time[0],
+                  generator.uniform(15.0, 40.0)))
 
 
 def _triangle_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
@@ -303,28 +281,20 @@ def _triangle_temperature(generator: np.random.Generator, time: np.ndarray) -> n
     return 20.0 + speed * (turn - np.abs(time - turn))
 
 
-def _triangles_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    phase = (time / time[-1] * generator.integers(3, 6) + generator.random()) % 1.0
-    return 20.0 + 24.0 * np.abs(phase - 0.5)
-
-
-def _smooth_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    """Half a wave, slow beside any lag of a gyro."""
-    return 25.0 + generator.uniform(-10.0, 10.0) * np.cos(np.pi * time / time[-1])
-
-
-def _constant_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    return np.full(len(time), generator.uniform(20.0, 30.0))
-
-
 TEMPERATURES = {
     'rich': _warm_up_and_cycles,
-    'ramp': _ramp_temperature,
-    'cold_start': _cold_start_temperature,
+    'ramp': lambda generator, time: (
+        generator.uniform(15.0, 25.0) + generator.uniform(8.0, 20.0) * time / time[-1]),
+    'cold_start': lambda generator, time: (
+        generator.uniform(30.0, 40.0)
+        - generator.uniform(8.0, 15.0) * np.exp(-time / (0.2 * time[-1]))),
     'triangle': _triangle_temperature,
-    'triangles': _triangles_temperature,
-    'smooth': _smooth_temperature,
-    'constant': _constant_temperature
+    'triangles': lambda generator, time: 20.0 + 24.0 * np.abs(
+        (time / time[-1] * generator.integers(3, 6) + generator.random()) % 1.0 - 0.5),
+    # half a wave, slow beside any lag of a gyro
+    'smooth': lambda generator, time: (
+        25.0 + generator.uniform(-10.0, 10.0) * np.cos(np.pi * time / time[-1])),
+    'constant': lambda generator, time: np.full(len(time), generator.uniform(20.0, 30.0))
 }
 
 
@@ -339,17 +309,9 @@ def _stepped_supply(generator: np.random.Generator, time: np.ndarray,
                                               0.2) + 0.01 * wander / np.std(wander)
 
 
-def _heating_supply(generator: np.random.Generator, time: np.ndarray,
-                    temperature: np.ndarray) -> np.ndarray:
-    return 5.0 + 0.02 * (temperature - 25.0)
-
-
-def _constant_supply(generator: np.random.Generator, time: np.ndarray,
-                     temperature: np.ndarray) -> np.ndarray:
-    return np.full(len(time), 5.0)
-
-
-SUPPLIES = {'rich': _stepped_supply, 'heating': _heating_supply, 'constant': _constant_supply}
+SUPPLIES = {'rich': _stepped_supply,
+            'heating': lambda generator, time, temperature: 5.0 + 0.02 * (temperature - 25.0),
+            'constant': lambda generator, time, temperature: np.full(len(time), 5.0)}
 
 
 def _rich_force(generator: np.random.Generator, time: np.ndarray,
@@ -362,19 +324,9 @@ def _rich_force(generator: np.random.Generator, time: np.ndarray,
     starts = np.sort(generator.uniform(0.0, time[-1], generator.integers(10, 25)))
     levels = generator.choice([0.0, 1.0],
                               len(starts) + 1) * generator.uniform(0.3, 2.0, len(starts) + 1)
-    return GRAVITY * np.cos(angle), _random_vibration(generator, time,
-                                                      levels[np.searchsorted(starts, time)])
-
-
-def _random_vibration(generator: np.random.Generator, time: np.ndarray,
-                      level: np.ndarray) -> np.ndarray:
-    """Vibrate at random with this root mean square, m/s², that comes and goes within 0.5 s."""
-    return generator.standard_normal(len(time)) * lag(level, time[1] - time[0], 0.2)
-
-
-def _one_pose_force(generator: np.random.Generator, time: np.ndarray,
-                    rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.full(len(time), GRAVITY), np.zeros(len(time))
+    # the vibration comes and goes within 0.5 s
+    level = lag(levels[np.searchsorted(starts, time)], time[1] - time[0], 0.2)
+    return GRAVITY * np.cos(angle), generator.standard_normal(len(time)) * level
 
 
 def _turning_force(generator: np.random.Generator, time: np.ndarray,
@@ -384,10 +336,18 @@ def _turning_force(generator: np.random.Generator, time: np.ndarray,
             generator.choice([-1.0, 1.0], len(time)) * np.sqrt(np.abs(rate)))
 
 
-def _off_axis_force(generator: np.random.Generator, time: np.ndarray,
-                    rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return GRAVITY + 0.15 * rate ** 2, np.zeros(len(time))
+FORCES = {'rich': _rich_force,
+          'one_pose': lambda generator, time, rate: (np.full(len(time), GRAVITY),
+                                                     np.zeros(len(time))),
+          'turning': _turning_force,
+          'off_axis': lambda generator, time, rate: (GRAVITY + 0.15 * rate ** 2,
+                                                     np.zeros(len(time)))}
 
 
-FORCES = {'rich': _rich_force, 'one_pose': _one_pose_force, 'turning': _turning_force,
-          'off_axis': _off_axis_force}
+def lag(signal: np.ndarray, interval: float, time_constant: float) -> np.ndarray:
+    """Return the output of a first-order lag, exact for piecewise linear signals."""
+    decay = np.exp(-interval / time_constant)
+    ramp = time_constant / interval * -np.expm1(-interval / time_constant)
+    # x' = (u - x) / tau over one interval: x1 = decay x0 + (ramp - decay) u0 + (1 - ramp) u1
+    start = [ramp * signal[0]]
+    return lfilter([1.0 - ramp, ramp - decay], [1.0, -decay], signal, zi=start)[0]

@@ -24,9 +24,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration_bench.hidden.filters import autoregression
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.signal import lfilter
 
 #: Between the time constants of the ladder that makes flicker.
 TIME_CONSTANT_RATIO = 4.0
@@ -131,7 +131,7 @@ def generate_noise(figures: NoiseFigures, count: int, interval: float,
     for process in markov_processes(figures, count, interval):
         innovations = process.innovation * generator.standard_normal(count)
         innovations[0] *= process.first_deviation / process.innovation
-        slow += autoregression(innovations, process.factor)
+        slow += lfilter([1.0], [1.0, -process.factor], innovations)
     return white, slow
 
 

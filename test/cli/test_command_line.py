@@ -19,7 +19,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from gyro_calibration import cli as verbs
+from gyro_calibration.cli.main import find_verbs
 from gyro_calibration.driver.protocols import find_protocol
 from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
@@ -29,7 +29,7 @@ import pytest
 from tqdm import tqdm
 
 TURN = 2.0 * math.pi
-VERBS = [verb.replace('_', '-') for verb in verbs.VERBS]
+VERBS = list(find_verbs())
 GYRO = 'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: -0.1}}'
 NOISY_GYRO = GYRO + '\nnoise: {angle_random_walk: 7.3e-4}'
 

@@ -25,7 +25,7 @@ from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import DEGREE, QUANTITIES
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration_bench.hidden import hide
-from gyro_calibration_bench.hidden.twins import hide_look_alike, LOOK_ALIKES
+from gyro_calibration_bench.hidden.conditions import hide_look_alike, LOOK_ALIKES
 import numpy as np
 import pytest
 

@@ -25,7 +25,6 @@ from gyro_calibration_bench.hidden import (
     KINDS,
     LOOK_ALIKES,
     NoiseFigures,
-    oracle_gain,
     OUTSIDE_CATALOGUE,
     record,
     record_separating,
@@ -261,14 +260,6 @@ def test_what_is_outside_the_catalogue_is_mostly_not_explained_by_it(generator):
     assert np.mean([cause.likeness < 0.3
                     for cause in causes]) > 0.6, [(cause.name, cause.likeness) for cause in causes]
     assert all(cause.likeness <= cause.likeness_of_three + 0.02 for cause in causes)
-
-
-def test_an_oracle_wins_all_but_the_noise(generator):
-    log, = hide(['scale_factor_asymmetry', 'thermal_hysteresis'], 30.0, generator, noise='white',
-                **COARSE)
-    gain = oracle_gain(log)
-    assert gain.rate_after == pytest.approx(np.std(log.truth.noise), rel=0.01)
-    assert gain.rate > 0.01 and gain.heading > 0.3
 
 
 def test_a_gyro_is_recorded_again_under_conditions_that_others_plan(generator):

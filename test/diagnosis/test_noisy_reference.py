@@ -24,7 +24,7 @@ from gyro_calibration.logs.log import DataRefused, DEGREE, Log, select_rows
 from gyro_calibration.logs.recording import interpolate_with_gaps
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration_bench.hidden.reference import hide_with_reference, ImperfectReference
+from gyro_calibration_bench.hidden.conditions import hide_with_reference, ImperfectReference
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt

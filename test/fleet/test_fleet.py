@@ -27,18 +27,25 @@ from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.files import InputError
+from gyro_calibration.fleet.logs import (
+    compile_file_pattern,
+    describe_log,
+    find_logs,
+    FleetLog,
+    LogTask,
+    process_log,
+)
 from gyro_calibration.fleet.pooling import find_changes, find_outliers, Observations, PooledValue
-from gyro_calibration.fleet.report import render_report, table_files
 from gyro_calibration.fleet.run import cluster_executors, process_executors, run_tasks, WorkerLost
 from gyro_calibration.fleet.summary import (
     build_models,
     count_effects,
     data,
     describe_type,
+    render_report,
     summarize_types,
+    table_files,
 )
-from gyro_calibration.fleet.table import compile_file_pattern, describe_log, find_logs, FleetLog
-from gyro_calibration.fleet.work import LogTask, process_log
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
@@ -321,14 +328,15 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     generator = np.random.default_rng(8)
     values = generator.standard_normal((12, 1)) + 0.2 * generator.standard_normal((12, 6))
     date = np.tile(np.arange(6), 12)
-    assert find_outliers(PooledValue(crossed(values)), 'units', 0.01) == []
-    assert find_changes(PooledValue(crossed(values)), date, 0.01) == []
+    names = [str(number) for number in range(12)]
+    assert find_outliers(PooledValue(crossed(values)), 'units', names, 0.01) == []
+    assert find_changes(PooledValue(crossed(values)), date, names, names, 0.01) == []
     values[3] += 12.0
     values[7, 4:] += 3.0
     pooled = PooledValue(crossed(values))
-    assert [each.group for each in find_outliers(pooled, 'units', 0.01)] == [3]
-    (change,) = find_changes(pooled, date, 0.01)
-    assert ((change.unit, change.first_date) == (7, 4)
+    assert [each.name for each in find_outliers(pooled, 'units', names, 0.01)] == ['3']
+    (change,) = find_changes(pooled, date, names, names, 0.01)
+    assert ((change.name, change.since) == ('7', '4')
             and change.size == pytest.approx(3.0, abs=0.5))
 
 
