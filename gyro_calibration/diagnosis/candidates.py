@@ -233,12 +233,10 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 #: Prefix of the name of structure without a name; its variable follows.
 UNNAMED_PREFIX = '~'
-#: Numbers of waves over the range of rate and temperature, and of knots of splines.
+#: Numbers of waves over a turn or the range of rate or temperature, and of knots of splines.
 WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), 8
-#: Harmonics of the heading.
-HEADING_HARMONICS = range(2, 11)
 #: Widths of a bump in time as shares of the duration.
-BUMP_WIDTHS = (0.007, 0.02, 0.05)
+BUMP_WIDTHS = (0.01, 0.05)
 
 Variable = Callable[[Replay], Array]
 
@@ -261,7 +259,7 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
             yield _unnamed_term(name, _wave_columns(of, np.pi * count))
         yield _unnamed_term(name, _spline_columns(of))
     if 'rate' in variables:
-        for number in HEADING_HARMONICS:
+        for number in WAVE_COUNTS[1:]:
             yield _unnamed_term('heading', _wave_columns(_heading, number))
         for name, number in (('rate', 2), ('rate', 3), ('rate', 4), ('temperature', 1),
                              ('supply', 1)):

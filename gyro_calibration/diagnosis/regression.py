@@ -55,8 +55,9 @@ Indices = NDArray[np.intp]
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 MIN_INDEPENDENT_SHARE = 1e-7
 #: Longest averaging interval of filtered noise, s, and largest ratio of its power in the last to
-#: that in the second quarter of the frequencies.
-_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO = 0.25, 0.7
+#: that in the second quarter of the frequencies; of a smoothed record before causes are fitted
+#: (jumps have 0.18, noise not less).
+_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO, SMOOTHED_RATIO = 0.25, 0.7, 0.05
 
 
 @dataclass(frozen=True)
@@ -547,7 +548,8 @@ def _find_first_true(predicate: Callable[[float], bool], first: float) -> float:
 
 # filtered noise
 
-def average_filtered_noise(fit: RegressionFit) -> RegressionFit:
+def average_filtered_noise(fit: RegressionFit,
+                           max_ratio: float = _MAX_FILTERED_RATIO) -> RegressionFit:
     """
     Average neighbouring points of logs whose noise is filtered, until no filter shows.
 
@@ -558,9 +560,9 @@ def average_filtered_noise(fit: RegressionFit) -> RegressionFit:
 
     """
     while any(is_filtered := [
-            _high_frequency_power_ratio(part) < _MAX_FILTERED_RATIO
+            _high_frequency_power_ratio(part) < max_ratio
             and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME
-            for each, part in zip(fit.problem.replays, fit.whitened_transforms())]):
+            for each, part in zip(fit.problem.replays, fit.residual_transforms())]):
         fit = fit_causes(build_problem([replace(each, decimation=each.decimation * (1 + more))
                                         for each, more in zip(fit.problem.replays, is_filtered)]),
                          fit.causes)
