@@ -253,6 +253,9 @@ def unnamed_variable(candidate: Candidate) -> str:
 
 def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give the generic terms that these logs may show."""
+    def heading(each: Replay) -> Array:
+        return each.channels.heading
+
     variables = dict(_scaled_variables(replays))
     for name, of in variables.items():
         for count in WAVE_COUNTS if name in ('rate', 'temperature') else ():
@@ -260,12 +263,12 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
         yield _unnamed_term(name, _spline_columns(of))
     if 'rate' in variables:
         for number in WAVE_COUNTS[1:]:
-            yield _unnamed_term('heading', _wave_columns(_heading, number))
+            yield _unnamed_term('heading', _wave_columns(heading, number))
         for name, number in (('rate', 2), ('rate', 3), ('rate', 4), ('temperature', 1),
                              ('supply', 1)):
             if name in variables:
                 yield _unnamed_term(f'{name} and heading',
-                                    _wave_columns(_heading, number, variables[name]))
+                                    _wave_columns(heading, number, variables[name]))
     for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
             yield _unnamed_term(f'{first} and {second}', _product_columns(one, other))
@@ -301,10 +304,6 @@ def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable
 
 def _scale_to_unit_range(variable: Variable, low: float, high: float) -> Variable:
     return lambda each: np.clip((2.0 * variable(each) - low - high) / (high - low), -1.0, 1.0)
-
-
-def _heading(replay: Replay) -> Array:
-    return replay.channels.heading
 
 
 def _product_columns(one: Variable, other: Variable) -> ColumnFunction:

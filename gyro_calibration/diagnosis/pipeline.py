@@ -145,7 +145,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     false_alarm_rate : false alarms per diagnosis
     names : file names of the logs, for messages
     on_progress : is called with None and the name of each step that begins
-    reference_kind : of the reference, one of `expected_output.REFERENCE_KINDS`; None is found
+    reference_kind : of the reference, one of `gates.REFERENCE_KINDS`; None is found
         from the log
 
     Raises

@@ -235,11 +235,6 @@ class RegressionFit:
         """Return each log's residual whitened by the first noise: shape (points - 1,)."""
         return self.problem.split_by_log(self.residual - self.estimates[0] @ self.columns)
 
-    def whitened_transforms(self, noise_fit: RegressionFit | None = None) -> list[Array]:
-        """Return each log's whitened residual, by its own or another's noise: (points - 1,)."""
-        factors = (noise_fit or self).whitening_factors()
-        return [part * factor for part, factor in zip(self.residual_transforms(), factors)]
-
     def whitening_factors(self) -> list[Array]:
         """Return the factors to variance 1 of each log's coefficients, by the likeliest noise."""
         best = self.best_noise
@@ -248,8 +243,10 @@ class RegressionFit:
             * np.sqrt(self.degrees_of_freedom / self.residual_squares[best]))
 
     def whitened_series(self, noise_fit: RegressionFit | None = None) -> list[Array]:
-        """Return the residual of each log, whitened in time to variance 1: shape (points,)."""
-        return [inverse_cosine_transform(part) for part in self.whitened_transforms(noise_fit)]
+        """Return each log's residual, whitened by its own or another's noise: shape (points,)."""
+        factors = (noise_fit or self).whitening_factors()
+        return [inverse_cosine_transform(part * factor)
+                for part, factor in zip(self.residual_transforms(), factors)]
 
     # fitted values
 

@@ -242,11 +242,8 @@ def _search_strongest(search: Search, causes: Sequence[SelectedCause],
         each.candidate.cause, each.mean_evidence) > 0.0]
     if significant:
         top = max(first, key=lambda each: each.evidence)
-        # Causes that distort the rate are equal to first order; large ones need refined shapes.
-        alike = is_rate_distortion(top.candidate.cause)
-        worth = [each for each in first if (is_named(each.candidate) or each in significant) and (
-            each.evidence > 0.8 * top.evidence - 8.0
-            or alike and is_rate_distortion(each.candidate.cause))]
+        worth = [each for each in first if (is_named(each.candidate) or each in significant)
+                 and each.evidence > 0.8 * top.evidence - 8.0]
     else:
         worth = [each for each in first if is_lasting(each.candidate) and search.excess_evidence(
             each.candidate.cause, each.mean_evidence, SUSPECTED_RATE_FACTOR) > 0.0]
