@@ -21,9 +21,10 @@ integrals of the most likely rate ``w`` given both (with a course, that of the g
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
 with the integrals ``J``. A point is the mean over some samples; the observations are the
-differences between points, so that a gap of the reference is a long span. What differs between
-the kinds of references is in `ReferenceTreatment`. The computing time is proportional to the
-number of spans.
+differences between points, so that a gap of the reference is a long span. A rest in a gap, as of
+a vehicle whose course is lost then, is one more observation: a turn by 0. What differs between the
+kinds of references is in `ReferenceTreatment`. The computing time is proportional to the number of
+spans.
 
 A course over ground, the direction of travel by satellites, differs from the heading by the side
 slip. It is smoothed, late or early against the gyro, lost below some speed, and in bursts of some
@@ -78,7 +79,7 @@ from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
-from scipy.ndimage import median_filter
+from scipy.ndimage import binary_erosion, median_filter
 from scipy.stats import t as student
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
@@ -158,7 +159,7 @@ class CauseTerm(NamedTuple):
 
 @dataclass(frozen=True)
 class Spans:
-    """One log as n spans between n + 1 points."""
+    """One log as n spans between n + 1 points, and r rests."""
 
     log: Log  # with output, time and reference heading
     channels: Channels  # inputs of the effects; the rate is that of the gyro, as corrected so far
@@ -167,6 +168,8 @@ class Spans:
     # time, heading: of the points, s and rad, shape (n + 1,)
     time: Array
     heading: Array
+    # first and last row of each rest in a gap of the reference, shape (r, 2)
+    rests: NDArray[np.intp]
     treatment: ReferenceTreatment  # of the kind of the reference
     # the angle random walk by the white noise of the samples, with that of a reference rate, and
     # by the difference of gyro and reference over a second, the smaller first, rad/√s
@@ -180,22 +183,26 @@ class Spans:
 
     @property
     def is_measured(self) -> Mask:
-        """Tell which spans the output covers, shape (n,)."""
+        """Tell which spans and rests the output covers, shape (n + r,)."""
+        assert self.log.time is not None
         at, margin = self.time + self.delay, 0.5 * float(np.median(np.diff(self.time)))
+        first, last = np.concatenate([np.column_stack([at[:-1] - margin, at[1:] + margin]),
+                                      self.log.time[self.rests]]).T
         begin, end = self.holes[:, :, None].transpose(1, 0, 2)
-        return np.asarray(~((begin < at[1:] + margin) & (end > at[:-1] - margin)).any(axis=0))
+        return np.asarray(~((begin < last) & (end > first)).any(axis=0))
 
     @property
     def stretch_numbers(self) -> NDArray[np.intp]:
-        """Return the number of the stretch of each span, shape (n,)."""
+        """Return the number of the stretch of each observation, shape (n + r,)."""
         middle = 0.5 * (self.time[1:] + self.time[:-1]) - self.time[0]
         count = max(int(np.ceil(middle[-1] / self.treatment.stretch_duration)), 1)
-        return np.minimum(middle * count / (middle[-1] + 1e-9), count - 1).astype(np.intp)
+        of_spans = np.minimum(middle * count / (middle[-1] + 1e-9), count - 1).astype(np.intp)
+        return np.append(of_spans, count + np.arange(len(self.rests)))
 
     @property
     def shaft_sectors(self) -> NDArray[np.intp]:
         """
-        Return the number of the sector of 10 deg and sense of the shaft, shape (n,).
+        Return the number of the sector of 10 deg and sense of the shaft, shape (n + r,).
 
         If a motion repeats synchronously with the samples, the errors of an encoder repeat too.
         Stretches in time would count them as independent.
@@ -203,7 +210,7 @@ class Spans:
         """
         middle = self.point_means(np.asarray(self.channels.heading))
         sector = np.floor(0.5 * (middle[1:] + middle[:-1]) / (10.0 * DEGREE))
-        keys = 2.0 * sector + (np.diff(middle) > 0.0)
+        keys = np.append(2.0 * sector + (np.diff(middle) > 0.0), np.zeros(len(self.rests)))
         return np.unique(keys, return_inverse=True)[1].astype(np.intp)
 
     def point_means(self, values: Array) -> Array:
@@ -213,23 +220,26 @@ class Spans:
         return np.bincount(self.point_index, delayed_values) / np.bincount(self.point_index)
 
     def span_integrals(self, rate: Array) -> Array:
-        """Return the change of the integral of a rate over spans, shape (n,)."""
+        """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         assert self.log.time is not None
-        return self.span_changes(integrate_with_curvature(
-            self.log.time, np.broadcast_to(rate, self.log.time.shape)))
+        whole = integrate_with_curvature(self.log.time, np.broadcast_to(rate, self.log.time.shape))
+        return self.is_measured * np.append(np.diff(self.point_means(whole)),
+                                            np.diff(whole[self.rests])[:, 0])
 
     def span_changes(self, values: Array) -> Array:
-        """Return the change of a signal over spans, shape (n,)."""
-        return self.is_measured * np.diff(self.point_means(values))
+        """Return the change of a signal over spans, 0 over rests, shape (n + r,)."""
+        return self.is_measured * np.append(np.diff(self.point_means(values)),
+                                            np.zeros(len(self.rests)))
 
     @property
     def observed(self) -> Array:
-        """Return the change of the reference less that of the integral of the output, (n,)."""
+        """Return the change of the reference less that of the integral of the output, (n + r,)."""
         assert self.log.output is not None
-        return self.is_measured * np.diff(self.heading) - self.span_integrals(self.log.output)
+        turned = np.append(np.diff(self.heading), np.zeros(len(self.rests)))
+        return self.is_measured * turned - self.span_integrals(self.log.output)
 
     def base_columns(self) -> Array:
-        """Return the columns of scale factor error, bias and delay, shape (n, 3)."""
+        """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
         time, output = np.asarray(self.log.time), np.asarray(self.log.output)
         rate = np.asarray(self.channels.rate)
         turned = (np.asarray(self.channels.heading) if self.treatment.is_fine
@@ -242,7 +252,7 @@ class Spans:
                                 self.span_changes((forth - back) / (2.0 * half))])
 
     def cause_columns(self, cause: CauseTerm) -> Array:
-        """Return the columns of a cause, shape (n, k)."""
+        """Return the columns of a cause, shape (n + r, k)."""
         time, output, heading = map(np.asarray, (self.log.time, self.log.output,
                                                  self.channels.heading))
         if cause.cause == 'reference_once_per_rev':
@@ -287,7 +297,7 @@ class Spans:
             return heading_change / (1.0 + self.reference_noise_ratio ** 2)
         # what turned in a hole is known by the reference alone
         in_holes = np.append(0.0, np.cumsum(np.where(
-            self.is_measured, 0.0, np.diff(heading_change))))
+            self.is_measured[:len(heading_change) - 1], 0.0, np.diff(heading_change))))
         walk: Array = self.walk_bounds[0] ** 2 * np.diff(self.time)
         second = robust_deviation(np.diff(heading_change, 2)) ** 2
         stiffness = max(second / 6.0 - float(np.median(walk)) / 3.0, 0.0) / walk
@@ -304,6 +314,12 @@ class Spans:
         waves, parts = bias_wander_columns(self.time, *(
             (flicker, walk) if self.treatment.is_fine
             else (None, _COURSE_RANDOM_WALK_RANGE, _COURSE_COSINE_COUNT)))
+        assert self.log.time is not None
+        begin, end = self.time[0], self.time[-1]
+        omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
+        rest_times = np.clip(self.log.time[self.rests], begin, end)[:, :, None] - begin
+        rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
+        waves = np.concatenate([waves, rows])
         if self.treatment.is_fine:
             return waves, parts
         # a smoothed course errs in proportion to the acceleration, by less than this, s²
@@ -314,7 +330,7 @@ class Spans:
                  smoothing])
 
     def acceleration_changes(self) -> Array:
-        """Return the change of the acceleration, by the turns of half a second, shape (n,)."""
+        """Return the change of the acceleration, by the turns of half a second, shape (n + r,)."""
         assert self.log.time is not None and self.log.output is not None
         turned, half = integrate_with_curvature(self.log.time, self.log.output), 0.5
         after, now, before = (np.interp(self.log.time + shift, self.log.time, turned)
@@ -379,9 +395,21 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
                        heading=integrate(time, output))
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
                  np.bincount(place, reference[known]) / count,
-                 treatment,
+                 _find_rests(time, output, known), treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
                  find_holes(time[np.isfinite(measured)], length))
+
+
+def _find_rests(time: Array, output: Array, known: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return first and last row of 3 s and more of a quiet gyro in gaps of the reference."""
+    second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
+    blocks = len(output) // second
+    scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
+    is_lost = np.bincount(known // second, minlength=blocks)[:blocks] == 0
+    is_still = (binary_erosion(is_lost, border_value=1)
+                & (scatter <= 2.0 * scatter.min(initial=math.inf) + 1e-12))
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], is_still, [0]]))).reshape(-1, 2)
+    return np.asarray(ends[ends[:, 1] - ends[:, 0] >= 3] * second - [0, 1], dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -434,39 +462,43 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     prior = np.array(spans.treatment.prior)
     free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
+    count = len(spans.time) - 1
     delayed = replace(spans, delay=spans.delay or find_delay(spans))
-    point_variances: Array = np.ones(len(spans.time))
+    point_variances: Array = np.ones(count + 1)
     for _ in range(2):
         design = design_matrix(delayed, causes)
         if spans.treatment.is_fine:
             values = _robust_least_squares(design, delayed.observed, free)[0]
         else:
-            values, error = _fit_headings(design, delayed.observed, point_variances, free)
+            values, error = _fit_headings(design[:count], delayed.observed[:count],
+                                          point_variances, free)
             point_variances = _burst_variance(delayed.time, error)
         delayed = delayed.with_corrected_rate(values)
         if spans.treatment.is_fine:
             values[2] = 0.0
             left = delayed.observed - design_matrix(delayed, causes) @ values
-            point_variances = _point_variances(left)
+            point_variances = _point_variances(left[:count])
+    if len(spans.rests):
+        delayed = _drop_contradicted_rests(delayed, causes, point_variances)
     return _fit_with_noise(delayed, causes, point_variances)
 
 
 def find_delay(spans: Spans) -> float:
     """Return the trial delay of the best agreement of gyro and reference, s."""
-    prior = np.array(spans.treatment.prior)
+    count, prior = len(spans.time) - 1, np.array(spans.treatment.prior)
 
     def disagreement(delay: float) -> float:
         """Return the robust difference of gyro and reference at a delay, rad."""
         moved = replace(spans, delay=delay)
         if not spans.treatment.is_fine:
-            line = np.column_stack([np.ones(len(spans.time)), spans.time])
-            error = np.append(0.0, np.cumsum(moved.observed))
+            line = np.column_stack([np.ones(count + 1), spans.time])
+            error = np.append(0.0, np.cumsum(moved.observed[:count]))
             return float(np.mean(np.abs(robust_residual(line, error, 3))))
         left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
-        return float(np.mean(np.minimum(np.abs(left), 10.0 * DEGREE)))
+        return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
 
-    count = int(_DELAY_SIGMAS * prior[2] / _DELAY_STEP + 1e-6)
-    return min((_DELAY_STEP * np.arange(-count, count + 1)).tolist(), key=disagreement)
+    most = int(_DELAY_SIGMAS * prior[2] / _DELAY_STEP + 1e-6)
+    return min((_DELAY_STEP * np.arange(-most, most + 1)).tolist(), key=disagreement)
 
 
 def design_matrix(spans: Spans, causes: Sequence[CauseTerm]) -> Array:
@@ -487,6 +519,16 @@ def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tupl
             rows, np.append(observed * weight, np.zeros(len(prior))), rcond=None)[0])
         left = np.asarray(observed - columns @ values)
     return values, left
+
+
+def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm],
+                             point_variances: Array) -> Spans:
+    """Return the spans without rests whose rate is not the bias that the course shows."""
+    assert spans.log.output is not None
+    by_course = _fit_with_noise(replace(spans, rests=spans.rests[:0]), causes, point_variances)
+    rates = np.array([spans.log.output[first:last].mean() for first, last in spans.rests])
+    agree = np.abs(rates - by_course.values[1]) < by_course.half_width(1)
+    return replace(spans, rests=spans.rests[agree])
 
 
 def _fit_headings(design: Array, observed: Array, point_variances: Array,
@@ -529,6 +571,8 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     columns, (least, most) = design_matrix(spans, causes), spans.walk_bounds
     low, high = spans.treatment.walk_range
     rates = spans.point_means(np.asarray(spans.channels.rate))
+    assert spans.log.time is not None
+    durations = np.diff(spans.log.time[spans.rests])[:, 0]
     prior = spans.treatment.prior
     deviation = np.append(prior, np.full(columns.shape[1] - len(prior), np.inf))
     observed, (waves, shared) = spans.observed, spans.bias_wander()
@@ -536,10 +580,14 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     def fit_with(correlation: Array | None = None, **options: Any) -> GridFit:
         parts = heading_noise(spans.time, rates, point_variances, correlation=correlation,
                               angle_random_walk=(low * least, high * most))
+        parts = [replace(part, diagonal=np.append(part.diagonal, of_rests),
+                         off_diagonal=None if part.off_diagonal is None
+                         else np.append(part.off_diagonal, 0.0 * durations))
+                 for part, of_rests in zip(parts, (durations, 0.0 * durations, 0.0 * durations))]
         return fit_noise_grid(
             observed, columns, parts if spans.treatment.errs_as_heading else parts[:1], waves,
             shared, prior_deviation=deviation, carried=None if correlation is None
-            else carried_shares(correlation), **options)
+            else np.append(carried_shares(correlation), 0.0 * durations), **options)
 
     if spans.treatment.is_fine:
         fit = fit_with()
@@ -627,7 +675,7 @@ class WhitenedRegression:
 
     """
 
-    observed: Array  # shape (n + m,)
+    observed: Array  # shape (n + r + m,)
     # columns of scale factor error, bias, delay and causes, then those of the wander
     design: Array
     # numbers of the stretch of each row, and, of an encoder, of the place of the shaft
@@ -636,7 +684,7 @@ class WhitenedRegression:
     noise: GridFit  # that whitens
 
     def whiten_columns(self, columns: Array) -> Array:
-        """Return more columns, shape (n, k), in units of the noise, (n + m, k)."""
+        """Return more columns, shape (n + r, k), in units of the noise, (n + r + m, k)."""
         more = len(self.observed) - len(columns)
         return np.pad(self.noise.whiten(columns), ((0, more), (0, 0)))
 
@@ -697,7 +745,7 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
     turned = np.diff(spans.heading)
     # a bias is the same in each span
     residual, variation = (robust_deviation(each - np.median(each))
-                           for each in (fit.spans.observed, turned))
+                           for each in (fit.spans.observed[:len(turned)], turned))
     if residual > max(MAX_FOLLOWED_RESIDUAL, 0.5 * variation):
         raise DataRefused(f'from span to span of {length:.0f} s the course turns by '
                           f'{variation / DEGREE:.1f} deg, and less the gyro by '
@@ -720,9 +768,10 @@ def is_noisy(log: Log) -> bool:
                          ) > MAX_ROUNDING_STEP:
         return False
     spans = lay_out_spans(log)
-    if len(spans.time) <= MIN_SPANS:
+    count = len(spans.time) - 1
+    if count < MIN_SPANS:
         return False
     spans = replace(spans, delay=find_delay(spans))
-    columns = np.column_stack([spans.base_columns(), spans.acceleration_changes()])
-    residual = robust_residual(columns, spans.observed, 10)
+    columns = np.column_stack([spans.base_columns(), spans.acceleration_changes()])[:count]
+    residual = robust_residual(columns, spans.observed[:count], 10)
     return robust_deviation(residual) > math.sqrt(2.0) * MIN_COURSE_NOISE

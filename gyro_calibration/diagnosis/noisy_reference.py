@@ -312,12 +312,12 @@ def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
     values = fit.values.copy()
     values[2] -= fit.spans.delay
     columns = design_matrix(fit.spans, fit.causes) * values
-    found: dict[str, Array] = {name: columns[:, place] for place, name in enumerate(BASE_VALUES)
-                               if name != 'time_offset'}
+    found = {name: columns[:, place]
+             for place, name in enumerate(BASE_VALUES) if name != 'time_offset'}
     for cause in fit.causes:
         found[cause.cause] = columns[:, fit.value_slice(cause)].sum(axis=1)
     found['left'] = fit.spans.observed - columns.sum(axis=1)
-    return found
+    return {name: part[:len(fit.spans.time) - 1] for name, part in found.items()}
 
 
 def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
@@ -401,7 +401,7 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
     """Return the residual along the rate, and the measured and simulated rate over time."""
     steps, time = np.diff(fit.spans.time), fit.spans.time
     assert fit.spans.log.output is not None
-    measured = fit.spans.span_integrals(fit.spans.log.output) / steps
+    measured = fit.spans.span_integrals(fit.spans.log.output)[:len(steps)] / steps
     before, after = (-each / steps
                      for each in (sum(parts.values(), 0.0 * parts['left']), parts['left']))
     order = np.array_split(np.argsort(measured, kind='stable'), min(20, len(steps) // 4 + 1))
