@@ -104,8 +104,8 @@ _COURSE_CORRELATIONS = (0.0, 0.2, 0.4, 0.6, 0.8)
 BASE_VALUES = ('scale_factor_error', 'bias', 'time_offset')
 #: Least effective number of stretches of an established value.
 MIN_STRETCHES = 3.0
-#: Trial delays of a reference, s.
-_TRIAL_DELAYS = np.arange(-1.5, 1.501, 0.05)
+#: Distance of trial delays, s, and the largest in standard deviations of the prior.
+_DELAY_STEP, _DELAY_SIGMAS = 0.05, 1.5
 #: Bias instability and rate random walk, in rad/s and rad/s/√s, relative to the angle random walk.
 _FLICKER_RANGE, _RANDOM_WALK_RANGE = (3e-3, 0.5), (1e-4, 0.1)
 #: Largest angle random walk of a gyro in a vehicle, rad/√s (1.7 deg/√h); more white noise is
@@ -141,7 +141,7 @@ _TREATMENTS = {
     'rate_command': replace(HEADING_TREATMENT, errs_as_heading=False),
     # on the host of the gyro: small delays, as a swing agrees again a period later
     'encoder': replace(HEADING_TREATMENT,
-                       prior=(*HEADING_TREATMENT.prior[:2], MAX_ENCODER_OFFSET / 1.5)),
+                       prior=(*HEADING_TREATMENT.prior[:2], MAX_ENCODER_OFFSET / _DELAY_SIGMAS)),
     'motion_capture': HEADING_TREATMENT, 'gyro': HEADING_TREATMENT}
 
 
@@ -497,8 +497,8 @@ def find_delay(spans: Spans) -> float:
         left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
         return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
 
-    return float(min(_TRIAL_DELAYS[np.abs(_TRIAL_DELAYS) <= 1.5 * prior[2]].tolist(),
-                     key=disagreement))
+    most = int(_DELAY_SIGMAS * prior[2] / _DELAY_STEP + 1e-6)
+    return min((_DELAY_STEP * np.arange(-most, most + 1)).tolist(), key=disagreement)
 
 
 def design_matrix(spans: Spans, causes: Sequence[CauseTerm]) -> Array:

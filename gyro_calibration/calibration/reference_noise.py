@@ -36,8 +36,6 @@ _COMPARISON_SPAN = 1.0
 #: Largest error of an exact reference heading as a share of the difference of the headings over a
 #: second: a fifth of its variance.
 _MAX_HEADING_ERROR_SHARE = 0.25
-#: Largest number of tones, and the probability of each in noise alone.
-_MAX_TONES, _TONE_CHANCE = 10, 1e-6
 #: Numerical error of a heading, rad.
 _NUMERICAL_ERROR = 1e-9
 #: Neighbouring third differences have a correlation of -0.75 for white noise, of -0.67 for a
@@ -122,8 +120,6 @@ class HeadingDifference:
     # standard deviation of the part that does not grow with time, rad: errors of the reference, of
     # stamps, or by vibration of the gyro
     constant_error: float
-    # angle random walk of the rest, at most that of the white noise of the gyro, rad/√s
-    walk: float
     # angle random walk that is equivalent to the whole difference in a second, rad/√s
     total_walk: float
 
@@ -147,10 +143,6 @@ def heading_difference(log: Log) -> HeadingDifference:
     interval, output = float(np.median(np.diff(log.time))), bridge_gaps(log.output)
     turned, heading = integrate_with_curvature(log.time, output), log.reference_heading
     slope = np.gradient(output, log.time)
-    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
-        rate = bridge_gaps(log.reference_rate)
-        motion = np.column_stack([output, slope, np.ones(len(output))])
-        heading = integrate_with_curvature(log.time, rate + _fit_tones(output - rate, motion))
     assert heading is not None
     longest = max(round(_COMPARISON_SPAN / interval), 4)
     variance = {}
@@ -164,32 +156,9 @@ def heading_difference(log: Log) -> HeadingDifference:
             variance[lag / longest] = (float(np.quantile(np.abs(left), 0.9))
                                        / float(stats.norm.isf(0.05))) ** 2
     whole = variance.pop(1.0, 0.0)
-    error = max(((each - part * whole) / (6.0 * (1.0 - part)) for part, each in variance.items()),
-                default=0.0)
-    error = max(error, 0.0)
-    white = white_noise_deviation(log.output) * math.sqrt(interval)
-    walk = math.sqrt(max(whole - 6.0 * error, 0.0) / (2.0 * _COMPARISON_SPAN))
-    return HeadingDifference(math.sqrt(error), min(white, walk),
-                             math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
-
-
-def _fit_tones(difference: Array, motion: Array) -> Array:
-    """Return the tones in the difference of gyro and reference rate, shape (n,)."""
-    residual = difference - motion @ np.linalg.lstsq(motion, difference, rcond=None)[0]
-    count, tones = len(residual), np.zeros(len(residual))
-    for _ in range(_MAX_TONES):
-        power = np.abs(np.fft.rfft(residual, 2 * count)) ** 2
-        best = _BLOCK_SAMPLES + int(power[_BLOCK_SAMPLES:-2].argmax())
-        level = float(np.median(power[max(best - 100, 0):best + 100])) / math.log(2.0)
-        if power[best] < level * math.log(count / _TONE_CHANCE):
-            break
-        low, high = (float(np.sqrt(power[best + side])) for side in (-1, 1))
-        place = best + 0.5 * (low - high) / (low - 2.0 * float(np.sqrt(power[best])) + high)
-        phase = math.pi * place / count * np.arange(count)
-        wave = np.column_stack([np.cos(phase), np.sin(phase)])
-        tone = wave @ np.linalg.lstsq(wave, residual, rcond=None)[0]
-        residual, tones = residual - tone, tones + tone
-    return tones
+    error = max([0.0, *((each - part * whole) / (6.0 * (1.0 - part))
+                        for part, each in variance.items())])
+    return HeadingDifference(math.sqrt(error), math.sqrt(whole / (2.0 * _COMPARISON_SPAN)))
 
 
 def rate_noise_share(log: Log) -> float:
@@ -256,5 +225,5 @@ def is_course(log: Log) -> bool:
     # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
     # the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0
-    return heading_difference(replace(log, reference_rate=None)).total_walk > max(
+    return heading_difference(log).total_walk > max(
         larger * walk, MAX_ROUNDING_RATIO * rounding) > 0.0

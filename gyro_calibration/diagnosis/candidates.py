@@ -233,12 +233,10 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
 
 #: Prefix of the name of structure without a name; its variable follows.
 UNNAMED_PREFIX = '~'
-#: Numbers of waves over the range of rate and temperature, and of knots of splines.
+#: Numbers of waves over a turn or the range of rate or temperature, and of knots of splines.
 WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), 8
-#: Harmonics of the heading.
-HEADING_HARMONICS = range(2, 11)
 #: Widths of a bump in time as shares of the duration.
-BUMP_WIDTHS = (0.007, 0.02, 0.05)
+BUMP_WIDTHS = (0.01, 0.05)
 
 Variable = Callable[[Replay], Array]
 
@@ -255,19 +253,22 @@ def unnamed_variable(candidate: Candidate) -> str:
 
 def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     """Give the generic terms that these logs may show."""
+    def heading(each: Replay) -> Array:
+        return each.channels.heading
+
     variables = dict(_scaled_variables(replays))
     for name, of in variables.items():
         for count in WAVE_COUNTS if name in ('rate', 'temperature') else ():
             yield _unnamed_term(name, _wave_columns(of, np.pi * count))
         yield _unnamed_term(name, _spline_columns(of))
     if 'rate' in variables:
-        for number in HEADING_HARMONICS:
-            yield _unnamed_term('heading', _wave_columns(_heading, number))
+        for number in WAVE_COUNTS[1:]:
+            yield _unnamed_term('heading', _wave_columns(heading, number))
         for name, number in (('rate', 2), ('rate', 3), ('rate', 4), ('temperature', 1),
                              ('supply', 1)):
             if name in variables:
                 yield _unnamed_term(f'{name} and heading',
-                                    _wave_columns(_heading, number, variables[name]))
+                                    _wave_columns(heading, number, variables[name]))
     for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
             yield _unnamed_term(f'{first} and {second}', _product_columns(one, other))
@@ -303,10 +304,6 @@ def _scaled_variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Variable
 
 def _scale_to_unit_range(variable: Variable, low: float, high: float) -> Variable:
     return lambda each: np.clip((2.0 * variable(each) - low - high) / (high - low), -1.0, 1.0)
-
-
-def _heading(replay: Replay) -> Array:
-    return replay.channels.heading
 
 
 def _product_columns(one: Variable, other: Variable) -> ColumnFunction:

@@ -217,10 +217,7 @@ class SampleFault:
 
     is_faulty: Mask  # mask of the samples, shape (n,)
     p_value: float  # of their number, or of the length of a run
-    # expected number, at most, of what is tested: unlikely repeats, or such runs; or the largest
-    # deviation of outliers in standard deviations
-    size: float
-    is_by_run: bool = False  # whether a run of repeats is tested, not their number
+    sigmas: float = 0.0  # largest deviation of outliers in standard deviations
 
 
 def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes,
@@ -262,8 +259,7 @@ def find_repeated_samples(comparison: OutputComparison, codes: QuantizationCodes
             by_run = min(by_run, unlikely * len(valid))
     if not repeats.any():
         return None
-    return (SampleFault(repeats, by_run, by_run, is_by_run=True) if by_run < p_value
-            else SampleFault(repeats, p_value, expected_count))
+    return SampleFault(repeats, min(by_run, p_value))
 
 
 def _repeat_chances(change: Array, expected: Array, step: Array, known: Mask) -> Array:
@@ -556,18 +552,16 @@ def _sample_findings(repeated: SampleFault | None, outlying: SampleFault | None,
     if repeated is not None:
         count, runs = int(np.count_nonzero(repeated.is_faulty)), find_runs(repeated.is_faulty)
         first = log.time[int(np.argmax(repeated.is_faulty))]
-        explained = ('no such run' if repeated.is_by_run
-                     else f'at most {repeated.size:.2g} repeats that are unlikely by themselves')
         yield _sized_finding('stuck_samples', count, 0.0, repeated.p_value,
                              f'{count} samples in {len(runs)} run{"s" * (len(runs) > 1)} repeat '
                              f'the one before, the first at {first:.3f} s; codes and noise '
-                             f'explain {explained} in the whole log')
+                             'do not explain them')
     if outlying is not None:
         count = int(np.count_nonzero(outlying.is_faulty))
         first = log.time[int(np.argmax(outlying.is_faulty))]
         yield _sized_finding('outliers', count, 0.0, outlying.p_value,
                              f'{count} single samples differ from their neighbours by up to '
-                             f'{outlying.size:.0f} sigma, the first at {first:.3f} s')
+                             f'{outlying.sigmas:.0f} sigma, the first at {first:.3f} s')
     interval = float(np.median(np.diff(log.time)))
     noise = interval * noise_deviation
     if reference_step and (

@@ -32,6 +32,8 @@ NOT_OFFERED = ('On the held-out parts, the errors of the extended model are larg
 MIN_PROBABILITY = 1e-4
 #: Ratio of the level at which a lasting cause is suspected to that at which it is established.
 SUSPECTED_RATE_FACTOR = 5.0
+#: Shares of the false-alarm rate: for the search for causes, and for each value or noise figure.
+SEARCH_ALARM_SHARE, VALUE_ALARM_SHARE = 0.6, 0.05
 #: Least deficit in log-likelihood, relative to the best cause, of a cause that is ruled out (2.5
 #: sigma).
 RULED_OUT_DEFICIT = 3.2

@@ -141,8 +141,7 @@ def identify_sample_offset(estimate: float, deviation: float, interval: float) -
 _SMOOTHING_DURATION = 0.15
 
 
-@dataclass(frozen=True)
-class LineFit:
+class LineFit(NamedTuple):
     """Output = factor * rate + offset; standard deviation of the factor by scatter of parts."""
 
     factor: float
@@ -396,7 +395,12 @@ def _log_problems(log: Log) -> Iterator[str]:
 
 def _copy_problems(log: Log, output: Array) -> Iterator[str]:
     """Give a reference computed from the output, or an output computed from the reference."""
-    for rate in _rates_of_reference(log):
+    rates = [] if log.reference_rate is None else [log.reference_rate]
+    if log.reference_heading is not None and log.time is not None:
+        steps = np.diff(log.reference_heading) / np.diff(log.time)
+        before, after = np.append(steps, np.nan), np.insert(steps, 0, np.nan)
+        rates += [before, after, 0.5 * (before + after)]
+    for rate in rates:
         known = np.isfinite(rate) & np.isfinite(output)
         if np.count_nonzero(known) < MIN_TABLE_ROWS or not np.ptp(rate[known]) > 0.0:
             continue
@@ -410,16 +414,6 @@ def _copy_problems(log: Log, output: Array) -> Iterator[str]:
             yield (f'the output is {slope:.6g} times the reference plus {offset / DEGREE:.4g} '
                    'deg/s, to the last digit: one was computed from the other, without noise; '
                    'give an independent reference, or a simulation with noise')
-
-
-def _rates_of_reference(log: Log) -> list[Array]:
-    """Return the rates of the reference: as recorded, and by differences of the heading."""
-    rates = [] if log.reference_rate is None else [log.reference_rate]
-    if log.reference_heading is None or log.time is None:
-        return rates
-    steps = np.diff(log.reference_heading) / np.diff(log.time)
-    before, after = np.append(steps, np.nan), np.insert(steps, 0, np.nan)
-    return [*rates, before, after, 0.5 * (before + after)]
 
 
 def _unit_problem(log: Log, model: GyroModel) -> str:
@@ -480,19 +474,15 @@ class Agreement(NamedTuple):
 
 def check_gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
     """Return the gates of a log with a reference, up to the first that failed."""
-    if (log.time is None or log.output is None
-            or log.reference_heading is None and log.reference_rate is None):
-        return ()
-    results: list[Gate] = []
-    for gate in _run_gates(log, model):
-        results.append(gate)
-        if gate.passed is False:
-            break
-    return tuple(results)
+    results = [] if log.output is None else list(_run_gates(log, model))
+    failed = next((place for place, gate in enumerate(results) if gate.passed is False),
+                  len(results))
+    return tuple(results[:failed + 1])
 
 
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
-    assert log.time is not None
+    if log.time is None or log.reference_heading is None and log.reference_rate is None:
+        return
     if log.reference_rate is None:
         try:
             refuse_wrapped(log)
@@ -728,8 +718,8 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     if log.time is None or log.output is None or reference.kind == 'rest':
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
-        return log.reference_rate is not None and (rate_noise_share(log) > _MAX_RATE_NOISE_SHARE
-                                                   or heading_difference(log).is_significant)
+        return (log.reference_rate is not None
+                and rate_noise_share(log) > _MAX_RATE_NOISE_SHARE)
     if reference.kind == 'course' or reference.evidence == 'as given':
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)

@@ -64,10 +64,13 @@ from gyro_calibration.diagnosis.findings import (
     OnProgress,
     probabilities,
     Reference,
+    RULED_OUT_DEFICIT,
+    SEARCH_ALARM_SHARE,
     SUSPECTED_RATE_FACTOR,
     Trace,
+    VALUE_ALARM_SHARE,
 )
-from gyro_calibration.diagnosis.search import MIN_PREDICTION_SIGMAS, prediction_sigmas
+from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
@@ -84,9 +87,6 @@ _SAME_CLOCK = ('rate_command', 'encoder')
 DETECTION_SIGMAS = 4.8
 #: Longest lag of a gyro, s.
 _MAX_GYRO_LAG = 0.1
-#: Shares of the false-alarm rate: for the search for causes, and for each value. A delay between
-#: two clocks is usual and has a separate level.
-_SEARCH_ALARM_SHARE, _VALUE_ALARM_SHARE = 0.6, 0.05
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -103,16 +103,14 @@ _METHOD_TEXT = (
 #: Causes that are not candidates, because they are tested in each log.
 _ALWAYS_TESTED = {*BASE_VALUES, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_error',
                   'quantization', 'saturation'}
-#: Largest number of causes that are added, and of parts of a log for cross-fitting.
-MAX_CAUSES, FOLD_COUNT = 4, 5
+#: Largest number of parts of a log for cross-fitting.
+FOLD_COUNT = 5
 #: Largest effect along the rate that is established, as a share of the rate: two standard
 #: deviations of the prior of a scale factor error. Larger ones result from several similar columns
 #: that nearly cancel each other.
 _MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
 #: Variables whose causes are similar to errors of an encoder that repeat with its position.
 _MOTION_VARIABLES = frozenset({'rate', 'heading'})
-#: Largest likelihood ratio between the best cause and an equivalent one.
-_MAX_LIKELIHOOD_RATIO = 25.0
 
 
 def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel | None,
@@ -131,7 +129,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     if model is not None:
         cleaned_log = replace(cleaned_log, output=compensate_log(model, cleaned_log))
     plain = fit_spans(lay_out_spans(cleaned_log, reference.kind, prior))
-    extended, found = search_causes(plain, _SEARCH_ALARM_SHARE * false_alarm_rate,
+    extended, found = search_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
                                     on_progress)
     on_progress(None, 'cross-validation')
     gain = _cross_validated_gain(plain, extended)
@@ -199,7 +197,8 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
         deviation = math.sqrt(variance)
         effective, freedom = float(fit.effective_stretches[place]), float(fit.freedom[place])
         chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
-        share = 1.0 if name == 'time_offset' and own_clock else _VALUE_ALARM_SHARE
+        # a delay between two clocks is usual
+        share = 1.0 if name == 'time_offset' and own_clock else VALUE_ALARM_SHARE
         if chance >= share * false_alarm_rate or effective < MIN_STRETCHES:
             continue
         half = min(float(student.ppf(0.975, freedom)) * deviation,
@@ -528,7 +527,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
                for place in sorted(range(len(terms)), key=lambda place: evidences[place].gain)}
     gain = evidences[strongest].gain
     equivalent = {name: place for name, place in best_of.items() if place == strongest
-                  or gain - evidences[place].gain < math.log(_MAX_LIKELIHOOD_RATIO)}
+                  or gain - evidences[place].gain < RULED_OUT_DEFICIT}
 
     def complexity(place: int) -> tuple[int, float]:
         """Return the number of values and fitted shapes, and the p-value."""

@@ -54,7 +54,9 @@ from gyro_calibration.diagnosis.findings import (
     NOT_OFFERED,
     OnProgress,
     probabilities,
+    SEARCH_ALARM_SHARE,
     Unexplained,
+    VALUE_ALARM_SHARE,
 )
 from gyro_calibration.diagnosis.gates import (
     check_gates,
@@ -69,10 +71,12 @@ from gyro_calibration.diagnosis.gates import (
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise,
+    build_problem,
     fit_causes,
     is_single_event,
     RegressionFit,
     SelectedCause,
+    SMOOTHED_RATIO,
     Value,
 )
 from gyro_calibration.diagnosis.replay import Replay, replay
@@ -111,9 +115,6 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.stats import norm
 
-#: Shares of the false-alarm rate: for the search for causes, for each noise figure, and for bias
-#: and scale factor error each.
-_SEARCH_ALARM_SHARE, _NOISE_ALARM_SHARE, _BIAS_ALARM_SHARE = 0.6, 0.03, 0.05
 #: Probability that an effect of the minimum detectable size is found.
 _DETECTION_POWER = 0.95
 #: Names of the shape parameters of causes that are not effects of the catalogue.
@@ -144,7 +145,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     false_alarm_rate : false alarms per diagnosis
     names : file names of the logs, for messages
     on_progress : is called with None and the name of each step that begins
-    reference_kind : of the reference, one of `expected_output.REFERENCE_KINDS`; None is found
+    reference_kind : of the reference, one of `gates.REFERENCE_KINDS`; None is found
         from the log
 
     Raises
@@ -202,11 +203,12 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                       generator, clean.update_interval, clean.heading_step, clean.output_step,
                       model)
                for log, clean in zip(logs, quality)]
-    search = start_search(replays, _SEARCH_ALARM_SHARE * rate, on_progress)
+    plain = average_filtered_noise(fit_causes(build_problem(replays), []), SMOOTHED_RATIO)
+    search = start_search(plain.problem.replays, SEARCH_ALARM_SHARE * rate, on_progress)
     everything = search_causes(search)
     averaged = average_filtered_noise(fit_causes(search.problem, everything)).problem.replays
     if averaged is not search.problem.replays:
-        search = start_search(averaged, _SEARCH_ALARM_SHARE * rate, on_progress)
+        search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
         everything = search_causes(search)
     named, unnamed = withdraw_names(search, everything)
     named, removed = confirm(search, named)
@@ -316,7 +318,7 @@ def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
               ('scale_factor_error', scale.value, float(deviations[1]), ('reference_scale',)))
     for name, value, deviation, confounders in tested:
         chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
-        if chance < _BIAS_ALARM_SHARE * false_alarm_rate:
+        if chance < VALUE_ALARM_SHARE * false_alarm_rate:
             size = _estimate(Value(value, deviation), CAUSES[name].unit)
             different.append(make_finding(
                 name, {name: size}, chance, confounders, minimum_detectable=5.4 * deviation,
@@ -340,7 +342,7 @@ def _noise_findings(noise_parameters: NoiseParameters, model: GyroModel, false_a
     found, expected = [], model.noise
     # The steps of an encoder hide white noise.
     for name in NOISE_NAMES[1:] if any(each.heading_step for each in replays) else NOISE_NAMES:
-        if noise_parameters.p_values.get(name, 1.0) < _NOISE_ALARM_SHARE * false_alarm_rate:
+        if noise_parameters.p_values.get(name, 1.0) < VALUE_ALARM_SHARE * false_alarm_rate:
             low, high = model.noise_bounds.get(name, (math.inf, -math.inf))
             if (noise_parameters.intervals[name][0] <= high
                     and low <= noise_parameters.intervals[name][1]):

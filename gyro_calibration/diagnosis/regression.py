@@ -55,8 +55,9 @@ Indices = NDArray[np.intp]
 #: Least share of a column that is independent of the nuisances; with less it is unidentifiable.
 MIN_INDEPENDENT_SHARE = 1e-7
 #: Longest averaging interval of filtered noise, s, and largest ratio of its power in the last to
-#: that in the second quarter of the frequencies.
-_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO = 0.25, 0.7
+#: that in the second quarter of the frequencies; of a smoothed record before causes are fitted
+#: (jumps have 0.18, noise not less).
+_MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO, SMOOTHED_RATIO = 0.25, 0.7, 0.05
 
 
 @dataclass(frozen=True)
@@ -234,11 +235,6 @@ class RegressionFit:
         """Return each log's residual whitened by the first noise: shape (points - 1,)."""
         return self.problem.split_by_log(self.residual - self.estimates[0] @ self.columns)
 
-    def whitened_transforms(self, noise_fit: RegressionFit | None = None) -> list[Array]:
-        """Return each log's whitened residual, by its own or another's noise: (points - 1,)."""
-        factors = (noise_fit or self).whitening_factors()
-        return [part * factor for part, factor in zip(self.residual_transforms(), factors)]
-
     def whitening_factors(self) -> list[Array]:
         """Return the factors to variance 1 of each log's coefficients, by the likeliest noise."""
         best = self.best_noise
@@ -247,8 +243,10 @@ class RegressionFit:
             * np.sqrt(self.degrees_of_freedom / self.residual_squares[best]))
 
     def whitened_series(self, noise_fit: RegressionFit | None = None) -> list[Array]:
-        """Return the residual of each log, whitened in time to variance 1: shape (points,)."""
-        return [inverse_cosine_transform(part) for part in self.whitened_transforms(noise_fit)]
+        """Return each log's residual, whitened by its own or another's noise: shape (points,)."""
+        factors = (noise_fit or self).whitening_factors()
+        return [inverse_cosine_transform(part * factor)
+                for part, factor in zip(self.residual_transforms(), factors)]
 
     # fitted values
 
@@ -547,7 +545,8 @@ def _find_first_true(predicate: Callable[[float], bool], first: float) -> float:
 
 # filtered noise
 
-def average_filtered_noise(fit: RegressionFit) -> RegressionFit:
+def average_filtered_noise(fit: RegressionFit,
+                           max_ratio: float = _MAX_FILTERED_RATIO) -> RegressionFit:
     """
     Average neighbouring points of logs whose noise is filtered, until no filter shows.
 
@@ -558,9 +557,9 @@ def average_filtered_noise(fit: RegressionFit) -> RegressionFit:
 
     """
     while any(is_filtered := [
-            _high_frequency_power_ratio(part) < _MAX_FILTERED_RATIO
+            _high_frequency_power_ratio(part) < max_ratio
             and 2.0 * each.point_interval <= _MAX_AVERAGING_TIME
-            for each, part in zip(fit.problem.replays, fit.whitened_transforms())]):
+            for each, part in zip(fit.problem.replays, fit.residual_transforms())]):
         fit = fit_causes(build_problem([replace(each, decimation=each.decimation * (1 + more))
                                         for each, more in zip(fit.problem.replays, is_filtered)]),
                          fit.causes)

@@ -122,8 +122,8 @@ def noise_grid(interval: float, duration: float, rounding_ratio: float = 0.0) ->
 
 #: Largest number of points of the grid; with more, neighbours are averaged.
 MAX_POINTS = 50_000
-#: Frequencies over which the power of a rate is averaged.
-_SMOOTHING_BINS = 101
+#: Frequencies over which the power of a rate is averaged, and margin of the power of rounding.
+_SMOOTHING_BINS, _ROUNDING_POWER_FACTOR = 101, 1.5
 #: Update intervals of a held reference, and steps of its change, from which on a constant value is
 #: a standstill.
 _STANDSTILL_FACTOR = 1.5
@@ -184,37 +184,12 @@ class Replay:
             lost = np.ones(len(whole), dtype=bool)
             lost[self.grid_index] = False
             whole[lost] += fill_deviation * self.fill_noise[lost]
-        return self._average_neighbours(whole)
-
-    def _average_neighbours(self, whole: Array) -> Array:
         whole = whole[:self.point_count * self.decimation]
-        return whole.reshape(-1, self.decimation).mean(axis=1) if self.decimation > 1 else whole
-
-    def _reference_rounding(self) -> Array:
-        """Return the rounding error of the reference, rad/s, also where no output is used."""
-        rows = np.flatnonzero(self.valid)
-        rows = np.arange(rows[0], rows[-1] + 1)
-        at = np.interp(rows, np.flatnonzero(self.valid), self.grid_index)
-        added = (self.reference - self.channels.rate)[rows]
-        known = np.isfinite(added) & (at == np.rint(at))
-        whole = np.zeros(int(self.grid_index[-1]) + 1)
-        whole[at[known].astype(int)] = added[known]
-        return self._average_neighbours(whole)
+        return whole.reshape(-1, self.decimation).mean(axis=1)
 
     def transform_residual(self, values: Array) -> Array:
-        """
-        Return the cosine transform of a residual; interpolated points get white noise.
-
-        The error of a rounded heading is bounded, but its interpolation over a gap would not be.
-        So it is taken from the reference, which has no gap there.
-
-        """
-        if not self.heading_step:
-            return cosine_transform(
-                self.resample(values, white_noise_deviation(values[self.valid])))
-        smooth = values + (self.reference - self.channels.rate)
-        return cosine_transform(self.resample(smooth, white_noise_deviation(smooth[self.valid]))
-                                - self._reference_rounding())
+        """Return the cosine transform of a residual; interpolated points get white noise."""
+        return cosine_transform(self.resample(values, white_noise_deviation(values[self.valid])))
 
     def transform_samples(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
@@ -417,5 +392,5 @@ def _filter_rounding(rate: Array, step: float, interval: float) -> Array:
     rounding = ((step / interval) ** 2 / 12.0
                 * spline_derivative_gain(np.arange(len(rate)) * math.pi / len(rate)))
     power = uniform_filter1d(coefficients ** 2, _SMOOTHING_BINS, mode='nearest')
-    weight = 1.0 - rounding / np.maximum(power, 1e-300)
+    weight = 1.0 - _ROUNDING_POWER_FACTOR * rounding / np.maximum(power, 1e-300)
     return idct(coefficients * np.clip(weight, 0.0, 1.0), norm='ortho')

@@ -41,8 +41,8 @@ from scipy.stats import chi2
 NOISE_NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 #: Probability that a frequency band of noise alone is rejected, per log.
 _BAND_REJECTION_CHANCE = 1e-3
-#: Bins of a curve, points of a line over time, and samples of which the Allan deviation is taken.
-CURVE_BINS, CURVE_POINTS, _MAX_ALLAN_SAMPLES = 40, 600, 1 << 18
+#: Bins of a curve, and points of a line over time.
+CURVE_BINS, CURVE_POINTS = 40, 600
 
 
 @dataclass(frozen=True)
@@ -302,8 +302,7 @@ def heading_error_curve(before: Sequence[Array], after: RegressionFit) -> Headin
 def allan_curves(fit: RegressionFit, fitted: Noise, expected: Noise) -> NoiseCurve:
     """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
     each = fit.problem.replays[0]
-    allan = allan_deviation(
-        each.resample(fit.residuals[0])[:_MAX_ALLAN_SAMPLES], each.point_interval)
+    allan = allan_deviation(each.resample(fit.residuals[0]), each.point_interval)
     times = allan.time
     return NoiseCurve(
         times, allan.deviation, np.sqrt(fitted.allan_variance(times)),

@@ -79,8 +79,8 @@ SLIP_DURATIONS, MAX_SLIPS = (0.0, 0.1, 0.4), 20
 MAX_CONFOUNDERS, MAX_CAUSES = 9, 6
 #: Half-width of the range in which a shape is refined, in logarithms.
 _SHAPE_RANGE = 0.8
-#: Exponents with which distortions of fixed amplitude grow with their shapes.
-_SHAPE_EXPONENTS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
+#: Effects of fixed amplitude that grow with their shapes.
+_GROWING_EFFECTS = ('sine_response', 'time_offset', 'bandwidth', 'clock_rate')
 #: A cause is established if its gain in log-likelihood on held-out stretches exceeds so many
 #: standard deviations. The gain of one stretch is limited to a likelihood ratio of one over the
 #: same level, so that no single stretch establishes a cause.
@@ -242,11 +242,8 @@ def _search_strongest(search: Search, causes: Sequence[SelectedCause],
         each.candidate.cause, each.mean_evidence) > 0.0]
     if significant:
         top = max(first, key=lambda each: each.evidence)
-        # Causes that distort the rate are equal to first order; large ones need refined shapes.
-        alike = is_rate_distortion(top.candidate.cause)
-        worth = [each for each in first if (is_named(each.candidate) or each in significant) and (
-            each.evidence > 0.8 * top.evidence - 8.0
-            or alike and is_rate_distortion(each.candidate.cause))]
+        worth = [each for each in first if (is_named(each.candidate) or each in significant)
+                 and each.evidence > 0.8 * top.evidence - 8.0]
     else:
         worth = [each for each in first if is_lasting(each.candidate) and search.excess_evidence(
             each.candidate.cause, each.mean_evidence, SUSPECTED_RATE_FACTOR) > 0.0]
@@ -295,10 +292,11 @@ def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> Se
     """Add a cause with its best shape near the given one, less the penalty for this choice."""
     if fitted_shape_indices(candidate) and candidate.cause != 'reference_slip':
         place = fitted_shape_indices(candidate)[0]
-        if candidate.cause in _SHAPE_EXPONENTS:  # begin with the shape that a free amplitude has
+        if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
             ratio = free_amplitude(fit, candidate)
-            candidate = with_shape(candidate, place, candidate.shapes[place] * math.copysign(
-                abs(ratio) ** (1.0 / _SHAPE_EXPONENTS[candidate.cause]), ratio))
+            size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
+            candidate = with_shape(candidate, place,
+                                   candidate.shapes[place] * math.copysign(size, ratio))
         first, half = candidate.shapes[place], candidate.half_width
 
         def moved(by: float) -> Candidate:

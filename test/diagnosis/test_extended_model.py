@@ -174,12 +174,6 @@ def test_what_is_wrong_with_the_record_alone_leaves_the_model_as_it_is():
             and 'the model is unchanged' in headline(found)[1])
 
 
-def test_noise_that_a_short_log_cannot_show_stays_in_the_model():
-    model = replace(MODEL, noise=Noise(1.5e-4, 1e-6, 1e-8))
-    found = diagnosed(drive(term('warm_up', 60.0, 4e-3)), model)
-    assert names(found) == ['warm_up'] and found.model.noise == model.noise
-
-
 # a self-calibration behind the model
 
 BEHIND = SelfCalibration(0.02, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)))
@@ -194,19 +188,6 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
     assert names(found) == ['warm_up'] and found.model.self_calibration is None
     assert value(found.model, 'scale_factor_error') == pytest.approx(1.01 * 1.02 - 1.0, abs=5e-4)
     assert value(found.model, 'bias') == pytest.approx(2e-3 + 1.01 * 1e-3, abs=2e-4)
-
-
-def test_a_table_that_the_model_explains_leaves_it_as_it_is_to_the_letter(run, tmp_path):
-    behind, rate = replace(MODEL, self_calibration=BEHIND), np.tile(np.linspace(-1.5, 1.5, 21), 8)
-    output = (merge_self_calibration(behind).output(rate, 25.0)
-              + 5e-4 * np.random.default_rng(7).standard_normal(len(rate)))
-    write_log(tmp_path / 'table.csv',
-              Log(output=output, reference_rate=rate, temperature=np.full(len(rate), 25.0)))
-    write_model(tmp_path / 'model.yaml', behind)
-    code, text, errors = run('diagnose', tmp_path / 'table.csv', '--model',
-                             tmp_path / 'model.yaml', '--out', tmp_path / 'found')
-    assert code == 0 and 'the model is unchanged' in ' '.join(text.split()), errors
-    assert (tmp_path / 'found/model.yaml').read_text() == (tmp_path / 'model.yaml').read_text()
 
 
 # ranges

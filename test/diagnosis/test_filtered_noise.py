@@ -15,8 +15,6 @@ from dataclasses import replace
 from diagnosed import described as told
 from diagnosed import log_of, model_of
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression import average_filtered_noise, build_problem, fit_causes
-from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -71,17 +69,6 @@ def test_what_is_hidden_in_noise_behind_a_filter_is_found(filter, name):
     (finding,) = found.findings
     assert name in (finding.effect, *finding.ambiguous_with), told(hidden, found)
     assert not found.unexplained, told(hidden, found)
-
-
-@pytest.mark.parametrize('seconds', [20.0, 120.0, 900.0])
-def test_white_noise_has_been_through_no_filter(seconds):
-    time = np.arange(0.0, seconds, 0.02)
-    for seed in range(3):
-        generator = np.random.default_rng(seed)
-        log = Log(time=time, output=1e-3 * generator.standard_normal(len(time)))
-        each = replay(log, np.ones(len(time), dtype=bool), generator)
-        fit = fit_causes(build_problem([each]), [])
-        assert average_filtered_noise(fit) is fit
 
 
 # rounding

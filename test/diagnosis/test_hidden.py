@@ -29,7 +29,6 @@ from gyro_calibration_bench.hidden import (
     record,
     record_separating,
     session,
-    session_from_motion,
 )
 from gyro_calibration_bench.hidden.effects import (
     COUNTED_FAULTS,
@@ -183,17 +182,6 @@ def test_faults_of_samples_are_as_many_as_it_says(generator):
     assert 1 <= np.sum(np.diff(holed.columns['time_s']) > 1.5 * holed.session.interval) <= 12
 
 
-def test_a_size_in_si_is_hidden_as_it_is_given(generator):
-    def given(sessions):
-        return {'time_offset': {'size': 0.02},
-                'saturation': {'size': 0.5 * abs(sessions[0].rate).max()}}
-    log, = hide(['time_offset', 'saturation'], 1.0, generator, noise='white', fixed_parts=given,
-                reference='both', **COARSE)
-    assert log.truth['time_offset'].size == 0.02 and log.truth['time_offset'].multiple > 3.0
-    assert np.abs(log.columns['gyro_rad_s']).max() == 0.5 * np.abs(log.session.rate).max()
-    assert {'reference_rate_rad_s', 'reference_heading_rad'} <= set(log.columns)
-
-
 def test_a_wrong_unit_is_a_round_number_or_a_delay(generator):
     log, = hide(['unit_error'], 1.0, generator, noise='white', **COARSE)
     rate = log.session.motion.rate(log.session.time - log.truth['unit_error'].shapes['delay'])
@@ -260,26 +248,6 @@ def test_what_is_outside_the_catalogue_is_mostly_not_explained_by_it(generator):
     assert np.mean([cause.likeness < 0.3
                     for cause in causes]) > 0.6, [(cause.name, cause.likeness) for cause in causes]
     assert all(cause.likeness <= cause.likeness_of_three + 0.02 for cause in causes)
-
-
-def test_a_gyro_is_recorded_again_under_conditions_that_others_plan(generator):
-    log, = hide(['bias_temperature'], 10.0, generator, **COARSE)
-    time = np.arange(0.0, 200.0, 0.05)
-    again = record(log.truth.gyro,
-                   session_from_motion(generator, time, np.sin(0.3 * time), 25.0 + 0.05 * time),
-                   generator, run=1)
-    truth = again.truth
-    assert truth.rate == pytest.approx(np.sin(0.3 * time), abs=0.1)
-    slope = np.polyfit(again.session.temperature,
-                       truth.added_rate - truth.scale_factor_error * truth.rate, 1)[0]
-    assert slope == pytest.approx(log.truth['bias_temperature'].size, rel=1e-6)
-
-
-def test_runs_share_the_gyro_and_not_the_bias_or_the_motion(generator):
-    first, second = hide(['bias_step', 'rate_ramp'], 3.0, generator, runs=2, noise='mixed',
-                         **COARSE)
-    assert first.truth.gyro is second.truth.gyro and first.truth.bias != second.truth.bias
-    assert not np.allclose(first.truth.rate, second.truth.rate)
 
 
 def test_a_seed_makes_the_same_log_again_and_another_seed_another(tmp_path):

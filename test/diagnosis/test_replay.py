@@ -16,8 +16,7 @@ from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
-from gyro_calibration.model.effects import CATALOGUE
-from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import constant_rate_motion, simulate
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -119,17 +118,6 @@ def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():
     assert np.abs(each.reference - 0.5 * np.sin(2.0 * TIME))[each.valid].max() < 3e-3
     # four beside each end, and where the fourth difference sees the bend of the gap
     assert 8 <= np.count_nonzero(~each.valid & ~lost) < 24
-
-
-def test_a_log_without_temperature_is_simulated_at_the_temperature_of_the_model():
-    terms = (Term(CATALOGUE['bias_temperature'], (25.0, 1e-3)),)
-    model = GyroModel(terms, reference_temperature=40.0)
-    rate = np.sin(TIME)
-    output = model.output(rate, 40.0) + NOISE
-    each = replay(Log(output=output, time=TIME, reference_rate=rate), np.ones(len(TIME), bool),
-                  np.random.default_rng(0), model=model)
-    assert abs(float(np.mean(each.channels.output - each.reference))) < 1e-4
-    assert 'temperature' not in each.available_channels
 
 
 def test_the_corners_of_a_motion_known_by_its_heading_pass_for_no_dead_zone():

@@ -17,7 +17,6 @@ import zlib
 from diagnosed import diagnosis_of, held
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
-    effect_candidate,
     generic_terms,
     is_named,
     propose_candidates,
@@ -115,15 +114,6 @@ def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
 
 # shapes
 
-def test_a_shape_at_its_bound_has_a_deviation():
-    rate = np.sin(0.7 * TIME) * np.sin(0.11 * TIME)
-    whole = build_problem(
-        [laid(Log(output=rate + NOISE * np.random.default_rng(0).standard_normal(len(rate)),
-                  time=TIME, reference_rate=rate))])
-    assert ((0, -1) in fit_causes(
-        whole, [SelectedCause(effect_candidate('time_offset', 1.0), (1.0, ))]).column_owners)
-
-
 @pytest.mark.parametrize('name, shape', [('dead_zone', 'dead_zone'), ('bias_step', 'step_time')])
 def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
     log, = hide([name], 5.0, np.random.default_rng(3), noise='white', duration=600.0,
@@ -187,15 +177,6 @@ def test_a_step_is_found_where_the_kept_samples_begin_late():
     moments = [each.shapes[0]
                for each in search.candidates if each.cause in ('bias_step', '~time')]
     assert moments and 200.0 < min(moments) < max(moments) < 300.0
-
-
-def test_a_step_is_found_between_the_places_that_are_tried_in_many_logs():
-    time = TIME[:2000]
-    replays = [laid(resting(6e-4 * (time >= 50.0) * (run == 1), time, run)) for run in range(5)]
-    _, named = found_in(replays)
-    assert ([(known.candidate.cause, known.candidate.log_index)
-             for known in named] == [('bias_step', 1)])
-    assert named[0].candidate.shapes[0] == pytest.approx(50.0, abs=1.0)
 
 
 def test_what_a_log_cannot_show_is_not_searched_for():
