@@ -20,7 +20,6 @@ noise), `candidates` (columns of causes, and of what has no name), `regression` 
 under every noise), `search` (for causes, and their confirmation), `words` (numbers and findings
 for people), `residuals` (their noise and curves), `extended_model` (and its gain on what was held
 out), `noisy_reference` (where the reference limits what is known), `pipeline` (of a diagnosis, in
-order), `dwell_fit` (of a model and causes to a rate table), `rate_table` (the diagnosis of a rate
-table), `charts` (in pages), `report` (the page).
+order), `rate_table` (the diagnosis of a rate table), `charts` (in pages), `report` (the page).
 
 """
