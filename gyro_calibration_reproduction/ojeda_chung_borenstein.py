@@ -57,7 +57,6 @@ SAMPLES_PER_SET, RATE_ORDER, TEMPERATURE_ORDER, MIN_TEMPERATURE, MAX_TEMPERATURE
 TEMPERATURE_SPAN, SINE_CONSTANT = 115.0, 0.1
 #: Assumed for comparison: a shaking table, deg/s, and the sine of another open-loop gyro, s.
 VIBRATION_RATE, STRONG_SINE_CONSTANT = 1.0, 0.25
-LATITUDE, EARTH_RATE = 42.28, 15.04  # of Ann Arbor, deg, and deg/h
 POLYNOMIAL = rate_temperature_polynomial(RATE_ORDER, TEMPERATURE_ORDER)
 PHYSICAL_EFFECTS = ((BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, SCALE_FACTOR_TEMPERATURE,
                      SINE_RESPONSE))
@@ -93,9 +92,8 @@ def reproduce(generator: np.random.Generator, runs: int = 200,
     found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
     return Reproduction(TITLE, ASSUMED, (*_compare_own_figures(), *_compare_instrument(),
                                          *_compare_results(found)),
-                        (_index(), _data_sets(), _condition(), _regressor(generator),
-                         _sine(generator, len(found), progress), _order_of_magnitude(found),
-                         _percent(found), _full_turn(), _earth()))
+                        (_index(), _regressor(generator),
+                         _sine(generator, len(found), progress), _full_turn()))
 
 
 # a rate table
@@ -180,17 +178,10 @@ def _compare_own_figures() -> list[Comparison]:
     sets = (len(np.arange(-FULL_SCALE, FULL_SCALE + 1.0, 10.0))
             * len(np.arange(MIN_TEMPERATURE, MAX_TEMPERATURE + 1.0, 2.0)))
     return [
-        from_own_figures('drift of 0.002 deg/s', 'deg/min', 60.0 * BIAS_STABILITY, '0.12',
-                         'section 1'),
         from_own_figures('drift of 0.002 deg/s in an hour', 'deg/h', 3600.0 * BIAS_STABILITY,
                          '7.2', 'section 1'),
-        from_own_figures('drift of 0.002 deg/s in 10 min', 'deg', 600.0 * BIAS_STABILITY, '1.2',
-                         'section 1'),
         from_own_figures('angle random walk of 5 (deg/h)/sqrt(Hz)', 'deg/sqrt(h)',
                          ANGLE_RANDOM_WALK / 60.0, '0.08', 'table I'),
-        from_own_figures('samples in 10 s', '1', 10.0 * OUTPUT_RATE, '100', 'eq. 1'),
-        from_own_figures('fewest data sets for p = 3, q = 2', '1',
-                         float((RATE_ORDER + 1) * (TEMPERATURE_ORDER + 1)), '12', 'section 3.3'),
         from_own_figures('data sets, every 10 deg/s and 2 K', '1', float(sets), '121',
                          'section 3.3', '+-100 deg/s are 21 rates, not 11'),
     ]
@@ -237,29 +228,6 @@ def _compare_results(found: Array) -> list[Comparison]:
     return rows
 
 
-def _order_of_magnitude(found: Array) -> Contradiction:
-    before, after = found[:, 0, 0].mean() / DEGREE, found[:, -1, 0].mean() / DEGREE
-    return Contradiction({'before': before, 'after': after, 'ratio': before / after,
-                          'more': math.sqrt((before / 10.0) ** 2 - after ** 2)},
-                         'Abstract: the figures of Table I allow more than one order of '
-                         'magnitude, {before:.3f} to {after:.4f} deg/s, {ratio:.0f} times. One '
-                         'order of magnitude remains if errors outside the table and the '
-                         'polynomial are {more:.3f} deg/s rms.')
-
-
-def _percent(found: Array) -> Contradiction:
-    before, after = (float(100.0 * found[:, number, 1].mean() / (2.0 * math.pi))
-                     for number in (0, -1))
-    return Contradiction(
-        {'specified': NONLINEARITY + SCALE_OVER_TEMPERATURE / 2.0, 'before': before,
-         'after': after, 'left': 100.0 * float((found[:, -1, 0] / found[:, 0, 0]).mean())},
-        'Section 5: "less than 2 %" does not state of which quantity. As a share of the rate, '
-        'Table I allows {specified:.1f} % before any calibration (0.5 % and half of 2 %), and the '
-        'synthetic gyro has {before:.2f} % of a turn before and {after:.2f} % after. As a share '
-        'of the error, one order of magnitude is 10 %; {left:.1f} % of the error of the synthetic '
-        'gyro remains.')
-
-
 # misprints, and properties of the method
 
 def columns_of_equation_10(rate_order: int, temperature_order: int, stride: int) -> int:
@@ -279,41 +247,6 @@ def _index() -> Contradiction:
                          'With p = 3 and q = 2 it gives {printed:d} different columns of '
                          '{right:d}, with p = q = 3 {cubic:d} of {cubic_right:d}; the index i + '
                          '(j-1)(p+1) gives all columns.')
-
-
-def _data_sets() -> Contradiction:
-    rates, temperatures = (len(np.arange(low, high + 1.0, step))
-                           for low, high, step in ((-FULL_SCALE, FULL_SCALE, 10.0),
-                                                   (MIN_TEMPERATURE, MAX_TEMPERATURE, 2.0)))
-    return Contradiction({'rates': rates, 'temperatures': temperatures,
-                          'sets': rates * temperatures, 'step': 2.0 * FULL_SCALE / 10.0},
-                         'Section 3.3: steps of 10 deg/s over +-100 deg/s give {rates:d} rates, '
-                         'and with {temperatures:d} temperatures {sets:d} data sets, not 121. 11 '
-                         'rates correspond to steps of {step:.0f} deg/s. p and q are numbers of '
-                         'rates and temperatures there, and orders in eq. 10.')
-
-
-def condition_numbers() -> tuple[float, float]:
-    """Return the condition numbers for deg/s and degC, raw, and centred and scaled to +-1."""
-    rates, temperatures = rate_temperature_grid(
-        full_range_rates(21) / DEGREE, np.linspace(MIN_TEMPERATURE, MAX_TEMPERATURE, 11))
-    middle = (MIN_TEMPERATURE + MAX_TEMPERATURE) / 2.0
-    half = (MAX_TEMPERATURE - MIN_TEMPERATURE) / 2.0
-    raw, scaled = (np.linalg.cond(np.column_stack([rate ** i * temperature ** j
-                                                   for j in range(TEMPERATURE_ORDER + 1)
-                                                   for i in range(RATE_ORDER + 1)]))
-                   for rate, temperature in ((rates, temperatures),
-                                             (rates / FULL_SCALE, (temperatures - middle) / half)))
-    return float(raw), float(scaled)
-
-
-def _condition() -> Contradiction:
-    raw, scaled = condition_numbers()
-    return Contradiction(
-        {'raw': raw, 'scaled': scaled, 'digits': math.log10(raw), 'normal': 2.0 * math.log10(raw)},
-        'Eq. 10: raw powers of deg/s and degC have the condition number {raw:.1e}, centred and '
-        'scaled ones {scaled:.0f}. The raw powers lose {digits:.0f} of 16 digits, and by normal '
-        'equations {normal:.0f}, which is all.')
 
 
 def regressor_error(deviation: float, averaged: int, generator: np.random.Generator,
@@ -392,12 +325,3 @@ def _full_turn() -> Contradiction:
                          'an angle. {error:.1f} deg/s in a turn at {rate:.0f} deg/s give '
                          '{right:.0f} deg, and {printed:.0f} deg by the printed formula; the '
                          'samples must be divided by the output rate.')
-
-
-def _earth() -> Contradiction:
-    earth = EARTH_RATE * math.sin(LATITUDE * DEGREE)
-    return Contradiction({'earth': earth, 'stability': 3600.0 * BIAS_STABILITY,
-                          'ratio': earth / (3600.0 * BIAS_STABILITY)},
-                         'Eq. 1: the static bias includes the rate of the Earth, {earth:.1f} '
-                         'deg/h on a level floor in Ann Arbor, {ratio:.1f} times the bias '
-                         'stability of {stability:.1f} deg/h.')

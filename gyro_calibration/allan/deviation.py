@@ -28,7 +28,12 @@ from typing import Any
 
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS
 from gyro_calibration.logs.log import Array, DataRefused, Mask
-from gyro_calibration.logs.quality import find_runs, robust_deviation
+from gyro_calibration.logs.quality import (
+    bridge_gaps,
+    find_runs,
+    mask_outliers,
+    robust_deviation,
+)
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
     ANGLE_RANDOM_WALK,
@@ -41,7 +46,6 @@ from gyro_calibration.model.noise import (
     RATE_RANDOM_WALK,
 )
 import numpy as np
-from scipy.signal import medfilt
 from scipy.special import chdtri
 from scipy.stats import pearsonr
 
@@ -168,23 +172,13 @@ def _remove_outliers(rate: Array, stamps: StampGrid) -> list[str]:
     A motion or a jolt lasts longer than two samples and is not removed.
 
     """
-    values = _fill_gaps(rate)
-    off = np.abs(values - medfilt(values, 5))
-    off[:2] = off[-2:] = 0.0
-    # a high quantile, since half of these are zero where the output is a random walk
-    usual = float(np.quantile(off, 0.9)) / 1.645 or _noise_scale(off)
-    outliers = np.nonzero(off > 1.25 * MAX_NOISE_SIGMAS * usual)[0]
+    outliers = np.flatnonzero(mask_outliers(bridge_gaps(rate), MAX_NOISE_SIGMAS))
     if not outliers.size or outliers.size > 0.001 * len(rate):
         return []
     rate[outliers] = np.nan
     return [f'Far beyond the noise, and left out: {outliers.size} single '
             f'sample{"s" * (outliers.size > 1)}, the first at {stamps.time_at(outliers[0]):.3f} '
             's.']
-
-
-def _noise_scale(values: Array) -> float:
-    """Return the standard deviation of Gaussian values; the rms where most of them are zero."""
-    return robust_deviation(values) or float(np.sqrt(np.mean(values ** 2)))
 
 
 def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
@@ -200,7 +194,8 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
         if len(at) < MIN_WINDOWS:
             break
         change = np.abs(angle[at + 2 * size] - 2.0 * angle[at + size] + angle[at])
-        scale = _noise_scale(change)
+        # the rms where most of them are zero
+        scale = robust_deviation(change) or float(np.sqrt(np.mean(change ** 2)))
         for begin in at[change > MAX_NOISE_SIGMAS * scale]:
             moved[begin:begin + 2 * size] = True
         if change.max() > worst * scale:
@@ -220,27 +215,16 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
 # lost samples
 
 def integrate_angle(rate: Array) -> Array:
-    """Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples."""
+    """
+    Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples.
+
+    Gaps are bridged linearly.
+
+    """
     angle = np.empty(len(rate) + 1)
     angle[0] = 0.0
-    np.cumsum(_fill_gaps(rate), out=angle[1:])
+    np.cumsum(bridge_gaps(rate - np.nanmean(rate)), out=angle[1:])
     return angle
-
-
-def _fill_gaps(rate: Array) -> Array:
-    """Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side."""
-    known = np.isfinite(rate)
-    values = rate - rate[known].mean()
-    if known.all():
-        return values
-    values[~known] = 0.0
-    begins, ends = np.array([(gap.start, gap.stop) for gap in find_runs(~known)]).T
-    margin = 5 * (ends - begins) + 5
-    low, high = np.maximum(begins - margin, 0), np.minimum(ends + margin, len(rate))
-    sums, counts = (np.concatenate([[0.0], np.cumsum(each)]) for each in (values, known))
-    means = (sums[high] - sums[low]) / np.maximum(counts[high] - counts[low], 1.0)
-    values[~known] = np.repeat(means, ends - begins)
-    return values
 
 
 def _count_lost_before(rate: Array) -> Integers | None:
@@ -260,10 +244,9 @@ def mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step:
                       <= _MAX_LOST_PER_WINDOW * 2 * size)
 
 
-#: Samples in a block, whose arrays fit into the cache for all averaging times.
-_BLOCK_SAMPLES = 16384
-#: Longest dot product that numpy computes in one thread, which is faster here.
-_MAX_DOT_LENGTH = 8192
+#: Samples in a block, whose arrays fit into the cache for all averaging times, and whose dot
+#: product numpy computes in one thread, which is faster here.
+_BLOCK_SAMPLES = 8192
 #: Lags per window, and per the longer one of two; more change the covariance by less than 1 %.
 _LAGS_PER_WINDOW, _LAGS_PER_LONGER_WINDOW = 8, 512
 #: Indices of quantization and ramp among the terms, and of terms whose second differences are
@@ -401,8 +384,7 @@ def _sum_squared_differences(rate: Array, sizes: Integers) -> tuple[Array, Integ
                 kept = mask_complete_windows(lost, size, begin, end)
                 block *= kept
                 counts[place] += np.count_nonzero(kept)
-            sums[place] += sum(
-                float(part @ part) for part in (block[:_MAX_DOT_LENGTH], block[_MAX_DOT_LENGTH:]))
+            sums[place] += float(block @ block)
     return sums, counts
 
 

@@ -27,10 +27,9 @@ import math
 from gyro_calibration.allan.deviation import (
     allan_deviation,
     AllanChart,
-    chi_squared_bounds,
     covariance_form,
 )
-from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.logs.stamps import Integers
 from gyro_calibration.model.noise import GaussMarkov, Noise, NOISE_TERMS, NoiseTerm, QUANTIZATION
 import numpy as np
@@ -42,15 +41,11 @@ from scipy.special import chdtrc
 _TERM_PENALTY = 10.0
 #: Largest difference in -2 ln likelihood of an alternative combination of terms.
 _ALTERNATIVE_LIMIT = 6.0
-#: A combination that is likelier by this, but has too many terms, widens the bounds.
-_WIDENING_LIMIT = 1.0
-#: Increase of -2 ln likelihood at the ends of a 95 % interval: the quantile of chi squared.
-_CHI_SQUARED_95 = 3.84
 #: Least p-value of the residuals of an accepted fit.
 _MIN_P_VALUE = 0.05
 #: Relative differences between the Allan deviations and the sum of the terms that are tried; the
 #: smallest sufficient one is used.
-_MISFIT_SHARES = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
+_MISFIT_SHARES = (0.0, *np.geomspace(0.01, 0.32, 11).tolist())
 #: Least number of octaves that show a slope and its end.
 _MIN_OCTAVES = 4
 #: Indices of the terms, of a Gauss-Markov process, and of the reduction of the variance by a
@@ -213,13 +208,6 @@ class CombinationFit:
         """Return the standard deviation of the squared coefficient of a term of the fit."""
         return float(self.estimate_squares(self.active_terms)[1][self.active_terms.index(index)])
 
-    def coefficient_bounds(self, index: int) -> tuple[float, float]:
-        """Return 95 % bounds of a coefficient, whose square is taken as a mean square."""
-        square = self.squares[index]
-        lower, upper = chi_squared_bounds(
-            square, max(2.0 * (square / self.square_deviation(index)) ** 2, 1.0))
-        return float(lower), float(upper)
-
 
 def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: float,
                     fixed_term: int = -1, fixed_square: float = 0.0) -> CombinationFit:
@@ -300,7 +288,7 @@ class Ranking:
         return any(index not in each.active_terms
                    and (each.deviance - best.deviance if index == _K
                         else each.penalized_deviance() - best.penalized_deviance())
-                   < _CHI_SQUARED_95 for each in self.process_fits)
+                   < NORMAL_QUANTILE_975 ** 2 for each in self.process_fits)
 
     @property
     def detected_terms(self) -> list[int]:
@@ -315,14 +303,6 @@ class Ranking:
         return [each for each in self.fits if each.deviance < best.deviance + _ALTERNATIVE_LIMIT
                 and len(each.active_terms) <= len(best.active_terms)
                 and not set(each.active_terms) - {_FILTER_BEND, _Q} <= set(best.active_terms)]
-
-    @cached_property
-    def plausible_fits(self) -> list[CombinationFit]:
-        """Return the best, likelier ones with more terms, and those joined with alternatives."""
-        best = self.best
-        both = [{*best.active_terms, *other.active_terms} for other in self.alternatives]
-        return [best, *(each for each in self.fits if each.deviance
-                        < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
 
 
 def rank_combinations(octaves: OctaveVariances) -> Ranking:
@@ -520,53 +500,43 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
     """Return a figure with bounds that hold with and without undetected terms."""
     part, process = NOISE_TERMS[index], ranking.best_process
     # flicker and rate random walk approximate a process; the other terms are fitted with it
-    with_process = process is not None and index not in (_B, _K)
-    best = process if process is not None and with_process else ranking.best
+    best = ranking.best if process is None or index in (_B, _K) else process
     value, deviation = 0.0, math.nan
-    lower, upper = _likelihood_bounds(ranking, index, with_process)
+    lower, upper = _likelihood_bounds(ranking, best, index)
     if index in ranking.detected_terms and index in best.active_terms:
         value = math.sqrt(best.squares[index])
         deviation = 0.5 * best.square_deviation(index) / value
-        possible = [best] if with_process else ranking.plausible_fits
-        ends = [(lower, upper), *(each.coefficient_bounds(index)
-                                  for each in possible if index in each.active_terms)]
-        lower, upper = min(value, *(low for low, _ in ends)), max(value, *(up for _, up in ends))
-        if index in (_B, _K) and ranking.is_replaceable(index):
-            lower = 0.0
-    else:
+        lower, upper = min(lower, value), max(upper, value)
+    if not value or index in (_B, _K) and ranking.is_replaceable(index):
         lower = 0.0
     unit = interval ** -part.slope
     return NoiseFigure(part, *(each * unit for each in (value, deviation, lower, upper)))
 
 
-def _likelihood_bounds(ranking: Ranking, index: int, with_process: bool) -> tuple[float, float]:
+def _likelihood_bounds(ranking: Ranking, best: CombinationFit, index: int) -> tuple[float, float]:
     """
-    Return the bounds of a coefficient by the likelihood.
-
-    Between them -2 ln likelihood is within `_CHI_SQUARED_95` of its minimum.
+    Return the bounds of a coefficient, between which -2 ln likelihood is near its minimum.
 
     At each coefficient the other terms are fitted anew (profile likelihood): those of the best
     fits, N, B and K, detected or not, and a process where it is fitted with the term.
 
     """
-    octaves, misfit = ranking.best.octaves, ranking.misfit
-    if with_process and ranking.best_process is not None:
-        octaves = ranking.best_process.octaves
-    held = {_N, _B, _K, *(each for one in (*ranking.plausible_fits, *ranking.alternatives)
+    held = {_N, _B, _K, *(each for one in (best, ranking.best, *ranking.alternatives)
                           for each in one.active_terms)}
-    others = tuple(sorted(held - {index} | ({_PROCESS} if with_process else set())))
-    joint = fit_combination(octaves, (*others, index), misfit)
+    others = tuple(sorted(held - {index}))
+    joint = fit_combination(best.octaves, (*others, index), ranking.misfit)
     (*_, square), (*_, deviation) = joint.estimate_squares((*others, index))
 
     @cache
     def deviance_at(coefficient: float) -> float:
-        return fit_combination(octaves, others, misfit, index, coefficient ** 2).deviance
+        return fit_combination(best.octaves, others, ranking.misfit, index,
+                               coefficient ** 2).deviance
 
     found = math.sqrt(joint.squares[index])
     scale = math.sqrt(max(square, 0.0) + deviation)
     likeliest = min((found, *(scale * factor for factor in (0.25, 0.5, 0.75, 0.9, 1.0, 1.1))),
                     key=deviance_at)
-    limit = deviance_at(likeliest) + _CHI_SQUARED_95
+    limit = deviance_at(likeliest) + NORMAL_QUANTILE_975 ** 2  # of chi squared, 95 %
 
     def bisect_limit(inside: float, outside: float) -> float:
         for _ in range(12):

@@ -48,8 +48,7 @@ from scipy.special import digamma, polygamma
 _MIN_SAMPLES, _MIN_DURATION = 8, 1.5
 #: Minimum cut at both ends of a dwell, s, which excludes a time offset between gyro and reference.
 _MARGIN = 0.25
-#: Largest deviation of the heading from a straight line beyond its steps, rad, and half of the
-#: largest difference between the rates of the quarters of a dwell, rad/s.
+#: Largest deviation of the heading from a straight line beyond its steps, rad.
 _MAX_DEVIATION = 0.5 * DEGREE
 #: A dwell or a sample beyond this many robust standard deviations is outlying.
 OUTLIER_THRESHOLD = 6.0
@@ -389,12 +388,10 @@ def find_dwells(log: Log) -> Dwells:
     remarks += _describe_left_out(log, samples, is_outlier & within, is_repeated & within, within)
     share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
     if share < _MIN_DWELL_SHARE:
-        limit = _MAX_DEVIATION / DEGREE
         raise DataRefused(
-            f'the reference is steady to {limit:g} deg/s and straight to {limit:g} deg, for '
-            f'{_MIN_DURATION:g} s at a time without the settling, in {100.0 * share:.0f} % '
-            'of the log; hold each rate for longer, or use the heading itself with '
-            '--method likelihood')
+            f'the heading is a straight line to {_MAX_DEVIATION / DEGREE:g} deg, for '
+            f'{_MIN_DURATION:g} s at a time without the settling, in {100.0 * share:.0f} % of the '
+            'log; hold each rate for longer, or use the heading itself with --method likelihood')
     rate, output, deviation = _average(samples, dwells)
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None
@@ -427,9 +424,8 @@ def _find_straight(samples: _Samples) -> list[slice]:
             kept.pop()
         if not kept or part.start >= kept[-1].stop:
             kept.append(part)
-    whole = [slice(int(edges[part.start]), int(edges[part.stop]))
-             for part in kept if _length(part) > 4]
-    return [part for part in whole if _has_constant_slope(samples, part)]
+    return [slice(int(edges[part.start]), int(edges[part.stop]))
+            for part in kept if _length(part) > 4]
 
 
 def _length(part: slice) -> int:
@@ -481,16 +477,6 @@ def _count_ramp_blocks(deviation: Array, tolerance: float) -> int:
         return 0
     ratio = math.sqrt(max(1.0, deviation[_RAMP_BLOCKS] / tolerance))
     return math.ceil(min(6.0, 1.0 / max(ratio - 1.0, 1e-3)) * _RAMP_BLOCKS)
-
-
-def _has_constant_slope(samples: _Samples, part: slice) -> bool:
-    """Return whether the quarters of a stretch have one slope, unlike those of a slow swing."""
-    quarters = [rows for rows in np.array_split(np.arange(part.start, part.stop), 4)
-                if len(rows) > 2]
-    slopes = np.array([_fit_slope(samples.time[rows], samples.heading[rows]) for rows in quarters])
-    blur = 8.0 * samples.step / samples.duration(part)
-    return not quarters or bool(np.ptp(slopes) <= blur + 2.0 * (
-        _MAX_DEVIATION + 0.005 * np.abs(slopes).max()))
 
 
 # settling and temperature

@@ -155,7 +155,6 @@ def calibrate_encoder(log: Log, method: str | None = None,
 
     """
     time, output, motion = _extract_motion(log)
-    _refuse_length(motion)
     if method is None:
         method = 'likelihood'
         if log.reference_heading is not None and log.time is not None:
@@ -248,17 +247,14 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
                               f'at least {fewest} are needed: {remedy}')
     start = log.time[reference_known][0]
-    return (log.time[output_known] - start, log.output[output_known],
-            motion_from_headings(log.time[reference_known], heading[reference_known]))
-
-
-def _refuse_length(motion: Motion) -> None:
+    motion = motion_from_headings(log.time[reference_known], heading[reference_known])
     if motion.duration < 10.0:
         raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: '
                           'record longer')
     if motion.duration > 1e8:  # three years
         raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
                           'check that time_s is in s, or give --rate')
+    return log.time[output_known] - start, log.output[output_known], motion
 
 
 def _find_holes(time: Array) -> Array:

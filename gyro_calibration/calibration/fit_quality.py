@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 import math
-from typing import NamedTuple
 
 from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, ScaleBiasFit
 from gyro_calibration.calibration.noise_grid import BandedNoise, fit_noise_grid, GridFit
@@ -33,18 +32,9 @@ from scipy.special import chdtr
 
 #: Number of windows of a run in the second fit of the bias.
 _WINDOW_COUNT = 16
-#: Duration, s, and net turn, rad, of the drive for which the precision of a calibration is judged.
-DRIVE_DURATION, DRIVE_ANGLE = 300.0, 2.0 * math.pi
-
-
-class _WindowMeans(NamedTuple):
-    """Means over windows of equal length, and the deviation of the error within them."""
-
-    duration: float  # of a window, s
-    time: Array
-    heading: Array  # of the reference, rad
-    heading_error: Array  # of the gyro against the reference, rad
-    repeatable_error: float  # standard deviation of that about its means, rad
+#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
+#: is judged, s.
+DRIVE_DURATION = 300.0
 
 
 def refit_bias_by_windows(fit: ScaleBiasFit, time: Array, rate: Array,
@@ -67,55 +57,47 @@ def refit_bias_by_windows(fit: ScaleBiasFit, time: Array, rate: Array,
         returned unchanged
 
     """
-    windows = None if motion.rate is not None else _average_windows(fit, time, rate, motion)
-    if windows is None:
+    gyro_time = motion.time + fit.time_offset
+    inside = (gyro_time >= time[0]) & (gyro_time <= time[-1])
+    gyro_time, heading = gyro_time[inside], motion.heading[inside]
+    if motion.rate is not None or len(gyro_time) < 2 * _WINDOW_COUNT:
         return fit
-    walk, reference_deviation = fit.angle_random_walk, max(windows.repeatable_error, 1e-12)
-    random_walk_fit = _fit_windows(windows, (walk, walk), (1e-15, 1e-15))
+    length = float(gyro_time[-1] - gyro_time[0]) / _WINDOW_COUNT
+    place = np.minimum(((gyro_time - gyro_time[0]) / length).astype(np.intp), _WINDOW_COUNT - 1)
+    count = np.bincount(place, minlength=_WINDOW_COUNT)
+    if length < 1.0 or not count.all():
+        return fit
+    error = (np.interp(gyro_time, time, integrate(time, rate))
+             - (1.0 + fit.scale_factor_error) * heading)
+    means = [np.bincount(place, values) / count for values in (gyro_time, heading, error)]
+    repeatable_error = float(np.std(error - means[2][place]))
+    spacing, turned, moved = (np.diff(each) for each in means)
+    ones = np.ones(_WINDOW_COUNT - 1)
+
+    def fit_means(walk_range: tuple[float, float],
+                  reference_range: tuple[float, float]) -> GridFit:
+        """Fit a bias, with ranges of N, rad/√s, and of the errors of the means, rad."""
+        return fit_noise_grid(moved, spacing[:, None], [
+            BandedNoise('angle_random_walk', 2.0 / 3.0 * length * ones, length / 6.0 * ones,
+                        walk_range),
+            BandedNoise('reference', 2.0 * ones, -ones, reference_range)])
+
+    walk, reference_deviation = fit.angle_random_walk, max(repeatable_error, 1e-12)
+    random_walk_fit = fit_means((walk, walk), (1e-15, 1e-15))
     misfit = np.sum(random_walk_fit.whiten(random_walk_fit.residual) ** 2)
     # a random walk of the heading is refitted once in a thousand runs
     if not chdtr(_WINDOW_COUNT - 2, misfit) < 1e-3:
         return fit
-    repeatable_fit = _fit_windows(windows, (1e-3 * walk, walk),
-                                  (1e-3 * reference_deviation, reference_deviation))
-    weights = repeatable_fit.solve(np.diff(windows.time))
-    slope = float(weights @ np.diff(windows.heading)) / float(weights @ np.diff(windows.time))
+    repeatable_fit = fit_means((1e-3 * walk, walk),
+                               (1e-3 * reference_deviation, reference_deviation))
+    weights = repeatable_fit.solve(spacing)
+    slope = float(weights @ turned) / float(weights @ spacing)
     scale_variance = fit.covariance[0, 0]
     covariance = np.array([[scale_variance, -slope * scale_variance],
                            [-slope * scale_variance,
                             2.0 * repeatable_fit.covariance[0, 0] + slope ** 2 * scale_variance]])
     return replace(fit, bias=float(repeatable_fit.values[0]), covariance=covariance,
-                   repeatable_error=windows.repeatable_error)
-
-
-def _average_windows(fit: ScaleBiasFit, time: Array, rate: Array,
-                     motion: Motion) -> _WindowMeans | None:
-    """Return the windows; None where one is empty, or shorter than 1 s."""
-    gyro_time = motion.time + fit.time_offset
-    inside = (gyro_time >= time[0]) & (gyro_time <= time[-1])
-    gyro_time, heading = gyro_time[inside], motion.heading[inside]
-    if len(gyro_time) < 2 * _WINDOW_COUNT:
-        return None
-    length = float(gyro_time[-1] - gyro_time[0]) / _WINDOW_COUNT
-    place = np.minimum(((gyro_time - gyro_time[0]) / length).astype(np.intp), _WINDOW_COUNT - 1)
-    count = np.bincount(place, minlength=_WINDOW_COUNT)
-    if length < 1.0 or not count.all():
-        return None
-    error = (np.interp(gyro_time, time, integrate(time, rate))
-             - (1.0 + fit.scale_factor_error) * heading)
-    middle, known, turned = (np.bincount(place, values) / count
-                             for values in (gyro_time, heading, error))
-    return _WindowMeans(length, middle, known, turned, float(np.std(error - turned[place])))
-
-
-def _fit_windows(windows: _WindowMeans, walk_range: tuple[float, float],
-                 reference_range: tuple[float, float]) -> GridFit:
-    """Fit a bias, with ranges of N, rad/√s, and of the errors of the means of windows, rad."""
-    ones = np.ones(len(windows.time) - 1)
-    return fit_noise_grid(np.diff(windows.heading_error), np.diff(windows.time)[:, None],
-                          [BandedNoise('angle_random_walk', 2.0 / 3.0 * windows.duration * ones,
-                                       windows.duration / 6.0 * ones, walk_range),
-                           BandedNoise('reference', 2.0 * ones, -ones, reference_range)])
+                   repeatable_error=repeatable_error)
 
 
 def add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
@@ -158,9 +140,9 @@ def refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
 
     """
     error_with = math.sqrt(
-        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * DRIVE_ANGLE)
-        * DRIVE_DURATION + fit.covariance[0, 0] * DRIVE_ANGLE ** 2)
-    error_without = math.hypot(fit.bias * DRIVE_DURATION, fit.scale_factor_error * DRIVE_ANGLE)
+        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * math.tau)
+        * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
+    error_without = math.hypot(fit.bias * DRIVE_DURATION, fit.scale_factor_error * math.tau)
     if error_with > max(limit, error_without):
         raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
                           f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '

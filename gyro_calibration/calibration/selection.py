@@ -33,7 +33,7 @@ from gyro_calibration.calibration.scatter import (
     SCALE_SLOPE_DEVIATION,
     Scatter,
 )
-from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -53,8 +53,6 @@ FALSE_ALARM_RATE = 0.01
 #: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
 #: one of thirty thousand calibrations.
 MIN_DISTINGUISHING_SIGMAS = 4.0
-#: Standard deviations below which the data do not prefer one of two causes.
-MIN_PREFERENCE_SIGMAS = 2.0
 #: Technology -> which of sine response and cubic nonlinearity its physics causes.
 TECHNOLOGY_EFFECTS = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
                       'mems': CUBIC_NONLINEARITY}
@@ -249,7 +247,7 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
     best, second = sorted((fit, swapped), key=lambda each: each.misfit)
     taken = next(each for each in CONFOUNDERS if each in best.effects)
     sigmas = math.sqrt(max(second.misfit - best.misfit, 0.0))
-    preferred, limit = ((bounded_effect, MIN_PREFERENCE_SIGMAS) if technology is None
+    preferred, limit = ((bounded_effect, NORMAL_QUANTILE_975) if technology is None
                         else (TECHNOLOGY_EFFECTS[technology], MIN_DISTINGUISHING_SIGMAS))
     fits = f'fits better by {sigmas:.1f} standard deviations'
     if preferred is CONFOUNDERS[taken] and sigmas < limit:

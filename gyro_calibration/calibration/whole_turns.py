@@ -31,14 +31,13 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import ndtri
 
-FULL_TURN = 2.0 * math.pi
 #: Standard deviation of the heading of a robot put on a mark by hand or eye, rad: two marks a
 #: finger's width apart at half a metre.
 MARK_DEVIATION = 1.0 * DEGREE
-#: Shortest rest, s, and the time at its end that is left out while the robot stops or starts, s.
-MIN_REST_DURATION, _REST_MARGIN = 1.0, 0.25
-#: Length of the means that separate rest from motion, s, and the smallest deviation that is
-#: motion for any noise of the gyro, rad/s.
+#: Shortest rest, s.
+MIN_REST_DURATION = 1.0
+#: Length of the means that separate rest from motion, s; the one beside the motion is left
+#: out. And the smallest deviation that is motion for any noise of the gyro, rad/s.
 _PART_DURATION, _MIN_MOVING_RATE = 0.25, 0.5 * DEGREE
 #: Largest difference between the angle and the number of turns, in turns; half a turn would be as
 #: near to the next number.
@@ -109,20 +108,29 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     wander_variance = noise.mean_change_variance(duration, min(rest_durations))
     difference_variance = white_density / rest_durations[0] + white_density / rest_durations[1]
     bias, variance = 0.5 * (first + last), 0.25 * difference_variance + 0.5 * wander_variance
-    _refuse_bias(last - first, math.sqrt(difference_variance + wander_variance), bias, limits)
+    difference, deviation = last - first, math.sqrt(difference_variance + wander_variance)
+    if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSAL_RATE)) * deviation,
+                             limits.max_rest_rate):
+        raise DataRefused(
+            f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
+            f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
+            'both ends, or the gyro still warms up; wait, and run again')
+    if abs(bias) > limits.max_bias:
+        raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
+                          f'{limits.max_bias / DEGREE:g} deg/s: did the robot rest at both ends?')
     integral = np.interp((begin, end), time, integrate(time, rate))
     gyro_angle = float(integral[1] - integral[0]) - bias * duration
-    count = _count_turns(gyro_angle / FULL_TURN, turns, limits)
-    scale = gyro_angle / (count * FULL_TURN)
+    count = _count_turns(gyro_angle / math.tau, turns, limits)
+    true_angle = count * math.tau
+    scale = gyro_angle / true_angle
     if abs(scale - 1.0) > limits.max_scale_factor_error:
         raise DataRefused(f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, '
                           'and look at the sensitivity')
     angle_variance = (white_density * duration + variance * duration ** 2
                       + (scale * mark_deviation) ** 2)
-    shared = -variance * duration / (count * FULL_TURN)
-    covariance = np.array([[angle_variance / (count * FULL_TURN) ** 2, shared],
-                           [shared, variance]])
+    shared = -variance * duration / true_angle
+    covariance = np.array([[angle_variance / true_angle ** 2, shared], [shared, variance]])
     return TurnCalibration(ScaleBiasFit(scale - 1.0, bias, covariance), count, duration,
                            rest_durations)
 
@@ -137,28 +145,15 @@ def _find_turns(time: Array, rate: Array, white_density: float) -> tuple[float, 
         # number of means, from the first on, whose differences are within the noise
         middle = np.array([np.median(values[:end]) for end in range(1, len(values) + 1)])
         steady = int(np.argmax(np.append(np.abs(values - middle) > limit, True)))
-        lengths.append(steady * _PART_DURATION - _REST_MARGIN)
+        lengths.append((steady - 1) * _PART_DURATION)
         if lengths[-1] < MIN_REST_DURATION:
             raise DataRefused(f'the robot rests for {max(lengths[-1], 0.0):.1f} s {name} the '
                               f'turns, wanted {MIN_REST_DURATION:g} s at least: leave it at rest '
                               'on the mark, and record until after that')
-    if sum(lengths) >= time[-1] - time[0] - 2.0 * _REST_MARGIN:
+    if sum(lengths) >= time[-1] - time[0] - 2.0 * _PART_DURATION:
         raise DataRefused('the gyro rests all the time: did the robot turn, '
                           'and does the gyro respond?')
     return float(time[0] + lengths[0]), float(time[-1] - lengths[1])
-
-
-def _refuse_bias(difference: float, deviation: float, bias: float, limits: RunLimits) -> None:
-    """Refuse rests that differ significantly (`deviation` is 1 sigma), or a large bias, rad/s."""
-    if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSAL_RATE)) * deviation,
-                             limits.max_rest_rate):
-        raise DataRefused(
-            f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
-            f'{abs(difference) / deviation:.1f} standard deviations: the robot did not rest at '
-            'both ends, or the gyro still warms up; wait, and run again')
-    if abs(bias) > limits.max_bias:
-        raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.max_bias / DEGREE:g} deg/s: did the robot rest at both ends?')
 
 
 def _count_turns(measured: float, turns: int | None, limits: RunLimits) -> int:

@@ -19,7 +19,6 @@ spectrum of its noise), `candidates` (columns of causes, and of what has no name
 logs on causes, under every noise), `search` (for causes, and their confirmation), `words` (numbers
 and findings for people), `residuals` (their noise and curves), `extended_model` (and its gain on
 what was held out), `noisy_reference` (where the reference limits what is known), `pipeline` (of a
-diagnosis, in order), `dwell_fit` (of a model and causes to a rate table), `rate_table` (the
-diagnosis of a rate table), `report` (the page).
+diagnosis, in order), `rate_table` (the diagnosis of a rate table), `report` (the page).
 
 """

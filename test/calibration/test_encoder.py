@@ -15,7 +15,6 @@ What was put in is found, with true intervals, on simulated logs and on measured
 """
 
 from dataclasses import replace
-import math
 
 from chance import fewest, rms_bounds
 import efficiency
@@ -76,13 +75,6 @@ def test_a_wobble_that_repeats_itself_is_no_angle_random_walk():
     model = calibrate_encoder(replace(log, output=log.output + wobble)).model
     assert 0.7 * true < model.noise.angle_random_walk < 2.0 * true
     assert not model.noise_bounds
-
-
-def test_the_model_has_the_angle_random_walk_that_is_stated_and_it_is_right():
-    noise = Noise(angle_random_walk=5e-4)
-    found = calibrate_encoder(log_of(SWING, 100.0, noise, np.random.default_rng(8)))
-    assert found.model.noise.angle_random_walk == found.fit.angle_random_walk
-    assert found.fit.angle_random_walk == pytest.approx(5e-4, rel=0.25)
 
 
 def test_the_model_holds_what_was_found():
@@ -184,14 +176,6 @@ def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_no
     ratios = (found ** 2).mean(axis=0) / efficiency.bound(step * DEGREE, noise * DEGREE, False)
     assert (ratios[0] < 1.1 * rms_bounds(runs)[1] ** 2).all(), ratios
     assert (ratios[1] > 3.0).all(), ratios
-
-
-def test_the_rate_of_the_encoder_finds_the_truth_where_nothing_is_late():
-    found = calibrate_encoder(
-        log_of(SWING, 100.0, Noise(0.3 * DEGREE / 60), np.random.default_rng(1)), 'rate')
-    errors = np.abs((found.fit.scale_factor_error - S, found.fit.bias - B))
-    assert (errors < 4.0 * np.sqrt(np.diag(found.fit.covariance))).all() and math.isnan(
-        found.fit.time_offset)
 
 
 def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():

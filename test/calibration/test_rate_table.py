@@ -14,8 +14,8 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
-from gyro_calibration.calibration.rate_table import bin_errors, channels_of, fit_effects
-from gyro_calibration.calibration.scatter import estimate_scatter, Scatter, Whitener
+from gyro_calibration.calibration.rate_table import channels_of, fit_effects
+from gyro_calibration.calibration.scatter import estimate_scatter, Scatter
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS,
@@ -113,17 +113,6 @@ def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_sca
                                covariance / np.outer(sizes, sizes), atol=1e-5)
 
 
-def test_given_deviations_weigh_the_dwells_and_one_that_is_unknown_counts_like_the_others():
-    table = measured(LINEAR, sweeps=3, told=True)
-    fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR), alike(table, 0.0))
-    (scale, bias) = np.polyfit(table.rate, table.output - table.rate, 1, w=1.0 / table.deviation)
-    assert [term.values[0] for term in fit.terms] == pytest.approx([bias, scale], rel=1e-9)
-    unknown = replace(table,
-                      deviation=np.where(np.arange(len(table)) == 5, np.nan, table.deviation))
-    assert alike(unknown, 0.0).deviation(unknown)[5] == pytest.approx(
-        np.sqrt(np.nanmean(unknown.deviation ** 2)))
-
-
 def test_the_matrix_of_the_paper_is_the_polynomial():
     table = measured(SINE)
     fit = fit_effects(table, [rate_temperature_polynomial(3, 2)])
@@ -140,18 +129,6 @@ def test_the_matrix_of_the_paper_is_the_polynomial():
 
 # few dwells
 
-def test_three_speeds_of_a_record_player_leave_one_degree_of_freedom():
-    rate = np.array([0.0, 200.0, 270.0]) * DEGREE
-    # the counts of the blog, at 70 mdps a count
-    output = -np.array([2.5654, -2854.5, -3857.9]) * 0.07 * DEGREE
-    fit = fit_effects(dwells(rate, output - rate), (BIAS, SCALE_FACTOR_ERROR))
-    (scale, bias), covariance = np.polyfit(rate, output - rate, 1, cov=True)
-    assert [term.values[0] for term in fit.terms] == pytest.approx([bias, scale])
-    student_intervals = np.sqrt(np.diag(covariance))[::-1] * student.ppf(0.975, 1)
-    np.testing.assert_allclose(1.96 * np.sqrt(np.diag(fit.model.covariance)),
-                               student_intervals, rtol=1e-5)
-
-
 @pytest.mark.parametrize('runs', [40, pytest.param(400, marks=pytest.mark.evidence)])
 def test_intervals_from_three_speeds_hold_the_truth(runs):
     generator = np.random.default_rng(3)
@@ -162,12 +139,6 @@ def test_intervals_from_three_speeds_hold_the_truth(runs):
         fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR))
         held += abs(fit.terms[1].values[0] - 0.02) < 1.96 * math.sqrt(fit.model.covariance[1, 1])
     assert binom.ppf(RARE, runs, 0.95) <= held <= binom.ppf(1 - RARE, runs, 0.95)
-
-
-def test_as_many_values_as_dwells_have_no_covariance():
-    table = measured(SINE, sweeps=3, rates=4)
-    fit = fit_effects(table, [rate_temperature_polynomial(3, 2)])
-    assert len(table) == 12 and fit.model.covariance is None and fit.dof == 0
 
 
 # scatter
@@ -184,18 +155,6 @@ def test_a_table_without_any_error_is_fitted(rates):
     fit = fit_effects(dwells(rates, 0.0), [BIAS])
     assert fit.model.terms[0].values[0] == pytest.approx(0.0, abs=1e-15)
     assert fit.p_value(BIAS) == 1.0
-
-
-def test_whitening_is_by_the_whole_covariance():
-    table = measured(SINE, sweeps=5, rates=6)
-    scatter = Scatter(1e-3, 2e-3, 3e-3, 4e-3, np.ones(len(table), bool))
-    same = table.sweep[:, None] == table.sweep
-    covariance = (np.diag(scatter.deviation(table) ** 2)
-                  + same * (scatter.sweep_columns(table) @ scatter.sweep_columns(table).T))
-    whitener, error = Whitener(table, scatter), table.output - table.rate
-    assert whitener.whiten(error) @ whitener.whiten(error) == pytest.approx(
-        error @ np.linalg.solve(covariance, error))
-    np.testing.assert_allclose(whitener.restore(whitener.whiten(error)), error)
 
 
 def test_what_is_left_out_is_what_a_fit_without_the_sweep_gives():
@@ -234,24 +193,6 @@ def test_an_outlying_dwell_is_not_fitted():
             and np.isnan(fit.left_out_residual[30]))
 
 
-def test_bins_hold_all_dwells_that_were_fitted_and_know_what_sweeps_share():
-    fit = fit_effects(measured(SINE, sweep_bias=0.1 * DEGREE), [term.effect for term in SINE])
-    parts = bin_errors(fit, fit.dwells.temperature)
-    assert sum(part.count for part in parts) == fit.scatter.inliers.sum()
-    assert (min(part.deviation for part in parts) > 0.5 * fit.scatter.sweep_bias
-            > fit.scatter.dwell_bias / 2.0)
-
-
-def test_rates_beyond_the_top_of_a_sine_are_reported():
-    beyond, within = (fit_effects(measured((*LINEAR, Term(SINE_RESPONSE, (0.25, 1.0))),
-                                           fastest=fastest * DEGREE),
-                                  (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE))
-                      for fastest in (450.0, 250.0))
-    # 90 degrees of phase are at 360 deg/s
-    assert (within.min_non_monotonic_rate is None
-            and 300.0 < beyond.min_non_monotonic_rate / DEGREE < 400.0)
-
-
 # refusals
 
 ASCENDING = np.linspace(-1.0, 1.0, 20)
@@ -282,14 +223,6 @@ REFUSED = {
 def test_what_the_dwells_do_not_determine_is_refused_with_the_remedy(table, effects, said):
     with pytest.raises(DataRefused, match=f'^{said}'):
         fit_effects(table, effects)
-
-
-def test_a_polynomial_over_the_output_alone_needs_no_temperature():
-    table = measured(SINE)
-    fit = fit_effects(replace(table, temperature=None), [rate_temperature_polynomial(3, 0)])
-    assert fit.residual == pytest.approx(
-        fit_effects(table, [rate_temperature_polynomial(3, 0)]).residual,
-        abs=0.1 * fit.residual_rms)
 
 
 # a polynomial of the output

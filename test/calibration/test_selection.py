@@ -17,7 +17,6 @@ from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells, 
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE,
     MIN_DISTINGUISHING_SIGMAS,
-    MIN_PREFERENCE_SIGMAS,
     select_effects,
     TECHNOLOGY_EFFECTS,
 )
@@ -78,11 +77,6 @@ def test_a_curve_over_temperature_is_found_where_its_slope_alone_explains_little
     table = replace(WANDERING, temperatures=(0.0, 60.0))
     assert {'bias_temperature', 'bias_temperature_quadratic'} <= names(
         select_effects(measured(table, terms), 'open_loop_fog'))
-
-
-def test_two_sweeps_at_two_temperatures_show_the_slope_between_them():
-    terms = (*LINEAR, Term(BIAS_TEMPERATURE, (36.0, 1e-4)))
-    assert 'bias_temperature' in names(select_effects(measured(Table(sweeps=2), terms)))
 
 
 @pytest.mark.parametrize('technology', TECHNOLOGY_EFFECTS)
@@ -151,15 +145,6 @@ def test_rests_show_a_bias_alone():
 def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
     """Dwells that scatter by 10 deg/s do not determine a slope of 0.07 deg/s/K."""
     assert names(select_effects(measured(Table(dwell=10.0 * DEGREE), LINEAR))).isdisjoint(SLOPES)
-
-
-def test_of_confounders_that_fit_alike_the_bounded_one_is_taken_by_default():
-    generator = np.random.default_rng(6)
-    for _ in range(2):
-        fit = select_effects(
-            WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])), generator))
-        pair, = fit.confounders
-        assert pair.taken == 'sine_response' or pair.sigmas >= MIN_PREFERENCE_SIGMAS
 
 
 @pytest.mark.parametrize('technology', [None, *TECHNOLOGY_EFFECTS])

@@ -16,16 +16,13 @@ import re
 
 from gyro_calibration.calibration.dwells import join_dwells
 from gyro_calibration.calibration.rate_table import fit_effects
-from gyro_calibration.calibration.scatter import rms, Scatter
-from gyro_calibration.diagnosis import dwell_fit
+from gyro_calibration.calibration.scatter import rms
 from gyro_calibration.diagnosis import rate_table as diagnosis
 from gyro_calibration.diagnosis.rate_table import diagnose_table
-from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import (
-    BIAS,
     CATALOGUE,
     rate_temperature_polynomial,
-    SCALE_FACTOR_ERROR,
     STATIC_EFFECTS,
 )
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, SelfCalibration, Term
@@ -35,7 +32,6 @@ import pytest
 from rate_table import table as recorded_table
 from recovery import LINEAR, SCATTERS, Table
 from scipy.stats import binom
-from scipy.stats import t as student
 
 #: A test fails by chance as rarely as this.
 RARE = 1e-4
@@ -146,21 +142,6 @@ def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_aga
     assert members(found) == {'bias_temperature'}
 
 
-def test_a_scale_factor_may_always_be_that_of_the_reference(without_gain):
-    found = diagnosed(Table(), gyro('scale_factor_error', 0.01), np.random.default_rng(7),
-                      GyroModel(LINEAR))
-    assert members(found.findings[0]) == {'scale_factor_error', 'reference_scale'}
-
-
-def test_a_factor_that_may_be_of_the_gyro_stays_in_the_scale_factor_of_a_model(without_gain):
-    found = diagnosed(Table(), GyroModel((Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.024,)))),
-                      np.random.default_rng(8))
-    terms = {term.effect.name: term.values for term in found.model.terms}
-    assert ('unit_error' in names(found)
-            and terms['scale_factor_error'][0] == pytest.approx(0.024, abs=1e-3))
-    assert any('was not multiplied' in remark for remark in found.remarks)
-
-
 def test_a_model_of_a_mended_table_says_what_its_output_was_multiplied_by(without_gain):
     table = Table().measure(gyro('scale_factor_asymmetry', 0.02), np.random.default_rng(8))
     found = diagnose_table(replace(table, output=-table.output), None)
@@ -233,21 +214,6 @@ def test_what_is_not_in_the_catalogue_gets_no_name(waves):
             and found.unexplained[0].share_of_variance > 0.3)
 
 
-def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_for(monkeypatch):
-    generator = np.random.default_rng(19)
-    table = Table().measure(GyroModel(LINEAR), generator)
-    table = replace(table, output=table.output + 0.03 * DEGREE * np.sin(6.0 * table.rate + 1.0))
-    fit = fit_effects(table, [term.effect for term in LINEAR])
-    certain = np.zeros((np.count_nonzero(fit.scatter.inliers), 1))
-    probes = dwell_fit._structure_curves(table)
-    found = dwell_fit.find_structure(fit, 1e-3, certain)[0][0]
-    monkeypatch.setattr(dwell_fit,
-                        '_structure_curves', lambda dwells: {found.along: probes[found.along]})
-    alone = dwell_fit.find_structure(fit, 1e-3, certain)[0][0]
-    tried = sum(columns.shape[1] > 0 for columns in probes.values())
-    assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
-
-
 def test_outlying_dwells_and_wrong_units_are_reported_and_not_fitted():
     generator = np.random.default_rng(13)
     table = Table().measure(GyroModel(LINEAR), generator)
@@ -255,30 +221,6 @@ def test_outlying_dwells_and_wrong_units_are_reported_and_not_fitted():
     found = diagnose_table(replace(table, output=wild * DEGREE), None)
     assert names(found) == ['unit_error', 'outliers'] and 'row 51' in found.findings[1].evidence
     assert found.before.terms[1].values[0] == pytest.approx(0.01, abs=1e-3)
-
-
-def test_an_exact_table_with_an_outlying_dwell_is_diagnosed():
-    rate = np.tile(np.linspace(-70.0, 70.0, 15), 3)
-    output = 1.002 * rate + np.where(np.arange(len(rate)) == 7, 15.0, 0.0)
-    table = Log(output=output * DEGREE, reference_rate=rate * DEGREE,
-                temperature=np.repeat([10.0, 25.0, 40.0], 15))
-    assert 'outliers' in names(diagnose_table(table, None))
-
-
-def test_an_outlying_dwell_is_compared_with_what_the_others_foretell_of_it():
-    table = Table(sweeps=1, rates=13).measure(GyroModel(LINEAR), np.random.default_rng(21))
-    last = np.arange(13) == 12
-    table = replace(table, output=table.output + 0.4 * DEGREE * last)
-    fit = fit_effects(table, [term.effect for term in LINEAR],
-                      Scatter(0.03 * DEGREE, 0.0, 0.0, 0.0, ~last))
-    (found,) = diagnosis._outlier_findings(table, fit, 1.0)
-    line, covariance = np.polyfit(table.rate[~last], (table.output - table.rate)[~last], 1,
-                                  cov='unscaled')
-    off = (table.output - table.rate)[12] - np.polyval(line, table.rate[12])
-    deviation = 0.03 * DEGREE * np.sqrt(
-        1.0 + [table.rate[12], 1.0] @ covariance @ [table.rate[12], 1.0])
-    # The scatter of 12 dwells is found about a parabola: their temperature rises as the rate does.
-    assert found.p_value == pytest.approx(13 * 2.0 * student.sf(abs(off) / deviation, 9))
 
 
 def test_tables_without_temperature_say_what_they_cannot_show():
@@ -289,24 +231,6 @@ def test_tables_without_temperature_say_what_they_cannot_show():
             and 'time' in found.cannot_show['thermal_lag'])
     known = {*found.cannot_show, *STATIC_EFFECTS, 'outliers', 'unit_error'}
     assert known == set(diagnosis.CAUSES)
-
-
-def test_columns_of_a_table_that_are_not_used_are_not_reported_as_missing(without_gain):
-    table = Table().measure(GyroModel(LINEAR), np.random.default_rng(20))
-    steady = np.full(len(table), 5.0)
-    log = Log(output=table.output, reference_rate=table.rate, temperature=table.temperature,
-              supply=steady, specific_force=steady)
-    told = diagnose_table(log, None).cannot_show
-    assert ('only rates and temperatures' in told['supply_sensitivity']
-            and 'only rates and temperatures' in told['acceleration_sensitivity'])
-    assert not [reason for reason in told.values() if 'holds no' in reason]
-
-
-def test_a_table_of_one_rate_is_refused():
-    table = Table().measure(GyroModel(LINEAR), np.random.default_rng(15))
-    with pytest.raises(DataRefused, match='one rate'):
-        diagnose_table(replace(table, rate=np.zeros(len(table)), output=table.output - table.rate),
-                       None)
 
 
 # what is won
