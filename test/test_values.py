@@ -17,7 +17,6 @@ GYRO_CALIBRATION_EXAMPLES multiplies their number and chooses them at random.
 """
 
 import itertools
-import json
 import math
 import os
 
@@ -26,7 +25,7 @@ from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.integration import filter_rates, Threshold, ThresholdFilter
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import DEGREE, Log, write_log
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.compensation import compensate
 from gyro_calibration.model.effects import CATALOGUE, Channels, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
@@ -277,22 +276,3 @@ def test_a_bias_table_stays_finite(rests, temperature, time):
 
 
 # verbs
-
-def test_a_log_with_a_lost_decimal_point_keeps_its_heading_and_counts_the_row(run, tmp_path):
-    (tmp_path / 'model.yaml').write_text(
-        'effects: {cubic_nonlinearity: {cubic_nonlinearity: -1.0e-3}}\n'
-        'valid: {rate: [-2, 2]}\nnoise: {angle_random_walk: 7.3e-4}')
-    rate, headings = np.repeat([0.0, 0.7, 0.0, -0.7, 0.0], [100, 150, 100, 150, 100]), []
-    for changes in ([], [(200, 700.0, 25.0), (300, 3e15, 25.0), (400, 0.0, 9e4)]):
-        output, temperature = rate + REST[:600], np.full(600, 25.0)
-        for place, *wrong in changes:
-            output[place], temperature[place] = wrong
-        write_log(tmp_path / 'log.csv', Log(output=output, time=np.arange(600) * INTERVAL,
-                                            temperature=temperature))
-        code, text, _ = run('compensate', tmp_path / 'log.csv', '--model',
-                            tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv', '--json')
-        answer = json.loads(text)
-        assert code == 0 and answer['refused_samples'] == len(changes) == answer['lost_samples']
-        headings.append((answer['heading_rad'], answer['heading_std_rad']))
-    (whole, sure), (gaps, less) = headings
-    assert abs(whole - gaps) < 3.0 * less and less > sure

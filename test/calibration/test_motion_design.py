@@ -18,8 +18,6 @@ import math
 from chance import mean_bound, rms_bounds
 from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, fit_likelihood
 from gyro_calibration.calibration.motion_design import (
-    _MotionFamily,
-    build_motion,
     CalibrationForecast,
     can_follow,
     find_best_motion,
@@ -112,29 +110,6 @@ def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
     assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
     assert (ability.max_turn_angle(9.0) == pytest.approx(4.5 * fastest)
             and ability.max_turn_rate(4.5 * fastest) == pytest.approx(fastest))
-
-
-def test_no_random_motion_that_the_robot_can_do_is_better():
-    """500 motions of random turns, rates and rests, stretched to the limit of time or place."""
-    ability = ABILITIES['a cable']
-    forecast = CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
-    generator = np.random.default_rng(3)
-    family, errors = _MotionFamily(ability, 20.0), []
-    for _ in range(500):
-        ends = np.append(generator.uniform(-1.0, 1.0, generator.integers(1, 8)), 0.0)
-        rows = family._fit_duration(np.diff(ends, prepend=0.0),
-                                    generator.uniform(0.2, 1.0, len(ends)), 0.0)
-        if rows is not None:
-            errors.append(forecast.search_error(build_motion(ability, rows, 1.0)))
-    assert len(errors) > 100 and min(errors) > forecast.search_error(planned('a cable').motion)
-
-
-def test_the_same_seed_plans_the_same_motion():
-    first, second = (find_best_motion(ABILITIES['free'],
-                                      CalibrationForecast(XV3500, 10.0, ROBOT_MOTION, 160.0), 10.0,
-                                      np.random.default_rng(4), 10) for _ in range(2))
-    assert (np.array_equal(first.motion.time, second.motion.time)
-            and np.array_equal(first.motion.rate, second.motion.rate))
 
 
 def test_the_bias_is_as_well_known_as_white_noise_allows_whatever_the_motion():
