@@ -560,6 +560,11 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     slips = slips[:len(slips) // 2]
     slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
+    # a profile itself has no noise, so that the ratio of the noises is not estimated
+    alone = estimate if alignment.is_measured else _solve_weighted(
+        data, _IncrementCovariance(data, 0.0), data.columns, estimate.prior_deviation)
+    residual_squares = float(alone.residual @ alone.noise.solve(alone.residual))
+    dof = alone.dof + (not alignment.is_measured)
     reference_noise = (math.sqrt(estimate.rate_variance * estimate.noise.ratio)
                        / abs(_nonzero_scale(estimate.values[0])))
     return ScaleBiasFit(
@@ -569,8 +574,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         math.sqrt(mixture.covariance[2, 2]),
         np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
         *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
-        *_residual_squares(data, estimate, alignment.is_measured),
-        slip_deviation=slip)
+        residual_squares, dof, slip_deviation=slip)
 
 
 def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
@@ -605,16 +609,6 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
 _OFFSET_TOLERANCE = 1e-3
 #: Largest additional delay of a robot that follows its profile with a lag, s.
 MAX_TRACKING_LAG = 0.25
-
-
-def _residual_squares(data: _Increments, estimate: _Estimate,
-                      is_measured: bool) -> tuple[float, float]:
-    """Return weighted sum of squares and degrees of freedom; a profile itself has no noise."""
-    if not is_measured:
-        estimate = _solve_weighted(data, _IncrementCovariance(data, 0.0), data.columns,
-                                   estimate.prior_deviation)
-    return (float(estimate.residual @ estimate.noise.solve(estimate.residual)),
-            estimate.dof + (not is_measured))  # the ratio of the noises is not estimated
 
 
 def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float]:
@@ -657,23 +651,6 @@ class DeviatingStretch:
     all_explained_squares: Array
     column_squares: Array
 
-    def mean_odds(self, dof: float, rate_deviation: float, noise_deviation: float) -> float:
-        """
-        Return the mean odds of all stretches, each against none.
-
-        Parameters
-        ----------
-        dof : remaining degrees of freedom
-        rate_deviation : standard deviation of the excess rates that are expected, rad/s
-        noise_deviation : standard deviation of the white noise
-
-        """
-        total_squares = max(self.remaining_squares + self.explained_squares, 1e-300)
-        odds = -0.5 * (
-            dof * np.log1p(-np.minimum(self.all_explained_squares / total_squares, 1.0 - 1e-15))
-            + np.log1p(self.column_squares * (rate_deviation / noise_deviation) ** 2))
-        return float(np.exp(np.minimum(odds, 100.0)).sum()) / max(len(odds), 1)
-
 
 #: A turn that the profile does not contain, by hand or by a single slip: standard deviation of its
 #: rate, rad/s, and its prior odds.
@@ -710,8 +687,13 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
 def _weigh_stretch(estimate: _Estimate, data: _Increments, found: DeviatingStretch,
                    stretch_column: Array, noise_deviation: float) -> tuple[float, Array, Array]:
     """Return the probability of a stretch with a turn of its own, and (1 + s, b) with it."""
-    odds = (EXCESS_TURN_ODDS
-            * found.mean_odds(estimate.dof - 1.0, EXCESS_RATE_DEVIATION, noise_deviation))
+    total_squares = max(found.remaining_squares + found.explained_squares, 1e-300)
+    logarithms = -0.5 * (
+        (estimate.dof - 1.0) * np.log1p(-np.minimum(
+            found.all_explained_squares / total_squares, 1.0 - 1e-15))
+        + np.log1p(found.column_squares * (EXCESS_RATE_DEVIATION / noise_deviation) ** 2))
+    odds = (EXCESS_TURN_ODDS * float(np.exp(np.minimum(logarithms, 100.0)).sum())
+            / max(len(logarithms), 1))  # the mean over all stretches, each against none
     widened = replace(data, columns=np.insert(data.columns, 4, stretch_column, axis=1),
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))
     other = _solve_weighted(widened, estimate.noise, widened.columns,

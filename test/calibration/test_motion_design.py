@@ -15,7 +15,7 @@ from functools import cache
 import json
 import math
 
-from chance import mean_bound, rms_bounds
+from chance import rms_bounds
 from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, fit_likelihood
 from gyro_calibration.calibration.motion_design import (
     CalibrationForecast,
@@ -35,7 +35,6 @@ from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model import presets
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION,
-    constant_rate_motion,
     motion_from_rates,
     read_motion,
     ROBOT_MOTION,
@@ -187,30 +186,6 @@ def test_fits_scatter_as_predicted(name, late, lag):
     ratios = np.std(errors, axis=0, ddof=1) / (expected.scale_deviation, expected.bias_deviation)
     low, high = rms_bounds(19)
     assert ((low < ratios) & (ratios < high)).all(), ratios
-
-
-def test_the_heading_of_a_drive_errs_as_predicted():
-    """300 runs of white noise; s and b are weighted sums, so that only the mapping is tested."""
-    noise, generator, drive = WHITE, np.random.default_rng(1), np.arange(1, 1601) / 10.0
-    rate, errors = CALIBRATION_MOTION.rate_at(TIME), []
-    for _ in range(300):
-        white = simulate_noise(noise, len(TIME), 0.01, generator)
-        s, b = np.linalg.lstsq(np.column_stack([rate, np.ones(len(TIME))]), white, rcond=None)[0]
-        walk = np.cumsum(simulate_noise(noise, len(drive), 0.1, generator)) * 0.1
-        errors.append(np.abs(walk - s * ROBOT_MOTION.heading_at(drive) - b * drive).mean())
-    predicted = (CalibrationForecast(noise, 20.0, ROBOT_MOTION, 160.0,
-                                     0.0).predict(CALIBRATION_MOTION).heading_error)
-    assert predicted == pytest.approx(np.mean(errors),
-                                      abs=mean_bound(np.array(errors) - predicted))
-
-
-def test_where_the_drive_turns_round_and_round_the_motion_gains_heading():
-    round_and_round = constant_rate_motion([(160.0, 45.0)])
-    forecast = CalibrationForecast(XV3500, 20.0, round_and_round, 160.0)
-    generator = np.random.default_rng(0)
-    chosen = find_best_motion(ABILITIES['free'], forecast, 20.0, generator, 15).prediction
-    assert (chosen.heading_error
-            < 0.85 * forecast.predict(plain_motion(ABILITIES['free'], 20.0)).heading_error)
 
 
 IMPOSSIBLE = {

@@ -13,7 +13,6 @@
 import math
 import time
 
-from gyro_calibration.files import read_bytes
 from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
 import pytest
@@ -88,10 +87,3 @@ def test_numbers_of_numpy_are_written_as_those_of_python(tmp_path):
         'a': [1e-7, 0.5, 2.0, 3, True]}
     with pytest.raises(ArithmeticError):
         format_settings({'a': np.float64(math.nan)})
-
-
-def test_a_file_of_the_largest_size_is_read(tmp_path):
-    path = written(tmp_path, b'x' * 100)
-    assert read_bytes(path, 100) == b'x' * 100
-    with pytest.raises(ValueError, match='more than 99 bytes'):
-        read_bytes(path, 99)
