@@ -89,9 +89,10 @@ def _compensate_at_once(model: GyroModel, output: Number, temperature: Number,
         modelled, unexplained = model.rate_from_channels(
             Channels(seen, seen, used) if environment is None
             else environment.with_rate(seen, seen))
-        computed = np.abs(modelled) < _MAX_COMPUTABLE_RATE
-        if not computed.all():
-            modelled, unexplained = np.where(computed, modelled, seen)[()], unexplained | ~computed
+        computed = abs(modelled) < _MAX_COMPUTABLE_RATE
+        if computed is not True and not np.all(computed):
+            modelled = np.where(computed, modelled, seen)[()]
+            unexplained = unexplained | np.logical_not(computed)
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen is not output:
         modelled, rate = modelled + (output - seen), rate + (output - seen)
