@@ -25,7 +25,7 @@ FILES = sorted(PACKAGE.rglob('*.py'))
 #: As the package's docstring gives it.
 ORDER = re.findall(r'`(\w+)`', gyro_calibration.__doc__.partition('Reading order:')[2])
 CORE = ORDER[:ORDER.index('driver')]
-FOLDERS = ['logs', 'model', 'model/effects', 'heading', 'calibration',
+FOLDERS = ['logs', 'model', 'heading', 'calibration',
            'allan', 'diagnosis', 'fleet', 'driver', 'ros']
 MAY_USE_ROS = {'demo_run.py', *(path.name for path in (PACKAGE / 'ros').glob('*.py'))}
 ROS = re.compile(r'rclpy|ament_\w+|launch\w*|tf2\w*|rosbag2\w*|rcl_interfaces|\w+_msgs|\w+_srvs')

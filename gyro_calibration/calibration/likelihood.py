@@ -29,7 +29,6 @@ import math
 from gyro_calibration.calibration.noise_grid import TridiagonalMatrix
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused
-from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
@@ -104,25 +103,6 @@ MAX_NOISE_SIGMAS = 7.0
 
 
 @dataclass(frozen=True)
-class _ReferencePoints:
-    """
-    Where the reference is known: times, s, headings, rad, and variances, shape (n,) each.
-
-    The variances are known up to one factor. Errors that several points share have columns, shape
-    (n, k), and prior standard deviations, shape (k,), times one row of the factors
-    `prior_factors`, shape (m, k).
-
-    """
-
-    time: Array
-    heading: Array
-    variance: Array
-    shared: Array
-    shared_deviation: Array = field(default_factory=lambda: np.empty(0))
-    prior_factors: Array = field(default_factory=lambda: np.ones((1, 0)))
-
-
-@dataclass(frozen=True)
 class _Increments:
     """Increments of headings of gyro and reference between blocks, each a mean over points."""
 
@@ -137,7 +117,7 @@ class _Increments:
     # shape (n,)
     walk_variance: Array
     walk_covariance: Array
-    # variance of the reference in each block, up to one factor, shape (n + 1,)
+    # variance of the reference in each block, relative to that of a point, shape (n + 1,)
     reference_variance: Array
     time: Array  # of the blocks, s, shape (n + 1,)
     # from the first point to the first block: its heading, the time, the shared errors in that
@@ -168,7 +148,15 @@ class _RunAlignment:
         self._smoothing_time = max(float(np.median(np.diff(time))), _MIN_SMOOTHING_TIME)
         self.is_measured = motion.rate is None
         self._block_duration = block_duration(motion)
-        self._points = _select_reference_points(motion, self._block_duration, slip_deviation)
+        if motion.rate is None:
+            self._point_time, self._heading = motion.time, motion.heading
+            self._shared, self._shared_deviation, self._prior_factors = _no_shared_errors(
+                len(motion.time))
+        else:
+            self._point_time = np.arange(0.0, motion.duration + 1e-9, 0.01)
+            self._heading = motion.heading_at(self._point_time)
+            self._shared, self._shared_deviation, self._prior_factors = tracking_error_columns(
+                motion, self._point_time, slip_deviation)
 
     def increments_at(self, offset: float, lag: float = 0.0) -> _Increments:
         """
@@ -178,30 +166,30 @@ class _RunAlignment:
         times the constant is the input, but for a delay.
 
         """
-        points, constant = self._points, math.sqrt(2.0 * lag)
-        gyro_time = points.time + offset - constant
+        constant = math.sqrt(2.0 * lag)
+        gyro_time = self._point_time + offset - constant
         is_covered = (gyro_time >= self._time[0]) & (gyro_time <= self._time[-1])
-        time, weight = points.time[is_covered], 1.0 / points.variance[is_covered]
+        time = self._point_time[is_covered]
         if len(time) < 2:
             return _Increments(np.empty((0, 4)), *np.empty((9, 0)))
         begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block_duration + 1e-6),
                                         prepend=-1.0))
-        precision = np.add.reduceat(weight, begins)
-        weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
-        known = np.column_stack([points.heading[is_covered], time,
+        counts = np.diff(begins, append=len(time))
+        weight = np.repeat(1.0 / counts, counts)
+        known = np.column_stack([self._heading[is_covered], time,
                                  *self._rate_and_integral(gyro_time[is_covered], constant),
-                                 points.shared[is_covered]])
+                                 self._shared[is_covered]])
         means = np.add.reduceat(weight[:, None] * known, begins)
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
-        prior = np.append(self._prior_deviation, points.shared_deviation)
-        prior_factors = np.insert(points.prior_factors, [0] * 4, 1.0, axis=1)
+        prior = np.append(self._prior_deviation, self._shared_deviation)
+        prior_factors = np.insert(self._prior_factors, [0] * 4, 1.0, axis=1)
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
         start_offsets = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
                                         [means[0, 4] - known[0, 4]]])
         return _Increments(columns, prior, prior_factors, expected, np.diff(means[:, 4]), *walk,
-                           1.0 / precision, means[:, 1], start_offsets)
+                           1.0 / counts, means[:, 1], start_offsets)
 
     def require_increments(self, offset: float, lag: float) -> _Increments:
         """Return the increments, or refuse a run with hardly any."""
@@ -275,40 +263,22 @@ def block_duration(motion: Motion) -> float:
     return block / 2.0 ** halvings
 
 
-def _select_reference_points(motion: Motion, block: float,
-                             slip_deviation: float) -> _ReferencePoints:
-    """Return where a motion is known: at its samples, or for an encoder where it steps."""
-    if motion.rate is not None:
-        time = np.arange(0.0, motion.duration + 1e-9, 0.01)
-        return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
-                                *tracking_error_columns(motion, time, slip_deviation))
-    step = quantization_step(motion.heading)
-    if not step:
-        return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
-                                np.empty((len(motion.time), 0)))
-    step_crossings = _find_step_crossings(motion, step)
-    constant_readings = _find_constant_readings(motion, step, block)
-    order = np.argsort(np.append(step_crossings.time, constant_readings.time), kind='stable')
-    time, heading, variance, shared = (np.concatenate(
-        [getattr(points, name) for points in (step_crossings, constant_readings)])[order]
-                                       for name in ('time', 'heading', 'variance', 'shared'))
-    return _ReferencePoints(time, heading, variance, shared, np.full(2, step / math.sqrt(12.0)),
-                            np.ones((1, 2)))
+def _no_shared_errors(count: int) -> tuple[Array, Array, Array]:
+    """Return no columns of a number of points, as `tracking_error_columns` does."""
+    return np.empty((count, 0)), np.empty(0), np.ones((1, 0))
 
 
 #: Standard deviation of the scale factor error by which the two senses of turning may differ.
 ASYMMETRY_DEVIATION = 1e-4
-#: Prior standard deviations of the differences between turns in the response of a robot: delay, s,
-#: and lag, s².
-_TURN_DELAY_DEVIATION, _TURN_LAG_DEVIATION = 0.1, 0.02
+#: Prior standard deviation of the differences between turns in the lag of a robot, s².
+_TURN_LAG_DEVIATION = 0.02
 #: Largest number of groups of neighbouring turns with a delay and a lag of their own.
 _MAX_TURN_GROUPS = 12
 #: A response of higher order, as of a robot that overshoots, as a sum of second differences of the
 #: heading: their times, s, and prior standard deviation, 1.
-_RESPONSE_DELAYS, _RESPONSE_DEVIATION = (0.15, 0.3, 0.45, 0.6, 0.8), 0.3
+_RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.15 * np.arange(1, 6), 0.3
 #: Possible factors of the prior standard deviations of the response, and of slips.
-_TRACKING_FACTORS, _SLIP_FACTORS = (np.array([0.001, 0.1, 1.0]),
-                                    np.array([0.001, 0.03, 0.1, 0.3, 1.0]))
+_PRIOR_FACTORS = np.geomspace(1e-3, 1.0, 4)
 
 
 def tracking_error_columns(motion: Motion, time: Array,
@@ -337,7 +307,7 @@ def tracking_error_columns(motion: Motion, time: Array,
     turn = np.where(sense, np.cumsum((sense != 0.0) & (np.diff(sense, prepend=0.0) != 0.0)), 0)
     count = min(int(turn.max()), _MAX_TURN_GROUPS)
     if count < 2:
-        return np.empty((len(time), 0)), np.empty(0), np.ones((1, 0))
+        return _no_shared_errors(len(time))
     inside = (-(-turn * count // turn.max()))[:, None] == np.arange(1, count + 1)
     # the mean over the turns is delay, lag and scale
     contrasts = helmert(count).T
@@ -345,82 +315,25 @@ def tracking_error_columns(motion: Motion, time: Array,
     columns.append(
         np.column_stack([heading - 2.0 * motion.heading_at(time - late)
                          + motion.heading_at(time - 2.0 * late) for late in _RESPONSE_DELAYS]))
-    deviations = [np.full(count - 1, _TURN_DELAY_DEVIATION),
+    deviations = [np.full(count - 1, DELAY_DEVIATION),
                   np.full(count - 1, _TURN_LAG_DEVIATION),
                   np.full(len(_RESPONSE_DELAYS), _RESPONSE_DEVIATION)]
-    following, slips = _TRACKING_FACTORS, np.ones(1)
+    slips = np.ones(1)
     if slip_deviation:
         ending = inside & (rate * acceleration < 0.0)[:, None]
         columns += [np.cumsum(heading_change * part, axis=0)
                     for part in (inside @ contrasts, ending)]
         deviations.append(np.full(2 * count - 1, slip_deviation))
-        slips = _SLIP_FACTORS
-    prior_factors = np.hstack([np.repeat(np.tile(following, len(slips))[:, None],
-                                         2 * count - 2 + len(_RESPONSE_DELAYS), axis=1),
-                               np.repeat(np.repeat(slips, len(following))[:, None],
-                                         (2 * count - 1) * bool(slip_deviation), axis=1)])
+        slips = _PRIOR_FACTORS
+    of_response, of_slips = (each.reshape(-1, 1) for each in np.meshgrid(_PRIOR_FACTORS, slips))
+    prior_factors = np.hstack([
+        np.repeat(of_response, 2 * count - 2 + len(_RESPONSE_DELAYS), axis=1),
+        np.repeat(of_slips, (2 * count - 1) * bool(slip_deviation), axis=1)])
     if sense.min() < 0.0 < sense.max():
         columns.append(np.cumsum(np.abs(heading_change), axis=0))
         deviations.append(np.array([ASYMMETRY_DEVIATION]))
         prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
     return np.hstack(columns), np.concatenate(deviations), prior_factors
-
-
-def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
-    """
-    Return the middles between lasting readings one step apart, with variances in units of theirs.
-
-    A constant reading has a constant error of up to half a step; where it changes by one step, the
-    heading is the edge between the two, but for the turn between the samples.
-
-    """
-    change = np.abs(np.diff(motion.heading))
-    index = np.flatnonzero(change > 0.5 * step)
-    time, heading = (0.5 * (values[index] + values[index + 1])
-                     for values in (motion.time, motion.heading))
-    speed = np.abs(np.diff(heading) / np.diff(time))
-    relative_deviation = (np.maximum(np.append(speed, 0.0), np.append(0.0, speed)[:len(time)])
-                          if len(time) else time)
-    relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
-                                  np.clip(relative_deviation * np.diff(motion.time)[index] / step,
-                                          _MIN_CROSSING_DEVIATION, 1.0))
-    # none has more weight than the median one: the accuracy of a reference is seldom that of its
-    # slowest steps
-    relative_deviation = (np.maximum(relative_deviation, np.median(relative_deviation))
-                          if len(time) else relative_deviation)
-    alone = np.diff(index, prepend=-1, append=len(change)) == 1
-    edges = (change[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
-    return _ReferencePoints(time[edges], heading[edges], relative_deviation[edges] ** 2,
-                            np.zeros((int(edges.sum()), 2)))
-
-
-#: Least standard deviation of a heading where an encoder steps, in units of that of a reading.
-_MIN_CROSSING_DEVIATION = 0.05
-
-
-def _find_constant_readings(motion: Motion, step: float, block: float) -> _ReferencePoints:
-    """
-    Return the readings that are constant for longer than a block, single ones, the first and last.
-
-    All samples of a constant reading count as one. At the first and the last the gyro rests if
-    they last much longer than the readings next to them; then their samples share one error.
-
-    """
-    run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)
-    begins = np.flatnonzero(np.diff(run, prepend=-1))
-    ends = np.append(begins[1:], len(run)) - 1
-    durations = motion.time[ends] - motion.time[begins]
-    is_used = (durations > block) | (ends == begins)
-    is_used[[0, -1]] = True
-    rest_columns = np.zeros((len(begins), 2))
-    if len(begins) > 2:
-        rest_columns[0, 0], rest_columns[-1, 1] = (
-            durations[end] > max(block, 2.0 * durations[next_to])
-            for end, next_to in ((0, 1), (-1, -2)))
-    variance = np.where(rest_columns.any(axis=1), 1.0, np.bincount(run))
-    kept = is_used[run]
-    return _ReferencePoints(motion.time[kept], motion.heading[kept], variance[run[kept]],
-                            rest_columns[run[kept]])
 
 
 def _random_walk_covariance(time: Array, weight: Array,
@@ -647,6 +560,11 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     slips = slips[:len(slips) // 2]
     slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
+    # a profile itself has no noise, so that the ratio of the noises is not estimated
+    alone = estimate if alignment.is_measured else _solve_weighted(
+        data, _IncrementCovariance(data, 0.0), data.columns, estimate.prior_deviation)
+    residual_squares = float(alone.residual @ alone.noise.solve(alone.residual))
+    dof = alone.dof + (not alignment.is_measured)
     reference_noise = (math.sqrt(estimate.rate_variance * estimate.noise.ratio)
                        / abs(_nonzero_scale(estimate.values[0])))
     return ScaleBiasFit(
@@ -656,8 +574,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         math.sqrt(mixture.covariance[2, 2]),
         np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
         *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
-        *_residual_squares(data, estimate, alignment.is_measured),
-        slip_deviation=slip)
+        residual_squares, dof, slip_deviation=slip)
 
 
 def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
@@ -692,16 +609,6 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
 _OFFSET_TOLERANCE = 1e-3
 #: Largest additional delay of a robot that follows its profile with a lag, s.
 MAX_TRACKING_LAG = 0.25
-
-
-def _residual_squares(data: _Increments, estimate: _Estimate,
-                      is_measured: bool) -> tuple[float, float]:
-    """Return weighted sum of squares and degrees of freedom; a profile itself has no noise."""
-    if not is_measured:
-        estimate = _solve_weighted(data, _IncrementCovariance(data, 0.0), data.columns,
-                                   estimate.prior_deviation)
-    return (float(estimate.residual @ estimate.noise.solve(estimate.residual)),
-            estimate.dof + (not is_measured))  # the ratio of the noises is not estimated
 
 
 def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float]:
@@ -744,23 +651,6 @@ class DeviatingStretch:
     all_explained_squares: Array
     column_squares: Array
 
-    def mean_odds(self, dof: float, rate_deviation: float, noise_deviation: float) -> float:
-        """
-        Return the mean odds of all stretches, each against none.
-
-        Parameters
-        ----------
-        dof : remaining degrees of freedom
-        rate_deviation : standard deviation of the excess rates that are expected, rad/s
-        noise_deviation : standard deviation of the white noise
-
-        """
-        total_squares = max(self.remaining_squares + self.explained_squares, 1e-300)
-        odds = -0.5 * (
-            dof * np.log1p(-np.minimum(self.all_explained_squares / total_squares, 1.0 - 1e-15))
-            + np.log1p(self.column_squares * (rate_deviation / noise_deviation) ** 2))
-        return float(np.exp(np.minimum(odds, 100.0)).sum()) / max(len(odds), 1)
-
 
 #: A turn that the profile does not contain, by hand or by a single slip: standard deviation of its
 #: rate, rad/s, and its prior odds.
@@ -797,8 +687,13 @@ def _find_stretch_of_fit(estimate: _Estimate, data: _Increments) -> tuple[
 def _weigh_stretch(estimate: _Estimate, data: _Increments, found: DeviatingStretch,
                    stretch_column: Array, noise_deviation: float) -> tuple[float, Array, Array]:
     """Return the probability of a stretch with a turn of its own, and (1 + s, b) with it."""
-    odds = (EXCESS_TURN_ODDS
-            * found.mean_odds(estimate.dof - 1.0, EXCESS_RATE_DEVIATION, noise_deviation))
+    total_squares = max(found.remaining_squares + found.explained_squares, 1e-300)
+    logarithms = -0.5 * (
+        (estimate.dof - 1.0) * np.log1p(-np.minimum(
+            found.all_explained_squares / total_squares, 1.0 - 1e-15))
+        + np.log1p(found.column_squares * (EXCESS_RATE_DEVIATION / noise_deviation) ** 2))
+    odds = (EXCESS_TURN_ODDS * float(np.exp(np.minimum(logarithms, 100.0)).sum())
+            / max(len(logarithms), 1))  # the mean over all stretches, each against none
     widened = replace(data, columns=np.insert(data.columns, 4, stretch_column, axis=1),
                       prior_mean=np.insert(data.prior_mean, 4, 0.0))
     other = _solve_weighted(widened, estimate.noise, widened.columns,

@@ -56,16 +56,6 @@ between the points of span ``k``. The differences of observations and columns ::
 have tridiagonal covariances again (Cochrane and Orcutt 1949), and as their matrix has the
 determinant 1, likelihoods of different correlations can be compared (`carried_shares`).
 
-Example, for headings of a gyro's integral and of a reference, rad, at the same times, s::
-
-    increments = np.diff(integral)
-    # the values: 1 + scale factor error, and bias in rad/s
-    columns = np.column_stack([np.diff(reference), np.diff(time)])
-    noise = heading_noise(time, rate)
-    found = fit_noise_grid(increments, columns, noise, *bias_wander_columns(time), noisy_column=0,
-                           wandering_value=1)
-    found.values, found.covariance, found.size('reference'), found.whiten(columns)
-
 """
 
 from __future__ import annotations

@@ -360,10 +360,14 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None 
     half_difference = _half_difference(corrected)
     variance = rest_variance(noise, duration, white_deviation, half_difference)
     deviation = math.sqrt(variance + float(np.nan_to_num(fit.covariance[1, 1])))
-    scale = 1.0 + fit.scale_factor_error
+    scale, updated = 1.0 + fit.scale_factor_error, fit
+    if np.isfinite(fit.covariance).all():
+        gain, covariance = combine_with_rest(fit.covariance, scale * mean, scale ** 2 * variance)
+        s, b = (gain * scale * mean + (fit.scale_factor_error, fit.bias)).tolist()
+        updated = replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
     check = RestCheck(mean, deviation, max(limits.max_rest_rate,
                                            -float(ndtri(0.5 * false_refusal_rate)) * deviation),
-                      _update_with_rest(fit, scale * mean, scale ** 2 * variance))
+                      updated)
     if half_difference > 2.0 * max(MAX_NOISE_SIGMAS * white_deviation, _MIN_DRIVING_RATE_CHANGE):
         raise DataRefused('after the run the robot still moved, its rate changed by '
                           f'{half_difference / DEGREE:.2f} deg/s: leave it at rest after the run')
@@ -391,15 +395,6 @@ def rest_variance(noise: Noise, duration: float, white_deviation: float,
     """
     return (max(white_deviation, noise.angle_random_walk / math.sqrt(duration)) ** 2
             + float(noise.mean_change_variance(duration, duration)) + 0.25 * half_difference ** 2)
-
-
-def _update_with_rest(fit: ScaleBiasFit, rate: float, variance: float) -> ScaleBiasFit:
-    """Return the fit with its bias updated by a rest after its run, as in `combine_with_rest`."""
-    if not np.isfinite(fit.covariance).all():
-        return fit
-    gain, covariance = combine_with_rest(fit.covariance, rate, variance)
-    s, b = (gain * rate + (fit.scale_factor_error, fit.bias)).tolist()
-    return replace(fit, scale_factor_error=s, bias=b, covariance=covariance)
 
 
 def combine_with_rest(covariance: Array, rate: float, variance: float) -> tuple[Array, Array]:

@@ -71,15 +71,13 @@ CACHE_BLOCK_SAMPLES = 1 << 14
 BLOCK_ROWS = 1 << 16
 #: Least interval between samples, s.
 MIN_SAMPLE_INTERVAL = 1e-9
-#: Largest number of characters of a line, of notes and header, and of a block of lines or of a row
-#: that spans several lines.
-_MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 20, 1 << 24
+#: Largest number of characters of a line; and of notes and header, of a block of lines, or of a
+#: row that spans several lines.
+_MAX_LINE_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 24
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
 
 _ROS_1_MAGIC = b'#ROSBAG V2.0'
-#: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
-_MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading', *ATTITUDE)
 #: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
 #: as text.
@@ -196,7 +194,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                            'recording: convert it, by pip install rosbags and '
                            f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
-        table, first_line = _read_header(path, _limit_length(lines, _MAX_HEADER_LENGTH), columns,
+        table, first_line = _read_header(path, _limit_length(lines), columns,
                                          axis)
         unfolded = 0
         if rate is not None:
@@ -265,14 +263,14 @@ def _read_block(lines: Iterator[str], rows: int) -> list[str]:
     return block
 
 
-def _limit_length(lines: Iterator[str], max_length: int) -> Iterator[str]:
-    """Give lines, and raise csv.Error beyond a number of characters."""
-    left = max_length
+def _limit_length(lines: Iterator[str]) -> Iterator[str]:
+    """Give lines, and raise csv.Error beyond the length of a block."""
+    left = _MAX_BLOCK_LENGTH
     for line in lines:
         left -= len(line)
         if left < 0:
-            raise csv.Error(f'a row, or what is before the first, has more than {max_length} '
-                            'characters')
+            raise csv.Error(f'a row, or what is before the first, has more than '
+                            f'{_MAX_BLOCK_LENGTH} characters')
         yield line
 
 
@@ -359,7 +357,7 @@ def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterat
     A quoted text may span lines, and so take lines of the rest.
 
     """
-    reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines, _MAX_BLOCK_LENGTH)),
+    reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines)),
                         delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
     for row in reader:
@@ -399,7 +397,7 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
     wrong = _mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
+        fault = (f'beyond the limit of {MAX_MAGNITUDE:g}'
                  if np.isfinite(values[row]) else 'not a finite number')
         raise LogError(f'{path}: line {line_numbers[row]}, column {column}: {excerpt(texts[row])} '
                        f'is {fault}; remove the row')
@@ -407,7 +405,7 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
 
 
 def _mask_invalid(values: Array, quantity: str) -> Mask:
-    valid = np.abs(values) <= _MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE)
+    valid = np.abs(values) <= MAX_MAGNITUDE
     return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
 
 

@@ -29,7 +29,15 @@ from typing import Any
 
 from gyro_calibration.logs import cdr
 from gyro_calibration.logs.cdr import MessageError, NSEC_PER_SEC
-from gyro_calibration.logs.log import Array, BLOCK_ROWS, Log, LogError, Mask, unwrap_heading
+from gyro_calibration.logs.log import (
+    Array,
+    BLOCK_ROWS,
+    Log,
+    LogError,
+    Mask,
+    select_rows,
+    unwrap_heading,
+)
 from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_messages
 import numpy as np
 from numpy.typing import NDArray
@@ -191,10 +199,7 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
 def split_blocks(log: Log, rows: int = BLOCK_ROWS) -> Iterator[Log]:
     """Give a log in blocks, as a log file is read."""
     for begin in range(0, len(log), rows):
-        here = slice(begin, begin + rows)
-        pieces: dict[str, Any] = {name: values[here] for name, values in vars(log).items()
-                                  if isinstance(values, np.ndarray)}
-        yield replace(log, **pieces)
+        yield select_rows(log, slice(begin, begin + rows))
 
 
 class _LogBuilder:

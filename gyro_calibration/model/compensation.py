@@ -21,6 +21,8 @@ differ from the simulation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
+import sys
 
 from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, Number
 from gyro_calibration.model.channels import clip
@@ -28,6 +30,9 @@ from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy.linalg import block_diag
+
+#: Rates beyond this, rad/s, are treated as overflow: the model's values are too large.
+_MAX_COMPUTABLE_RATE = math.sqrt(sys.float_info.max)
 
 
 @dataclass(frozen=True)
@@ -84,9 +89,10 @@ def _compensate_at_once(model: GyroModel, output: Number, temperature: Number,
         modelled, unexplained = model.rate_from_channels(
             Channels(seen, seen, used) if environment is None
             else environment.with_rate(seen, seen))
-        if not np.isfinite(modelled).all():  # the model overflows there, and is not used
-            computed = np.isfinite(modelled)
-            modelled, unexplained = np.where(computed, modelled, seen)[()], unexplained | ~computed
+        computed = abs(modelled) < _MAX_COMPUTABLE_RATE
+        if computed is not True and not np.all(computed):
+            modelled = np.where(computed, modelled, seen)[()]
+            unexplained = unexplained | np.logical_not(computed)
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen is not output:
         modelled, rate = modelled + (output - seen), rate + (output - seen)

@@ -306,6 +306,11 @@ def _raw_power_coefficients(centre: float, scale: float, count: int) -> Array:
     return rows
 
 
+def _at_each(channels: Channels, value: Number) -> Number:
+    """Return a value in the shape of the rates."""
+    return value + 0.0 * channels.rate
+
+
 BIAS = Effect(
     'bias', 'The output at rest is not zero; it includes the Earth rate about the input axis.',
     frozenset(), (Parameter('bias', 'rad/s'),),
@@ -342,13 +347,13 @@ _REFERENCE_TEMPERATURE = Parameter('reference_temperature', 'degC', 25.0)
 BIAS_TEMPERATURE = Effect(
     'bias_temperature', 'The bias changes in proportion to the temperature.',
     frozenset({'temperature'}), (Parameter('bias_temperature', 'rad/s/K'),),
-    lambda channels, reference: (channels.temperature - reference + 0.0 * channels.rate,),
+    lambda channels, reference: (_at_each(channels, channels.temperature - reference),),
     (_REFERENCE_TEMPERATURE,), 'rest at two temperatures, and better go up and down again',
     along='temperature')
 BIAS_TEMPERATURE_QUADRATIC = Effect(
     'bias_temperature_quadratic', 'The bias changes with the square of the temperature.',
     frozenset({'temperature'}), (Parameter('bias_temperature_quadratic', 'rad/s/K²'),),
-    lambda channels, reference: ((channels.temperature - reference) ** 2 + 0.0 * channels.rate,),
+    lambda channels, reference: (_at_each(channels, (channels.temperature - reference) ** 2),),
     (_REFERENCE_TEMPERATURE,), 'rest at three temperatures or more', along='temperature')
 SCALE_FACTOR_TEMPERATURE = Effect(
     'scale_factor_temperature', 'The scale factor changes in proportion to the temperature.',
@@ -366,6 +371,7 @@ def _temperature_lag(channels: Channels, time_constant: float) -> Number:
 
 _THERMAL_CYCLE = ('heat and cool the resting gyro at two temperature rates, with abrupt changes '
                   'from heating to cooling')
+_FILTER_TIME = Parameter('filter_time', 's', 10.0, (1e-3, 1e4))
 _THERMAL_HISTORY_EFFECTS = (
     Effect(
         'bias_temperature_rate',
@@ -373,8 +379,8 @@ _THERMAL_HISTORY_EFFECTS = (
         'within the instrument (in fibre gyros the Shupe effect).',
         frozenset({'temperature', 'lagged'}), (Parameter('bias_temperature_rate', 'rad/s/(K/s)'),),
         lambda channels, filter_time: (
-            -_temperature_lag(channels, filter_time) / filter_time + 0.0 * channels.rate,),
-        (Parameter('filter_time', 's', 10.0, (1e-3, 1e4)),),
+            _at_each(channels, -_temperature_lag(channels, filter_time) / filter_time),),
+        (_FILTER_TIME,),
         _THERMAL_CYCLE, along='temperature_rate'),
     Effect(
         'thermal_lag',
@@ -382,17 +388,16 @@ _THERMAL_HISTORY_EFFECTS = (
         'thermometer.',
         frozenset({'temperature', 'lagged'}), (Parameter('thermal_lag', 'rad/s/K'),),
         lambda channels, time_constant: (
-            _temperature_lag(channels, time_constant) + 0.0 * channels.rate,),
+            _at_each(channels, _temperature_lag(channels, time_constant)),),
         (Parameter('time_constant', 's', bounds=(1.0, 3000.0)),),
         _THERMAL_CYCLE, along='temperature_rate'),
     Effect(
         'thermal_hysteresis', 'The bias while heating differs from that while cooling.',
         frozenset({'temperature', 'heating'}), (Parameter('thermal_hysteresis', 'rad/s'),),
         lambda channels, filter_time, threshold: (
-            (0.0 if channels.heating is None else channels.heating(filter_time, threshold))
-            + 0.0 * channels.rate,),
-        (Parameter('filter_time', 's', 10.0, (1e-3, 1e4)),
-         Parameter('threshold', 'K/s', 1e-3, (0.0, 10.0))),
+            _at_each(channels, 0.0 if channels.heating is None
+                     else channels.heating(filter_time, threshold)),),
+        (_FILTER_TIME, Parameter('threshold', 'K/s', 1e-3, (0.0, 10.0))),
         'repeat the same temperature cycle at two temperature rates', along='temperature_rate'))
 
 _TIME_EFFECTS = (
@@ -400,13 +405,13 @@ _TIME_EFFECTS = (
         'warm_up', 'After power-on the bias settles exponentially.',
         frozenset({'time'}), (Parameter('warm_up', 'rad/s'),),
         lambda channels, time_constant: (
-            np.exp(-channels.time / time_constant) + 0.0 * channels.rate,),
+            _at_each(channels, np.exp(-channels.time / time_constant)),),
         (Parameter('time_constant', 's', bounds=(1.0, 1e5)),),
         'start the gyro both cold and warm, and let it rest'),
     Effect(
         'rate_ramp', 'The bias grows steadily with time.',
         frozenset({'time'}), (Parameter('rate_ramp', 'rad/s²'),),
-        lambda channels: (channels.time + 0.0 * channels.rate,),
+        lambda channels: (_at_each(channels, channels.time),),
         experiment='record again, from a power-on at another temperature: only a ramp repeats'),
     Effect(
         'bias_step', 'The bias changes in a single step.',
@@ -414,43 +419,43 @@ _TIME_EFFECTS = (
         lambda channels, step_time: ((channels.time >= step_time) * channels.ones(),),
         (Parameter('step_time', 's', bounds=(0.0, 1e9)),), 'record again: a step does not repeat'))
 
+_WAVES = Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')
 _ENVIRONMENT_EFFECTS = (
     Effect(
         'heading_sensitivity',
         'The bias depends on the heading, mostly by the magnetic field of the Earth.',
-        frozenset({'heading'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')),
-        lambda channels: [wave(channels.heading) + 0.0 * channels.rate
+        frozenset({'heading'}), _WAVES,
+        lambda channels: [_at_each(channels, wave(channels.heading))
                           for wave in (np.sin, np.cos)],
         experiment='turn at several speeds, and stop at eight headings', along='heading'),
     Effect(
         'acceleration_sensitivity',
         'The bias changes in proportion to the specific force along the input axis.',
         frozenset({'specific_force'}), (Parameter('acceleration_sensitivity', '(rad/s)/(m/s²)'),),
-        lambda channels: (channels.specific_force + 0.0 * channels.rate,),
+        lambda channels: (_at_each(channels, channels.specific_force),),
         experiment='rest in several poses within one power-on', along='specific_force'),
     Effect(
         'vibration_rectification', 'Vibration shifts the bias in proportion to its mean square.',
         frozenset({'specific_force', 'lagged'}),
         (Parameter('vibration_rectification', '(rad/s)/(m/s²)²'),),
         lambda channels, time_constant: (
-            (0.0 if channels.lagged is None else channels.lagged('vibration', time_constant))
-            + 0.0 * channels.rate,),
+            _at_each(channels, 0.0 if channels.lagged is None
+                     else channels.lagged('vibration', time_constant)),),
         (Parameter('time_constant', 's', 1.0, (1e-3, 1e4)),),
         'rest with the motor on and off', along='vibration'),
     Effect(
         'supply_sensitivity', 'The bias changes in proportion to the supply voltage.',
         frozenset({'supply'}), (Parameter('supply_sensitivity', 'rad/s/V'),),
         lambda channels, reference: (
-            (0.0 if channels.supply is None else channels.supply - reference)
-            + 0.0 * channels.rate,),
+            _at_each(channels, 0.0 if channels.supply is None else channels.supply - reference),),
         (Parameter('reference_supply', 'V', 5.0),), 'step the supply voltage at one temperature',
         along='supply'),
     Effect(
         'interference_tone',
         'The output contains a periodic signal, or an alias from above half the sample rate.',
-        frozenset({'time'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')),
+        frozenset({'time'}), _WAVES,
         lambda channels, frequency: [
-            wave(2.0 * math.pi * frequency * channels.time) + 0.0 * channels.rate
+            _at_each(channels, wave(2.0 * math.pi * frequency * channels.time))
             for wave in (np.sin, np.cos)],
         (Parameter('frequency', 'Hz', bounds=(1e-4, 1e5)),),
         'sample at another rate: an alias changes its frequency, a tone does not',

@@ -26,7 +26,7 @@ ALLAN_FLOOR_RATIO = math.sqrt(2.0 * math.log(2.0) / math.pi)
 BIAS_AVERAGING_TIME = 20.0
 #: Time constants, s, a factor of 10 apart, of the Gauss-Markov processes that approximate flicker
 #: from 1 s to some hours.
-_FLICKER_TIME_CONSTANTS = np.array([3.0, 30.0, 300.0, 3000.0])
+_FLICKER_TIME_CONSTANTS = np.geomspace(3.0, 3000.0, 4)
 
 
 @dataclass(frozen=True)

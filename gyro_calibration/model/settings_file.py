@@ -150,6 +150,8 @@ def _parse_plain(text: str) -> Any:
         return text.lower() == 'true'
     if _INTEGER.fullmatch(text):
         return int(text)
+    if text.lower().lstrip('+-') in ('.inf', '.nan'):
+        return float(text.lower().replace('.', ''))
     return float(text) if len(text) < 400 and _FLOAT.fullmatch(text) else text
 
 

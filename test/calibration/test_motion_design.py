@@ -15,11 +15,9 @@ from functools import cache
 import json
 import math
 
-from chance import mean_bound, rms_bounds
+from chance import rms_bounds
 from gyro_calibration.calibration.likelihood import ASYMMETRY_DEVIATION, fit_likelihood
 from gyro_calibration.calibration.motion_design import (
-    _MotionFamily,
-    build_motion,
     CalibrationForecast,
     can_follow,
     find_best_motion,
@@ -37,7 +35,6 @@ from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model import presets
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION,
-    constant_rate_motion,
     motion_from_rates,
     read_motion,
     ROBOT_MOTION,
@@ -112,29 +109,6 @@ def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
     assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
     assert (ability.max_turn_angle(9.0) == pytest.approx(4.5 * fastest)
             and ability.max_turn_rate(4.5 * fastest) == pytest.approx(fastest))
-
-
-def test_no_random_motion_that_the_robot_can_do_is_better():
-    """500 motions of random turns, rates and rests, stretched to the limit of time or place."""
-    ability = ABILITIES['a cable']
-    forecast = CalibrationForecast(XV3500, 20.0, ROBOT_MOTION, 160.0)
-    generator = np.random.default_rng(3)
-    family, errors = _MotionFamily(ability, 20.0), []
-    for _ in range(500):
-        ends = np.append(generator.uniform(-1.0, 1.0, generator.integers(1, 8)), 0.0)
-        rows = family._fit_duration(np.diff(ends, prepend=0.0),
-                                    generator.uniform(0.2, 1.0, len(ends)), 0.0)
-        if rows is not None:
-            errors.append(forecast.search_error(build_motion(ability, rows, 1.0)))
-    assert len(errors) > 100 and min(errors) > forecast.search_error(planned('a cable').motion)
-
-
-def test_the_same_seed_plans_the_same_motion():
-    first, second = (find_best_motion(ABILITIES['free'],
-                                      CalibrationForecast(XV3500, 10.0, ROBOT_MOTION, 160.0), 10.0,
-                                      np.random.default_rng(4), 10) for _ in range(2))
-    assert (np.array_equal(first.motion.time, second.motion.time)
-            and np.array_equal(first.motion.rate, second.motion.rate))
 
 
 def test_the_bias_is_as_well_known_as_white_noise_allows_whatever_the_motion():
@@ -212,30 +186,6 @@ def test_fits_scatter_as_predicted(name, late, lag):
     ratios = np.std(errors, axis=0, ddof=1) / (expected.scale_deviation, expected.bias_deviation)
     low, high = rms_bounds(19)
     assert ((low < ratios) & (ratios < high)).all(), ratios
-
-
-def test_the_heading_of_a_drive_errs_as_predicted():
-    """300 runs of white noise; s and b are weighted sums, so that only the mapping is tested."""
-    noise, generator, drive = WHITE, np.random.default_rng(1), np.arange(1, 1601) / 10.0
-    rate, errors = CALIBRATION_MOTION.rate_at(TIME), []
-    for _ in range(300):
-        white = simulate_noise(noise, len(TIME), 0.01, generator)
-        s, b = np.linalg.lstsq(np.column_stack([rate, np.ones(len(TIME))]), white, rcond=None)[0]
-        walk = np.cumsum(simulate_noise(noise, len(drive), 0.1, generator)) * 0.1
-        errors.append(np.abs(walk - s * ROBOT_MOTION.heading_at(drive) - b * drive).mean())
-    predicted = (CalibrationForecast(noise, 20.0, ROBOT_MOTION, 160.0,
-                                     0.0).predict(CALIBRATION_MOTION).heading_error)
-    assert predicted == pytest.approx(np.mean(errors),
-                                      abs=mean_bound(np.array(errors) - predicted))
-
-
-def test_where_the_drive_turns_round_and_round_the_motion_gains_heading():
-    round_and_round = constant_rate_motion([(160.0, 45.0)])
-    forecast = CalibrationForecast(XV3500, 20.0, round_and_round, 160.0)
-    generator = np.random.default_rng(0)
-    chosen = find_best_motion(ABILITIES['free'], forecast, 20.0, generator, 15).prediction
-    assert (chosen.heading_error
-            < 0.85 * forecast.predict(plain_motion(ABILITIES['free'], 20.0)).heading_error)
 
 
 IMPOSSIBLE = {

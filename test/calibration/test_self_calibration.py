@@ -21,7 +21,6 @@ import math
 from chance import fewest, mean_bound, most, rms_bounds
 from gyro_calibration.calibration.self_calibration import (
     calibrate_bias,
-    combine_with_rest,
     fit_heading,
     fit_likelihood,
     fit_rate,
@@ -32,7 +31,6 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION,
-    constant_rate_motion,
     motion_from_headings,
     motion_from_rates,
 )
@@ -141,22 +139,6 @@ def lagging(constant, every=10):
     return np.array(rates[::every])
 
 
-SOFT = constant_rate_motion([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0),
-                             (3.5, -30), (1, 0)], ramp=0.7).rate_at(TIME)
-ROBOTS = {'late by 0.3 s': (CALIBRATION_MOTION.rate_at(TIME - 0.3), 0.1),
-          'lag of 0.1 s': (lagging(0.1), 0.2), 'lag of 0.3 s': (lagging(0.3), 1.0),
-          'ramps of 0.7 instead of 0.5 s': (SOFT, 0.5)}
-
-
-@pytest.mark.parametrize('rate, percent', ROBOTS.values(), ids=ROBOTS)
-def test_a_robot_that_follows_late_or_softly_is_calibrated_all_the_same(rate, percent):
-    for seed in range(5):
-        noise = simulate_noise(XV3500, len(TIME), 0.01, np.random.default_rng(seed))
-        fit = self_calibrate(TIME, (1 + XV3500_S) * rate + XV3500_B + noise, CALIBRATION_MOTION)
-        assert 100 * abs(fit.scale_factor_error - XV3500_S) < percent
-        assert abs(fit.scale_factor_error - XV3500_S) < 4.0 * math.sqrt(fit.covariance[0, 0])
-
-
 def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
     """Sample noise in rate and acceleration must not be taken for a delay or a lag."""
     fine, true, sizes = np.arange(20001) / 1000.0, lagging(0.15, 1), []
@@ -168,7 +150,7 @@ def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
     assert np.sqrt(np.mean(np.square(sizes))) < rms_bounds(20)[1], np.round(sizes, 1)
 
 
-@pytest.mark.parametrize('kind', ['ramps softer than commanded', 'second order',
+@pytest.mark.parametrize('kind', ['lag', 'ramps softer than commanded', 'second order',
                                   'slip up to 1 % of each turn'])
 def test_a_robot_that_follows_each_turn_otherwise_is_calibrated_within_its_interval(kind):
     """Earlier, soft ramps were refused, and half of the intervals contained such a slip."""
@@ -181,33 +163,6 @@ def test_a_robot_that_follows_each_turn_otherwise_is_calibrated_within_its_inter
 def run(seed=0, true=RATE, s=XV3500_S):
     return (1 + s) * true + XV3500_B + simulate_noise(
         XV3500, len(true), 0.01, np.random.default_rng(seed))
-
-
-def bumped(seed, degrees):
-    """Return the rates of a robot that is pushed by some degrees within 0.3 s, anywhere."""
-    start = np.random.default_rng([7, seed]).uniform(1.0, 18.0)
-    return RATE + np.where((start <= TIME) & (start + 0.3 > TIME), degrees * DEGREE / 0.3, 0.0)
-
-
-@pytest.mark.parametrize('degrees, runs',
-                         [(2.0, 7), *(pytest.param(degrees, 20, marks=pytest.mark.evidence)
-                                      for degrees in (5.0, 3.0, 2.0))])
-def test_a_slip_or_bump_is_refused(degrees, runs):
-    """Measured: all of 40 runs for 5, 3 and 2 deg; 1 deg is accepted, as the limit states."""
-    refused = 0
-    for seed in range(runs):
-        try:
-            self_calibrate(TIME, run(seed, bumped(seed, degrees)), CALIBRATION_MOTION)
-        except DataRefused as error:
-            refused += 'slip or a bump' in str(error)
-    assert refused >= runs - 1
-
-
-def test_a_bump_below_the_limit_does_little_harm():
-    errors = [
-        self_calibrate(TIME, run(seed, bumped(seed, 0.5)), CALIBRATION_MOTION).scale_factor_error
-        - XV3500_S for seed in range(10)]
-    assert np.abs(errors).max() < 0.005
 
 
 ONE_SPEED = motion_from_rates(np.array([0.0, 20.0]), np.array([0.5, 0.5]))
@@ -239,25 +194,11 @@ def test_what_cannot_be_believed_is_refused_with_its_reason(time, rate, motion, 
     assert reason in str(refused.value) and '\n' not in str(refused.value)
 
 
-@pytest.mark.parametrize('method', ['heading', 'rate', 'likelihood'])
-def test_no_method_calibrates_by_a_dead_gyro(method):
-    with pytest.raises(DataRefused):
-        self_calibrate(TIME, np.where(TIME > 19.9, 1e-9, 0.0), CALIBRATION_MOTION, method)
-
-
 def test_the_wander_of_the_bias_is_in_its_standard_deviation():
     flicker = Noise(bias_instability=18 * DEGREE / 3600)
     without, with_it = (self_calibrate(TIME, run(), CALIBRATION_MOTION,
                                        noise=noise).covariance[1, 1] for noise in (None, flicker))
     assert with_it - without == pytest.approx((ALLAN_FLOOR_RATIO * flicker.bias_instability) ** 2)
-
-
-@pytest.mark.parametrize('variance', [3.0, 10.0, 20.0])
-def test_a_run_that_is_far_off_is_in_the_interval_after_a_rest_that_hardly_shows_it(variance):
-    """A robot that yawed all the time: a bias of several deviations, and a short rest of noise."""
-    for off in np.arange(2.0, 11.0):
-        gain, covariance = combine_with_rest(np.diag([1e-6, 1.0]), -off, variance)
-        assert abs(off + gain[1] * -off) < 3.0 * math.sqrt(covariance[1, 1]), off
 
 
 def test_the_bias_is_the_mean_at_rest_and_its_deviation_is_true():

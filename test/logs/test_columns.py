@@ -105,32 +105,6 @@ def test_wrong_names_are_answered_with_the_nearest_right_ones(tmp_path, header, 
     assert wanted in str(found.value) and 'log.csv' in str(found.value)
 
 
-def test_the_suggestion_is_one_that_works(run, tmp_path):
-    path = written(tmp_path, 't_ms,wz_dps\n' + ''.join(f'{10 * row},1.5\n' for row in range(99)))
-    code, _, error = run('compensate', path, '--model', tmp_path / 'm.yaml', '--out',
-                         tmp_path / 'o.csv')
-    assert code == 2
-    (tmp_path / 'm.yaml').write_text('effects: {bias: {bias: 0.0}}')
-    code, _, error = run('compensate', path, '--model', tmp_path / 'm.yaml', '--out',
-                         tmp_path / 'o.csv')
-    names = error.partition('--columns ')[2].split()[0]
-    code, text, _ = run('compensate', path, '--model', tmp_path / 'm.yaml', '--out',
-                        tmp_path / 'o.csv', '--columns', names)
-    assert code == 0
-    assert read_log(tmp_path / 'o.csv').output[0] == pytest.approx(1.5 * DEGREE)
-
-
-def test_a_part_of_a_log_is_taken(run, tmp_path):
-    """The verb allan takes one in test_allan.py."""
-    path = written(tmp_path, 'time_s,gyro_dps\n' + ''.join(f'{100 + 0.01 * row:.2f},1.0\n'
-                                                           for row in range(3000)))
-    (tmp_path / 'm.yaml').write_text('effects: {bias: {bias: 0.0}}')
-    words = 'compensate', path, '--model', tmp_path / 'm.yaml', '--out', tmp_path / 'o.csv'
-    assert run(*words, '--from', 5, '--to', 20)[0] == 0
-    time = read_log(tmp_path / 'o.csv').time
-    assert time[0] == 105.0 and time[-1] == 120.0 and len(time) == 1501
-
-
 def test_an_unwrapped_heading_is_the_true_one(run, tmp_path):
     time = np.arange(0.0, 30.0, 0.02)
     rate = 2.0 * np.sin(0.5 * time) + 1.0
@@ -152,17 +126,6 @@ def test_an_unwrapped_heading_is_the_true_one(run, tmp_path):
     assert code == 0, error
     answer = json.loads(text)
     assert answer['verdict'] != 'mismatched'
-
-
-def test_over_a_gap_the_gyro_says_by_how_many_turns_the_heading_went_on():
-    time = np.arange(0.0, 20.0, 0.01)
-    heading = 3.0 * time + 4.0 * np.sin(time)
-    wrapped = np.where((time > 5.0) & (time < 8.0), np.nan, np.angle(np.exp(1j * heading)))
-    rate = 3.0 + 4.0 * np.cos(time) + 0.02
-    found, by_gyro = unwrap_heading(time, wrapped, time, rate)
-    known = np.isfinite(wrapped)
-    assert by_gyro and not unwrap_heading(time[:500], wrapped[:500], time[:500], rate[:500])[1]
-    np.testing.assert_allclose(found[known] - found[0], heading[known] - heading[0], atol=1e-9)
 
 
 @pytest.mark.parametrize(('table', 'wanted'), [
@@ -220,12 +183,6 @@ def test_the_columns_of_an_attitude_are_named_where_a_reference_is_missing(run, 
 def test_an_attitude_is_named_by_four_columns_and_is_the_only_heading(tmp_path, names, said):
     with pytest.raises(LogError, match=said):
         read_log(written(tmp_path, 'gyro_dps,w\n1,1\n2,2\n'), columns=names)
-
-
-def test_an_empty_cell_of_a_reference_is_a_lost_value(tmp_path):
-    log = read_log(written(tmp_path, 't;gz;yaw\n0;1;5\n1;1; \n2;1;\n3;1;8\n'),
-                   columns={'time': 't', 'gyro': 'gz', 'heading': 'yaw'})
-    assert np.isfinite(log.reference_heading).tolist() == [True, False, False, True]
 
 
 def test_a_data_frame_is_a_log():

@@ -13,7 +13,6 @@
 from dataclasses import replace
 import math
 
-from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
 from gyro_calibration.logs.log import CACHE_BLOCK_SAMPLES, DEGREE
 from gyro_calibration.model.compensation import (
     compensate,
@@ -30,7 +29,6 @@ from gyro_calibration.model.effects import (
     SCALE_FACTOR_ERROR,
 )
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
-from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 
@@ -139,34 +137,6 @@ def test_the_sensitivity_is_the_derivative_of_the_rate(name, calibration):
                    for row in step * np.eye(len(uncertainty_covariance(model)))]
     assert rate_sensitivity(model, output, base, temperature) == pytest.approx(
         np.array(differences), rel=1e-4, abs=1e-6)
-
-
-@pytest.mark.parametrize('calibration', [None, CALIBRATION],
-                         ids=['model alone', 'self-calibrated'])
-@pytest.mark.parametrize('name', UNCERTAIN)
-@pytest.mark.parametrize('runs', [200, pytest.param(2000, marks=pytest.mark.evidence)])
-def test_the_standard_deviations_are_those_of_models_drawn_from_the_covariance(
-        name, calibration, runs):
-    """At 1.5 rad/s (k w = 0.9) a value of the sine response counts 1.6 times what it adds."""
-    model = replace(UNCERTAIN[name], self_calibration=calibration)
-    generator = np.random.default_rng(0)
-    time = np.arange(101) * 0.1
-    rate, temperature = 1.5 * np.sin(time), 25.0 + time
-    output = model.output(rate, temperature)
-    whole = uncertainty_covariance(model)
-    rates = np.array(
-        [compensate(with_values(model, drawn), output, temperature).rate
-         for drawn in generator.multivariate_normal(np.zeros(len(whole)), whole, runs)])
-    headings = np.array([integrate(time, row) for row in rates])
-    rate = compensate(model, output, temperature).rate
-    sensitivity = rate_sensitivity(model, output, rate, temperature)
-    deviation = BlockIntegrator(Threshold(0.0), Noise(), whole).add(time, rate, sensitivity)[2]
-    # of a variance of so many runs: five sigma, for a hundred times
-    scatter = 5.0 * math.sqrt(2.0 / runs)
-    assert rates.var(axis=0) / quadratic_form(whole, sensitivity) == pytest.approx(
-        np.ones(101), abs=scatter)
-    assert headings.var(axis=0)[1:] / deviation[1:] ** 2 == pytest.approx(
-        np.ones(100), abs=scatter)
 
 
 def test_what_a_sine_cannot_answer_has_a_large_but_finite_deviation():

@@ -13,7 +13,6 @@
 import math
 import time
 
-from gyro_calibration.files import read_bytes
 from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
 import pytest
@@ -25,14 +24,9 @@ REFUSED = {
     'ten to the nineteenth laughs': (LAUGHS, 'line 1: an anchor or alias is not read'),
     'a list that holds itself': ('a: &a [*a]', 'anchor or alias'),
     'a call': ('a: !!python/object/apply:os.getcwd []', 'line 1: a tag is not read'),
-    'an empty integer': ('a: !!int ""', 'a tag is not read'),
-    'no boolean': ('a: !!bool maybe', 'a tag is not read'),
     'twice the same': ('a: 1\nb: 2\na: 3', "line 3: 'a' is given twice; keep one of them"),
-    'twice nearly the same': ('1: 1\n"1": 2', "line 2: '1' is given twice"),
     'a list as name': ('? [1]\n: 2', 'a name is a list'),
     'deep': ('[' * 100_000, 'more than 10 levels'),
-    'deep in names': ('{a: ' * 100_000, 'more than 10 levels'),
-    'deep in blocks': ('- ' * 100_000, 'more than 10 levels'),
     'large': ('#' * 1_000_001, 'more than 1000000 bytes'),
     'two documents': ('a: 1\n---\nb: 1', 'another document'),
     'a zero byte': ('a: \0', 'not allowed'),
@@ -69,7 +63,7 @@ def test_what_is_no_file_of_settings_is_refused_in_a_line_and_soon(
 
 
 @pytest.mark.parametrize('text, value', [
-    ('1e-4', 1e-4), ('-2E+5', -2e5), ('.5', 0.5), ('1.', 1.0), ('010', 10),
+    ('1e-4', 1e-4), ('-2E+5', -2e5), ('.5', 0.5), ('1.', 1.0), ('010', 10), ('-.inf', -math.inf),
     ('true', True), ('', None), ('~', None), ('yes', 'yes'), ('2026-11-21', '2026-11-21'),
     ('2024-13-45', '2024-13-45'), ('0x10', '0x10'), ('1_0', '1_0'), ('1:30', '1:30'), ('<<', '<<'),
     ('"1"', '1'), ('9' * 401, '9' * 401), ('9' * 400, 10 ** 400 - 1)])
@@ -93,10 +87,3 @@ def test_numbers_of_numpy_are_written_as_those_of_python(tmp_path):
         'a': [1e-7, 0.5, 2.0, 3, True]}
     with pytest.raises(ArithmeticError):
         format_settings({'a': np.float64(math.nan)})
-
-
-def test_a_file_of_the_largest_size_is_read(tmp_path):
-    path = written(tmp_path, b'x' * 100)
-    assert read_bytes(path, 100) == b'x' * 100
-    with pytest.raises(ValueError, match='more than 99 bytes'):
-        read_bytes(path, 99)
