@@ -21,11 +21,13 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.integration import Intervals
-from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
-from gyro_calibration.heading.integration import BlockIntegrator, Threshold
+from gyro_calibration.heading.heading_estimator import (
+    Assumptions,
+    HeadingEstimator,
+    TEMPERATURE_TIMEOUT,
+)
+from gyro_calibration.heading.integration import BlockIntegrator, Intervals, Threshold
 from gyro_calibration.heading.log_compensation import (
     LogCompensation,
     no_plausible_row_message,
