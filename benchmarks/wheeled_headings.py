@@ -34,9 +34,8 @@ import math
 from pathlib import Path
 from types import SimpleNamespace
 
-from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, read_log

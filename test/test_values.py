@@ -19,9 +19,8 @@ GYRO_CALIBRATION_EXAMPLES multiplies their number and chooses them at random.
 import math
 import os
 
-from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.integration import filter_rates, Threshold, ThresholdFilter
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE

@@ -26,9 +26,12 @@ from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
+from gyro_calibration.heading.heading_estimator import (
+    Assumptions,
+    HeadingEstimator,
+    TEMPERATURE_TIMEOUT,
+)
 from gyro_calibration.heading.integration import BlockIntegrator, Intervals, Threshold
 from gyro_calibration.heading.log_compensation import (
     LogCompensation,

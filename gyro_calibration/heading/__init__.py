@@ -11,7 +11,7 @@
 """
 Rates to heading: gaps, integration, standstill, bias, and the uncertainty of the result.
 
-Reading order: `gaps`, `integration`, `kalman`, `stationary`, `tracker`, `bias_table`,
-`assumptions`, `heading_estimator`, `log_compensation`.
+Reading order: `integration`, `kalman`, `stationary`, `tracker`, `bias_table`,
+`heading_estimator`, `log_compensation`.
 
 """

@@ -35,6 +35,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import timedelta
 import hashlib
 import json
 import math
@@ -42,7 +43,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gyro_calibration.files import describe_error, to_printable, write_atomically
-from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.logs.log import Array, DEGREE, Number
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.settings_file import format_settings, read_settings
 import numpy as np
@@ -68,6 +69,8 @@ _MIN_VARIANCE = 1e-18
 #: `benchmarks/bias_table.py --sizes` compares them with more, and with fewer sizes.
 _COEFFICIENT_SIZES = {0.1: 0.4, 1.0: 0.6}
 _TURN_ON_SIZES = {0.3: 0.3, 1.0: 0.5, 4.0: 0.2}
+#: Distance up to which the change of the bias with temperature is computed, K; constant beyond.
+_MAX_DISTANCE = 100.0
 _SIZES = np.array([(coefficient, turn_on)
                    for coefficient in _COEFFICIENT_SIZES for turn_on in _TURN_ON_SIZES])
 _SIZE_PROBABILITIES = np.array(
@@ -155,7 +158,7 @@ class BiasTable:
         self.entries, self.jumps = list(entries), list(jumps)
         self.run = 1 + max([-1, *(math.floor(each.run) for each in entries),
                             *(each.run for each in jumps)])
-        self._first_run, self._dates_changed = self.run, False
+        self._first_run = self.run
         self.held_back_count = 0
         self._model, self._prior = model, prior or Prior()
         self._held_entries: list[Entry] = []
@@ -171,8 +174,6 @@ class BiasTable:
         self.entries, self._held_entries = ([self._shift_time(each, step) for each in rows]
                                             for rows in (self.entries, self._held_entries))
         self.jumps = [self._shift_time(each, step) for each in self.jumps]
-        self._dates_changed = (self._dates_changed
-                               or any(each.run >= self._first_run for each in self.entries))
 
     def _shift_time(self, row: _Dated, step: float) -> _Dated:
         return replace(row, time=max(row.time + step, 0.0)) if row.run >= self._first_run else row
@@ -269,28 +270,29 @@ class BiasTable:
         temperature, time = _clip_to_range(temperature, time)
         seen = self._posterior_at(entries, temperature, time)
         bias, variance = _mixture_moments(seen.probability, seen.mean, 1.0 / seen.information)
-        return (bias + entries[0].bias, variance,
+        return (float(bias) + entries[0].bias, float(variance),
                 float(seen.probability @ (seen.inverse_times_ones[:, -1] / seen.information)))
 
-    def bias_difference(self, from_temperature: float, to_temperature: float,
-                        time: float) -> tuple[float, float]:
+    def bias_difference(self, from_temperature: float, to_temperature: Number,
+                        time: float) -> tuple[Array, Array]:
         """Return the change of bias between temperatures, rad/s, and its variance, (rad/s)²."""
+        shape, to_temperatures = np.shape(to_temperature), np.atleast_1d(to_temperature)
         from_temperature, time = _clip_to_range(from_temperature, time)
-        to_temperature, _ = _clip_to_range(to_temperature, time)
-        own = self._temperature_variance(from_temperature, np.array([to_temperature]))[:, 0]
+        own = self._temperature_variance(from_temperature, to_temperatures)
         if not self.entries:
-            return 0.0, float(_SIZE_PROBABILITIES @ own)
+            return np.zeros(shape), np.reshape(_SIZE_PROBABILITIES @ own, shape)
         seen = self._posterior_at(self.entries, from_temperature, time)
         temperatures = np.array([each.temperature for each in self.entries])
-        near, far = (self._temperature_variance(end, temperatures)
-                     for end in (from_temperature, to_temperature))
-        shared = 0.5 * (near + own[:, None] - far)
-        change, of_shared = (np.einsum('mi,mi->m', shared, values)
+        shared = 0.5 * (self._temperature_variance(from_temperature, temperatures)[:, None]
+                        + own[:, :, None]
+                        - self._temperature_variance(to_temperatures[:, None], temperatures))
+        change, of_shared = ((shared @ values[:, :, None])[..., 0]
                              for values in (seen.inverse_times_residual, seen.inverse_times_ones))
-        explained = np.einsum('mi,mij,mj->m', shared, seen.inverse, shared)
-        return _mixture_moments(
+        explained = (shared @ seen.inverse * shared).sum(axis=2)
+        change, variance = _mixture_moments(
             seen.probability, change,
-            np.maximum(own - explained + of_shared ** 2 / seen.information, 0.0))
+            np.maximum(own - explained + of_shared ** 2 / seen.information[:, None], 0.0))
+        return np.reshape(change, shape), np.reshape(variance, shape)
 
     def combine_with_calibration(self, calibration: SelfCalibration, age: float, time: float,
                                  temperature: float | None,
@@ -389,24 +391,14 @@ class BiasTable:
             total += each.variance * np.outer(before, before)
         return total
 
-    def has_changed(self) -> bool:
-        """Tell whether entries changed since `mark_written`, or dates were corrected."""
-        if self._dates_changed:
-            return True
-        kept = {(each.run, _bin_number(each)): each for each in self._written_entries}
-        # by half a standard deviation, or a fifth of the variance
-        return any(old is None or (each.bias - old.bias) ** 2 > 0.25 * old.variance
-                   or each.variance < 0.8 * old.variance
-                   for each in self.entries for old in [kept.get((each.run, _bin_number(each)))])
-
     def is_write_due(self, now: float, ending: bool = False) -> bool:
         """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
-        return self.has_changed() and (ending or abs(now - self._write_time) >= MIN_WRITE_INTERVAL)
+        return (self._written_entries != tuple(self.entries)
+                and (ending or abs(now - self._write_time) >= MIN_WRITE_INTERVAL))
 
     def mark_written(self, now: float) -> None:
         """Record that the table was written."""
         self._written_entries, self._write_time = tuple(self.entries), now
-        self._dates_changed = False
 
     def mark_write_failed(self, now: float) -> None:
         """Record that it could not be written; it is tried again later, and at the end."""
@@ -437,10 +429,40 @@ class _Posterior:
     inverse: Array
 
 
-def _mixture_moments(probability: Array, means: Array, variances: Array) -> tuple[float, float]:
-    """Return mean and variance of a mixture."""
-    mean = float(probability @ means)
-    return mean, float(probability @ (variances + (means - mean) ** 2))
+def _mixture_moments(probability: Array, means: Array, variances: Array) -> tuple[Any, Any]:
+    """Return mean and variance of a mixture over the first axis."""
+    mean = probability @ means
+    return mean, probability @ (variances + (means - mean) ** 2)
+
+
+class TemperatureCorrection:
+    """
+    Change of the bias from one temperature to others, by a bias table as it is now.
+
+    Later entries of the table come from rests that the tracker has used itself. So they are not
+    used here until the tracker is restarted.
+
+    """
+
+    def __init__(self, table: BiasTable, begin: float, now: float, coefficient: float):
+        """
+        Begin at a temperature, degC.
+
+        Parameters
+        ----------
+        now : s since 1970
+        coefficient : standard deviation in which distances are counted, rad/s/K; above 0
+
+        """
+        self.start_temperature = begin
+        self._steps = begin + np.arange(-_MAX_DISTANCE, _MAX_DISTANCE + 0.5, 0.5)
+        self._changes, variances = table.bias_difference(begin, self._steps, now)
+        self._distances = np.copysign(np.sqrt(variances), self._steps - begin) / coefficient
+
+    def change_at(self, temperature: Number) -> tuple[Any, Any]:
+        """Return the change of the bias, rad/s, and the signed distance, K of the coefficient."""
+        return (np.interp(temperature, self._steps, self._changes),
+                np.interp(temperature, self._steps, self._distances))
 
 
 def _mean_square_change(distance: Array | float, length: float) -> Any:
@@ -525,16 +547,9 @@ def _propagation_message(calibration: SelfCalibration, table: BiasTable, age: fl
         why = 'at a temperature that is not known'
     else:
         why = f'at {calibration.temperature:.1f} degC, and now it is {temperature:.1f} degC'
-    return (f'the calibration was made {_format_age(age)} ago {why}: the standard deviation of '
-            f'its bias is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
+    return (f'the calibration was made {timedelta(seconds=round(age))} ago {why}: the standard '
+            f'deviation of its bias is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
             f'{own / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
-
-
-def _format_age(age: float) -> str:
-    for unit, length in (('days', 86400.0), ('hours', 3600.0)):
-        if age >= 2.0 * length:
-            return f'{age / length:.0f} {unit}'
-    return f'{age / 60.0:.0f} minutes'
 
 
 FORMAT = 'gyro_calibration/bias_table'

@@ -20,19 +20,17 @@ robot drives, and adds the bias at rest to the table for the next run.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 import math
+from typing import Any
 
-from gyro_calibration.heading.assumptions import (
-    Assumptions,
+from gyro_calibration.heading.bias_table import (
+    BiasTable,
+    propagate_calibration,
     TemperatureCorrection,
-    uncertain_covariance,
-    uncertain_sensitivity,
-    with_assumed_covariance,
 )
-from gyro_calibration.heading.bias_table import BiasTable, propagate_calibration
 from gyro_calibration.heading.integration import TIME_TOLERANCE
 from gyro_calibration.heading.stationary import BLOCK_DURATION
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
@@ -42,10 +40,12 @@ from gyro_calibration.model.compensation import (
     CompensatedSamples,
     quadratic_form,
     rate_sensitivity,
+    uncertainty_covariance,
 )
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
 import numpy as np
+from scipy.linalg import block_diag
 
 #: Averaging time of an entry of the table at rest, s.
 STRETCH_DURATION = 10.0
@@ -65,6 +65,69 @@ _AGE_TOLERANCE = 3600.0
 _MAX_TIME, _MAX_SPECIFIC_FORCE = 1e12, 1e5
 #: Assumed age of a calibration without a date, s.
 _YEAR = 365.25 * 86400.0
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """
+    Standard deviations of uncalibrated values, and of the bias at temperatures without data.
+
+    The variance of the tracker contains only the errors that it is given.
+
+    Attributes
+    ----------
+    bias : of an uncalibrated gyro, rad/s
+    scale_factor_error : of an uncalibrated gyro, 1
+    bias_temperature_coefficient : rad/s/K; 0 for a gyro with temperature compensation
+
+    """
+
+    bias: float = 0.5 * DEGREE
+    scale_factor_error: float = 0.03
+    bias_temperature_coefficient: float = 0.03 * DEGREE
+
+    @property
+    def covariance(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return that of (s, b)."""
+        return (self.scale_factor_error ** 2, 0.0), (0.0, self.bias ** 2)
+
+
+def with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroModel:
+    """Return the model with an assumed covariance in its self-calibration if it has none."""
+    calibration = model.self_calibration
+    if calibration is None:
+        return (model if model.covariance is not None else with_self_calibration(
+            model, SelfCalibration(covariance=assumptions.covariance)))
+    if calibration.covariance is not None and np.isfinite(calibration.covariance).all():
+        return model
+    return with_self_calibration(model, replace(calibration, covariance=assumptions.covariance))
+
+
+def uncertain_covariance(model: GyroModel, assumptions: Assumptions) -> Array:
+    """
+    Return the covariance of the temperature coefficient and of a model's uncertain values, (m, m).
+
+    The model is that of `with_assumed_covariance`.
+
+    """
+    return np.asarray(block_diag(assumptions.bias_temperature_coefficient ** 2,
+                                 uncertainty_covariance(model)))
+
+
+def uncertain_sensitivity(sensitivity: Array, temperature_distance: Number) -> Array:
+    """
+    Return the sensitivity of the rate to each value of `uncertain_covariance`, shape (m, ...).
+
+    Parameters
+    ----------
+    sensitivity : `compensation.rate_sensitivity` of the same model, shape (m - 1, ...)
+    temperature_distance : of the temperature from that at which the bias is known, K, a number or
+        shape (...)
+
+    """
+    whole = np.empty((len(sensitivity) + 1, *sensitivity.shape[1:]))
+    whole[0], whole[1:] = -temperature_distance, sensitivity
+    return whole
 
 
 @dataclass
@@ -89,10 +152,6 @@ class _RestStretch:
     rate_sum: float = 0.0
     temperature_sum: float = 0.0
     has_ended: bool = False
-
-    def mean(self) -> tuple[float, float]:
-        """Return the mean rate after the model, and temperature."""
-        return self.rate_sum / self.count, self.temperature_sum / self.count
 
 
 class HeadingEstimator:
@@ -219,7 +278,8 @@ class HeadingEstimator:
                                else math.inf)
         self._bias_shift, self._unobserved_distance, self._age_changed = 0.0, 0.0, False
         self._sensitivity: Array = np.zeros(len(self.covariance))
-        self._rest_sensitivity, self._sensitivity_time = self._sensitivity, -math.inf
+        self._rest_sensitivity: Array = self._sensitivity
+        self._sensitivity_time = -math.inf
         self._stretch = None
         self._pending_stretches.clear()
         self.restart_count += 1
@@ -304,7 +364,8 @@ class HeadingEstimator:
                 or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0))))
         assert used.covariance is not None  # an unknown one is assumed
         variance = self.bias_variance / used.scale ** 2
-        return replace(used, bias=used.bias + self._bias_change(self._time)[0],
+        change, _ = self._bias_change(self._time, self.temperature, 0.0)
+        return replace(used, bias=used.bias + float(change),
                        covariance=((used.covariance[0][0], 0.0), (0.0, variance)))
 
     @property
@@ -330,7 +391,7 @@ class HeadingEstimator:
     @property
     def is_temperature_lost(self) -> bool:
         """Tell whether the last temperature is too old at the last sample."""
-        return abs(self._time - self._temperature_time) > self._temperature_timeout
+        return self._temperature_lateness > 0.0
 
     @property
     def _known_temperature(self) -> float | None:
@@ -371,7 +432,7 @@ class HeadingEstimator:
             self._resume_temperature(now, around)
         self.last_compensated = result = compensate(self.current_model, output, self.temperature,
                                                     around)
-        change, distance = self._bias_change(time)
+        change, distance = self._bias_change(time, self.temperature, self._temperature_lateness)
         calibration, tracker = self.current_model.self_calibration, self.tracker
         rate = float(result.rate)
         if change:
@@ -380,9 +441,7 @@ class HeadingEstimator:
             self._rest_sensitivity, self._sensitivity = (
                 self._uncertain_sensitivity(output, seen, result.temperature, around, distance)
                 for seen in (0.0, float(result.rate)))
-        message = tracker.add(
-            time, rate, self._rest_sensitivity if tracker.is_resting else self._sensitivity,
-            wheels, self._rest_sensitivity)
+        message = tracker.add(time, rate, self._sensitivity, wheels, self._rest_sensitivity)
         self.corrected_rate, self.rate = rate, tracker.rate
         if message or not tracker.is_resting:
             self._end_rest()
@@ -391,7 +450,8 @@ class HeadingEstimator:
         else:
             self._extend_stretch(time, time, 1, float(result.model_rate), self.temperature,
                                  [self._rest_sensitivity])
-        self._update_table_at_rest(now)
+        if tracker.is_resting:
+            self._add_to_table(now, True)
         return message
 
     def is_plausible(self, time: float, output: float, force: float | None = None) -> bool:
@@ -411,19 +471,23 @@ class HeadingEstimator:
                                around: Channels | None, distance: Number) -> Array:
         """Return the sensitivity of the rate to each uncertain value, shape (m, ...)."""
         return uncertain_sensitivity(
-            self.current_model,
             rate_sensitivity(self.current_model, output, rate, temperature, around), distance)
 
-    def _bias_change(self, time: float) -> tuple[float, float]:
+    def _bias_change(self, time: float, temperature: Number | None,
+                     late: float) -> tuple[Any, Any]:
         """Return the change of the bias with temperature, rad/s, and the distance, K."""
-        if self.temperature is None:
+        if temperature is None:
             return 0.0, 0.0
         if self._correction is None:
             return self._bias_shift, _lost_temperature_distance(time - self._unknown_since)
-        change, distance = self._correction.change_at(self.temperature)
-        late = abs(time - self._temperature_time) - self._temperature_timeout
+        change, distance = self._correction.change_at(temperature)
         return (self._bias_shift + change, self._unobserved_distance + distance
-                + math.copysign(_lost_temperature_distance(late), distance))
+                + np.copysign(_lost_temperature_distance(late), distance))
+
+    @property
+    def _temperature_lateness(self) -> float:
+        """Return the time since the temperature is too old, s."""
+        return abs(self._time - self._temperature_time) - self._temperature_timeout
 
     def _follow_channels(self, interval: float, force: float | None,
                          supply: float | None) -> Channels:
@@ -485,7 +549,8 @@ class HeadingEstimator:
                                 self.last_compensated.temperature_clipped,
                                 self.last_compensated.beyond_range)
             place, beginnings = end, self.restart_count
-            self._update_table_at_rest(start_time + float(time[place - 1]))
+            if self.tracker.is_resting:
+                self._add_to_table(start_time + float(time[place - 1]), True)
             if self.restart_count > beginnings:
                 found[place - 1, [1, 3]] = self.tracker.variance, self.tracker.rate_variance
         return found
@@ -514,21 +579,17 @@ class HeadingEstimator:
         used, tracker, last = self.current_model, self.tracker, self._time
         self._time = float(time[-1])
         result = compensate(used, output, temperature)
-        change, distance = np.zeros(len(time)), np.zeros(len(time))
+        change, distance = np.zeros((2, len(time)))
         if temperature is not None:
             self.temperature, self._temperature_time = float(temperature[-1]), self._time
-            change += self._bias_shift
-            distance += self._unobserved_distance
-            if self._correction is not None:
-                changed, far = self._correction.changes_at(temperature)
-                change, distance = change + changed, distance + far
-            else:
-                change[:], distance[:] = self._bias_change(self._time)
+            known = self._bias_change(self._time, temperature, 0.0)
+            change += known[0]
+            distance += known[1]
         calibration = used.self_calibration
         scale = 1.0 if calibration is None else calibration.scale
         rate = np.asarray(result.rate) - change * scale
         still, moving = self._held_sensitivities(time, output, result, distance)
-        found[:, :5] = tracker.follow(time, rate, moving, wheels, still, still)
+        found[:, :5] = tracker.follow(time, rate, moving, wheels, still)
         found[:, 5], found[:, 6] = rate, result.temperature_clipped
         found[:, 7] = result.beyond_range
         self.last_compensated = CompensatedSamples(
@@ -536,9 +597,9 @@ class HeadingEstimator:
               for values in vars(result).values()))
         self.corrected_rate, self.rate = float(rate[-1]), float(found[-1, 2])
         interval = np.diff(time, prepend=last)
-        moving = np.flatnonzero(
+        stops = np.flatnonzero(
             (found[:, 4] < 0.5) | (interval < 0.0) | (interval > self._settings.maximum_gap))
-        first = int(moving[-1]) + 1 if len(moving) else 0
+        first = int(stops[-1]) + 1 if len(stops) else 0
         if first:
             self._end_rest()
         if first < len(time) and temperature is not None:
@@ -547,20 +608,22 @@ class HeadingEstimator:
                                  float(temperature[first:].sum()), (still[first], still[-1]))
 
     def _held_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
-                            distance: Array) -> Iterator[Array]:
-        """Give the sensitivities at rest and in motion, as `add` holds them, shape (n, m) each."""
+                            distance: Array) -> list[Array]:
+        """Return the sensitivities at rest and in motion, as `add` holds them, (n, m) each."""
         places = [place for place, at in enumerate(time.tolist()) if self._is_outdated(at)]
-        rows = [[self._rest_sensitivity], [self._sensitivity]]
-        if places:
-            temperature = result.temperature
-            if isinstance(temperature, np.ndarray):
-                temperature = temperature[places]
-            for known, rate in zip(rows, (np.zeros(len(time)), np.asarray(result.rate))):
-                known.extend(self._uncertain_sensitivity(
-                    output[places], rate[places], temperature, None, distance[places]).T)
-        self._rest_sensitivity, self._sensitivity = rows[0][-1], rows[1][-1]
-        counts = np.diff([0, *places, len(time)])
-        return (np.repeat(known, counts, axis=0) for known in rows)
+        counts, temperature = np.diff([0, *places, len(time)]), result.temperature
+        if isinstance(temperature, np.ndarray):
+            temperature = temperature[places]
+        held = list[Array]()
+        for last, rate in ((self._rest_sensitivity, 0.0 * output),
+                           (self._sensitivity, np.asarray(result.rate))):
+            rows = last[None]
+            if places:
+                rows = np.concatenate([rows, self._uncertain_sensitivity(
+                    output[places], rate[places], temperature, None, distance[places]).T])
+            held.append(np.repeat(rows, counts, axis=0))
+        self._rest_sensitivity, self._sensitivity = held[0][-1], held[1][-1]
+        return held
 
     # The bias at rest for the next run
 
@@ -591,17 +654,13 @@ class HeadingEstimator:
         """
         Add the bias of complete stretches of rest to the table; to be called regularly.
 
-        A stretch is pending until the next one is complete, or the rest or the run has ended: by
-        then the tracker has detected a slow turn.
-
         Returns
         -------
         '', or the message of the table since the last call
 
         """
+        self._add_to_table(now, self.tracker.is_resting and not ending)
         message, self._table_message = self._table_message, ''
-        while len(self._pending_stretches) > (self.tracker.is_resting and not ending):
-            message = self._add_to_table(self._pending_stretches.popleft(), now) or message
         return message
 
     def _end_rest(self) -> None:
@@ -609,23 +668,27 @@ class HeadingEstimator:
         for each in self._pending_stretches:
             each.has_ended = True
 
-    def _update_table_at_rest(self, now: float) -> None:
-        """Add a stretch to the table as soon as the next one is complete."""
-        while len(self._pending_stretches) > 1 and self.tracker.is_resting:
-            message = self._add_to_table(self._pending_stretches.popleft(), now)
-            self._table_message = message or self._table_message
+    def _add_to_table(self, now: float, resting: bool) -> None:
+        """
+        Add the bias of complete stretches of rest to the table.
 
-    def _add_to_table(self, stretch: _RestStretch, now: float) -> str:
-        bias, temperature = stretch.mean()
-        variance = self.current_model.noise.angle_random_walk ** 2 / STRETCH_DURATION
-        expected, deviation = self._expected_bias(temperature, stretch.sensitivity)
-        if abs(bias - expected) > _OUTLIER_SIGMAS * math.sqrt(deviation ** 2 + variance):
-            return ''
-        message = self.table.add(temperature, bias, variance, now)
-        if (self._correction is not None and self.tracker.is_resting and not stretch.has_ended
-                and abs(temperature - self._correction.start_temperature) > _RESTART_DISTANCE):
-            self._restart(now)
-        return message
+        A stretch is pending until the next one is complete, or the rest or the run has ended: by
+        then the tracker has detected a slow turn.
+
+        """
+        while len(self._pending_stretches) > resting:
+            stretch = self._pending_stretches.popleft()
+            bias, temperature = (total / stretch.count
+                                 for total in (stretch.rate_sum, stretch.temperature_sum))
+            variance = self.current_model.noise.angle_random_walk ** 2 / STRETCH_DURATION
+            expected, deviation = self._expected_bias(temperature, stretch.sensitivity)
+            if abs(bias - expected) > _OUTLIER_SIGMAS * math.sqrt(deviation ** 2 + variance):
+                continue
+            message = self.table.add(temperature, bias, variance, now)
+            self._table_message = message or self._table_message
+            if (self._correction is not None and resting and not stretch.has_ended and abs(
+                    temperature - self._correction.start_temperature) > _RESTART_DISTANCE):
+                self._restart(now)
 
     def _expected_bias(self, temperature: float, seen: Array) -> tuple[float, float]:
         """
@@ -638,7 +701,7 @@ class HeadingEstimator:
         calibration = self.current_model.self_calibration or SelfCalibration()
         change = self._bias_shift
         if self._correction is not None:
-            change += self._correction.change_at(temperature)[0]
+            change += float(self._correction.change_at(temperature)[0])
         off, deviation = self.tracker.bias_for(seen)
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 

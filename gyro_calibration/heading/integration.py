@@ -153,13 +153,13 @@ def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[in
 def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interval: Array | float,
                   step: Array | float) -> tuple[Array | float, Array | float]:
     """
-    Return the variance of the integral over a gap by motion, and the one by noise, rad².
+    Return the variances of an integral over gaps by motion, and additional ones by noise, rad².
 
     Parameters
     ----------
     usual : interval, s
     lost : number of samples
-    interval, step : between the samples around them, s, and change of the rate, rad/s
+    interval, step : between the samples around a gap, s, and change of the rate, rad/s
 
     """
     ends = noise.angle_random_walk ** 2 / usual
@@ -286,7 +286,8 @@ class BlockIntegrator:
         self._window_samples: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self._last_sample: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
         self._integrals: Array = np.zeros(2 + len(covariance))
-        self._gap_variance, self._last_rate, self.intervals = 0.0, np.zeros(0), Intervals()
+        self._last_rate: Array = np.zeros(0)
+        self._gap_variance, self.intervals = 0.0, Intervals()
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
         """
@@ -322,7 +323,7 @@ class BlockIntegrator:
         known = np.concatenate([last_rows[1], kept])
         usual, lost = self.intervals.add_many(interval)
         gaps = np.flatnonzero((lost > 0) & ((known[1:] > 0.0) | (known[:-1] > 0.0)))
-        unseen = np.zeros(len(known))
+        unseen: Array = np.zeros(len(known))
         unseen[gaps + 1] = sum(gap_variances(self._noise, usual[gaps], lost[gaps], interval[gaps],
                                              step[gaps]))
         unseen = self._gap_variance + np.cumsum(unseen)[len(last_time):]

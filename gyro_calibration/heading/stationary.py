@@ -19,7 +19,6 @@ whole blocks.
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -106,29 +105,6 @@ def _chi_squared_quantile(degrees_of_freedom: int, chance: float) -> float:
 _TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
 
 
-class _LowestDecile:
-    """The 10 % quantile of the last values."""
-
-    def __init__(self) -> None:
-        self._history: deque[float] = deque()
-        self._sorted: list[float] = []
-
-    @property
-    def count(self) -> int:
-        return len(self._sorted)
-
-    def add(self, value: float) -> float:
-        """Take the next value; return the quantile of 10 %."""
-        if len(self._history) == _MAX_WINDOWS:
-            self._sorted.pop(bisect_left(self._sorted, self._history.popleft()))
-        self._history.append(value)
-        insort(self._sorted, value)
-        place = 0.1 * (len(self._sorted) - 1)
-        below = int(place)
-        low, high = self._sorted[below], self._sorted[min(below + 1, len(self._sorted) - 1)]
-        return low + (place - below) * (high - low)
-
-
 class EnergyDetector:
     """
     The energy of the last `WINDOW_DURATION` s.
@@ -143,14 +119,18 @@ class EnergyDetector:
     def __init__(self, noise: Noise, false_alarms: float):
         """Begin with an empty window."""
         self.noise_factor = 1.0
+        self._blocks = deque[Block]()
+        self._energies = deque[float](maxlen=_MAX_WINDOWS)
+        self.configure(noise, false_alarms)
+        self._since_last_window, self._interval = 0.0, BLOCK_DURATION
+        self._sudden_limit: float | None = None
+
+    def configure(self, noise: Noise, false_alarms: float) -> None:
+        """Go on with other settings."""
         self._noise = noise
         self._false_alarm_chance = (
             false_alarms / (_TEST_COUNT * 3600.0 / WINDOW_DURATION * _OVERLAP_FACTOR))
         self._sample_false_alarms = false_alarms / _OVERLAP_FACTOR
-        self._blocks: deque[Block] = deque()
-        self._energy_decile, self._difference_decile = _LowestDecile(), _LowestDecile()
-        self._since_last_window, self._interval = 0.0, BLOCK_DURATION
-        self._sudden_limit: float | None = None
 
     def clear(self) -> None:
         """Clear the window, as before rates of another calibration."""
@@ -204,9 +184,10 @@ class EnergyDetector:
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return
         self._since_last_window = 0.0
-        quietest, rough = self._energy_decile.add(energy), self._difference_decile.add(differences)
-        if self._energy_decile.count >= _MIN_WINDOWS:
-            quietest = min(quietest, rough) * (count - 1) / _chi_squared_quantile(count - 1, 0.9)
+        self._energies.append(min(energy, differences))
+        if len(self._energies) >= _MIN_WINDOWS:
+            quietest = (sorted(self._energies)[len(self._energies) // 10] * (count - 1)
+                        / _chi_squared_quantile(count - 1, 0.9))
             self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
     def sudden_limit(self) -> float:
@@ -308,21 +289,15 @@ class Samples:
 
     time: Array
     rate: Array
-    motion_sensitivity: Array
-    rest_sensitivity: Array
+    sensitivity: Array
     wheels: Sequence[bool | None] | None
-    still_sensitivity: Array | None
+    still: Array | None
 
-    def still_at(self, place: int) -> Array | None:
-        return (self.still_sensitivity if self.still_sensitivity is None
-                or self.still_sensitivity.ndim == 1 else self.still_sensitivity[place])
-
-    def sample(self, place: int,
-               resting: bool) -> tuple[float, float, Array, bool | None, Array | None]:
+    def sample(self, place: int) -> tuple[float, float, Array, bool | None, Array | None]:
         """Return the arguments of `HeadingTracker.add`."""
-        return (float(self.time[place]), float(self.rate[place]),
-                (self.rest_sensitivity if resting else self.motion_sensitivity)[place],
-                None if self.wheels is None else self.wheels[place], self.still_at(place))
+        return (float(self.time[place]), float(self.rate[place]), self.sensitivity[place],
+                None if self.wheels is None else self.wheels[place],
+                None if self.still is None else self.still[place])
 
 
 @dataclass
@@ -358,6 +333,7 @@ class EvenSamples:
     time, rate, intervals, half_intervals, angles : stamps, rates, the intervals before them, half
         of them, and the integrals of the rates over them, shape (n,)
     motion_sensitivity, rest_sensitivity : sensitivities, shape (n, m)
+    wheels, still : as in `HeadingTracker.follow`, n of them, or None
     used_sensitivity : the sensitivities used, first that of the sample before, shape (n + 1, m)
     block_starts, block_stops, whole_blocks : first samples and ends of the blocks, and range of
         complete blocks
@@ -373,11 +349,12 @@ class EvenSamples:
     def __init__(self, given: Samples, where: slice, last: tuple[float, float, float, Array],
                  begun: float, rested: bool, found: Array):
         """Begin after the last sample, with an elapsed duration of the first block, s."""
-        self._given, self._first, self.last_at_rest = given, where.start, rested
-        self.results = found
+        self.last_at_rest, self.results = rested, found
         self.time, self.rate = given.time[where], given.rate[where]
-        self.motion_sensitivity = given.motion_sensitivity[where]
-        self.rest_sensitivity = given.rest_sensitivity[where]
+        self.wheels = None if given.wheels is None else given.wheels[where]
+        self.still = None if given.still is None else given.still[where]
+        self.motion_sensitivity = given.sensitivity[where]
+        self.rest_sensitivity = self.motion_sensitivity if self.still is None else self.still
         count = len(self.time)
         self.intervals = np.diff(self.time, prepend=last[0])
         self.half_intervals, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
@@ -391,7 +368,7 @@ class EvenSamples:
         self.block_starts = [0, *self.block_stops[:-1]]
         self.whole_blocks = range(bool(begun), whole)
         moving = self._integrate_sensitivity(self.motion_sensitivity)
-        resting = (moving if given.rest_sensitivity is given.motion_sensitivity
+        resting = (moving if self.still is None
                    else self._integrate_sensitivity(self.rest_sensitivity))
         self.sensitivity_integrals = moving, resting
         summed = (self.intervals, self.angles, self.rate, self.rate * self.rate, steps * steps)
@@ -407,15 +384,6 @@ class EvenSamples:
 
     def _sum_by_blocks(self, values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, self.block_starts))
-
-    def wheels_in_block(self, number: int) -> Sequence[bool | None]:
-        """Return whether wheels moved the robot, for the samples of a block."""
-        wheels, first = self._given.wheels, self._first
-        rows = slice(first + self.block_starts[number], first + self.block_stops[number])
-        return () if wheels is None else wheels[rows]
-
-    def still(self, place: int) -> Array | None:
-        return self._given.still_at(self._first + place)
 
     def close_epoch(self, end: int) -> None:
         """End the last epoch before a sample."""

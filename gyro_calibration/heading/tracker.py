@@ -19,6 +19,7 @@ time; its rotation, which was attributed to the bias meanwhile, is then added to
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -57,7 +58,7 @@ from gyro_calibration.heading.stationary import (
     Snapshot,
     WINDOW_DURATION,
 )
-from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
@@ -66,24 +67,14 @@ import numpy as np
 MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
 #: Longest step of the state, s.
 _STEP_DURATION = 1.0
-#: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
-_BIAS_MARGIN_SIGMAS = 4.0
-#: Shortest rest without a sudden end, s.
-_MIN_REST_DURATION = 2.0
-#: Change of the bias that is assumed while the wheels stand, rad/s; largest delay of odometry
-#: after the begin of a turn, s.
-_WHEEL_BIAS_CHANGE, _WHEEL_DELAY = 0.2 * DEGREE, 4.0
+#: Change of the bias that is assumed while the wheels stand, rad/s.
+_WHEEL_BIAS_CHANGE = 0.2 * DEGREE
 #: Tolerance of the noise figures: factor of the noise of the samples to that of the model from
 #: which on it is used, and factor of the thresholds of means.
 _NOISE_TOLERANCE = 1.25
 #: A steady turn slower than so many times the slowest detectable one may be a change of the bias;
 #: it is attributed to the bias after this time, s.
 _SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, 2.0 * MEAN_LAGS[-1]
-#: When the detection of rest restarts, a pending correction is delayed by this time, s, so that a
-#: continued rest is detected first.
-_RECOGNITION_TIME = 1.0
-#: Samples of a log in one chunk.
-_CHUNK_SAMPLES = 1 << 15
 #: Last blocks of a rest in memory, among which its end is located.
 _MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
 #: States of a rest in memory.
@@ -168,11 +159,9 @@ class HeadingTracker:
         self._open_variance: float | None = None
         self._suspected_turn: SlowTurn | None = None
         self._last_sample: tuple[float, float, float, Array] | None = None
-        self._last_time = self._recognition_left = 0.0
+        self._last_time = 0.0
         self._rest_scatter, self.outlier_count, self._state_version = RestScatter(), 0, 0
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
-        # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump.
-        self._before_last_jump = -math.inf, 0.0
         self.refused_count, self.rebuild_count, self._rebuild_message = 0, 0, ''
         self._last_finite_heading = 0.0, 0.0
         self._error_sensitivity: Array | None = None
@@ -181,7 +170,6 @@ class HeadingTracker:
         self._still_sensitivity: Array | None = None
         self.intervals = Intervals()
         self._energy = EnergyDetector(noise, settings.false_alarms)
-        self._detector_settings = (noise, settings.false_alarms)
         self._initialize_state(noise, covariance, 0.0, 0.0, age)
         self.configure(settings)
 
@@ -201,20 +189,16 @@ class HeadingTracker:
         self._settings = settings
         self._detects_rest = (settings.false_alarms > 0.0
                               and self._model_noise.angle_random_walk > 0.0)
-        rests = (self.is_resting and self._detects_rest
-                 and self._detector_settings == (self._model_noise, settings.false_alarms))
-        if self._detector_settings != (self._model_noise, settings.false_alarms):
-            self._detector_settings = self._model_noise, settings.false_alarms
-            self._energy = EnergyDetector(*self._detector_settings)
+        self._energy.configure(self._model_noise, settings.false_alarms)
         self._block, self._wheels_moved = Block(), False
         self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._detects_rest
                                        else settings.threshold)
         self._sigmas = {lag: _NOISE_TOLERANCE * mean_threshold_sigmas(lag, settings.false_alarms)
                         for lag in (WINDOW_DURATION, *MEAN_LAGS)} if self._detects_rest else {}
-        if rests:
+        if self.is_resting and self._detects_rest:
             self._enter_rest()
         else:
-            self._search_rest_again()
+            self._enter_motion(WINDOW_DURATION)
         self._adopt_state()
 
     def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0,
@@ -243,24 +227,18 @@ class HeadingTracker:
 
     def reset(self) -> None:
         """Set the heading to zero, without uncertainty."""
-        self._advance_to_last_sample()
-        self.heading = self.deleted_heading = 0.0
-        self._state = self._state.with_heading(0.0)
-        if self._suspected_turn:
-            # if the turn was a change of the bias, the heading was the same at its begin
-            self._suspected_turn.snapshot = replace(
-                self._suspected_turn.snapshot,
-                state=self._suspected_turn.snapshot.state.with_heading(0.0), deleted_heading=0.0)
-        self._adopt_state()
-        if self.is_resting:
-            self._enter_rest()
+        self.deleted_heading = 0.0
+        self.set_heading(0.0, 0.0)
 
     def set_heading(self, heading: float, variance: float) -> None:
         """Set the heading, rad, and its variance, rad²; the bias estimate remains."""
         self._advance_to_last_sample()
-        self._search_rest_again()
         self.heading, self._suspected_turn = heading, None
         self._state = self._state.with_heading(heading, variance)
+        if self.is_resting:
+            self._enter_rest()
+        else:
+            self._enter_motion(WINDOW_DURATION)
         self._adopt_state()
 
     @property
@@ -310,12 +288,6 @@ class HeadingTracker:
             # the jump is permanent; its time between the samples is not known
             turned = 0.5 * (spike[1] - self._last_sample[1]) * (spike[0] - self._last_sample[0])
             self._block_integral.lost_variance += turned ** 2
-            # a rate between two jumps within 2 s may be erroneous
-            begun, before = self._before_last_jump
-            if 0.0 < spike[0] - begun < _MIN_REST_DURATION:
-                turned = (self._last_sample[1] - before) * (spike[0] - begun)
-                self._block_integral.lost_variance += turned ** 2
-            self._before_last_jump = self._last_sample[:2]
             self._take_sample(*spike)
         elif spike is not None:
             self.outlier_count += 1
@@ -333,6 +305,8 @@ class HeadingTracker:
                      still: Array | None, gap: tuple[int, float] | None = None) -> str:
         """Take a sample; `gap` is the number of lost samples and the usual interval, if known."""
         self._still_sensitivity = still
+        if self.is_resting and still is not None:
+            sensitivity = still
         filtered = self._filter.apply(time, rate)
         last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
         if last is None:
@@ -371,8 +345,7 @@ class HeadingTracker:
     # Many samples at once
 
     def follow(self, time: Array, rate: Array, sensitivity: Array,
-               wheels: Sequence[bool | None] | None = None, still: Array | None = None,
-               resting: Array | None = None) -> Array:
+               wheels: Sequence[bool | None] | None = None, still: Array | None = None) -> Array:
         """
         Take samples as `add` does, in whole blocks where no decision falls within them.
 
@@ -382,23 +355,22 @@ class HeadingTracker:
         sensitivity : as in `add`, shape (n, m)
         wheels : as in `add`, n of them, or None
         still : as in `add`, shape (m,) or (n, m)
-        resting : stands for `sensitivity` where the robot rests before a sample, shape (n, m)
 
         Returns
         -------
         heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, (n, 5)
 
         """
-        given = Samples(time, rate, sensitivity, sensitivity if resting is None else resting,
-                        wheels, still)
+        given = Samples(time, rate, sensitivity, wheels, None if still is None
+                        else np.broadcast_to(still, sensitivity.shape))
         found, begin = np.empty((len(time), 5)), 0
         while begin < len(time):
-            count = self._count_even(time[begin:begin + _CHUNK_SAMPLES],
-                                     rate[begin:begin + _CHUNK_SAMPLES])
+            count = self._count_even(time[begin:begin + CACHE_BLOCK_SAMPLES],
+                                     rate[begin:begin + CACHE_BLOCK_SAMPLES])
             if count:
                 self._follow_even_samples(given, begin, begin + count, found)
             else:
-                self.add(*given.sample(begin, self.is_resting))
+                self.add(*given.sample(begin))
                 found[begin] = self._result_row(self.intervals.usual_interval)
             begin += count or 1
         return found
@@ -428,7 +400,7 @@ class HeadingTracker:
             if gap > begin:
                 self._follow_piece(given, begin, gap, usual[begin - end:][:gap - begin], found)
             if gap < end:
-                self._take_sample(*given.sample(gap, self.is_resting),
+                self._take_sample(*given.sample(gap),
                                   gap=(int(lost[gap - end]), float(usual[gap - end])))
                 found[gap] = self._result_row(float(usual[gap - end]))
             begin = gap + 1
@@ -453,9 +425,9 @@ class HeadingTracker:
             piece.close_epoch(piece.block_starts[number])
             for place in range(piece.block_starts[number], until):
                 piece.last_at_rest = self.is_resting
-                sample, known = given.sample(begin + place, self.is_resting), float(usual[place])
-                piece.used_sensitivity[place + 1] = sample[2]
-                self._take_sample(*sample, gap=(0, known))
+                known = float(usual[place])
+                self._take_sample(*given.sample(begin + place), gap=(0, known))
+                piece.used_sensitivity[place + 1] = self._last_sample[3]
                 found[begin + place] = self._result_row(known)
             if not self._block.duration:
                 piece.epochs.append(self._new_epoch(until - 1))
@@ -472,17 +444,15 @@ class HeadingTracker:
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
         begin, end = piece.block_starts[number], piece.block_stops[number]
-        moved = piece.wheels_in_block(number)
+        moved = () if piece.wheels is None else piece.wheels[begin:end]
         driven = True in moved
         rows = piece.rest_sensitivity if self.is_resting else piece.motion_sensitivity
         if self.is_resting:
             rates = (piece.rate[begin:end] - self._wander_rate
                      + rows[begin:end] @ self._calibration_errors)
-            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
+            limit = self._energy.sudden_limit()
             if driven or rates.max() > limit or rates.min() < -limit:
                 return False
-        elif self._recognition_left > 0.0:
-            return False
         part, block, sums = self._block_integral, self._block, piece.block_sums[number]
         part.duration, part.angle, decayed, *block_sums = sums
         block.rate_sum, block.square_sum, block.difference_square_sum = block_sums
@@ -502,7 +472,7 @@ class HeadingTracker:
         time, rate = float(piece.time[end - 1]), float(piece.rate[end - 1])
         self._last_sample = time, rate, rate, rows[end - 1]
         self._interval, self._last_time = float(piece.intervals[end - 1]), time
-        self._still_sensitivity = piece.still(end - 1)
+        self._still_sensitivity = None if piece.still is None else piece.still[end - 1]
         self._end_block(driven, moved[-1] if moved else None)
         if not -math.inf < self.heading < math.inf:
             self._rebuild_state()
@@ -538,12 +508,8 @@ class HeadingTracker:
             self.deleted_heading += corrected
             return
         self.deleted_heading += half * (rate - filtered + last_rate - last_filtered)
-        if self._recognition_left > 0.0:
-            self._recognition_left -= interval
-            settled = 0.0
-        else:
-            settled = self._pending_correction * duration / SETTLING_TIME
-            self._pending_correction -= settled
+        settled = self._pending_correction * duration / SETTLING_TIME
+        self._pending_correction -= settled
         self.heading += corrected + settled
 
     def _detect_motion(self, duration: float, before: float, wheels: bool | None) -> None:
@@ -552,8 +518,8 @@ class HeadingTracker:
         _, rate, _, sensitivity = self._last_sample
         self._block.add(duration, rate, before)
         if self.is_resting:
-            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
-            if wheels or abs(rate - self._rate_error(sensitivity)) > limit:
+            sudden = abs(rate - self._rate_error(sensitivity)) > self._energy.sudden_limit()
+            if wheels or sudden:
                 self._revert_to_motion(0.0)
         self._wheels_moved = self._wheels_moved or bool(wheels)
         if self._block.duration >= BLOCK_DURATION - TIME_TOLERANCE:
@@ -669,8 +635,6 @@ class HeadingTracker:
                              * before.state.noise.angle_random_walk ** 2)
             if abs(turn.angle - expected) > self._sigmas[lag] * math.sqrt(variance):
                 if wheels is False:
-                    if lag < _WHEEL_DELAY:
-                        continue
                     self._state = self._state.with_added_variance(
                         WALK_INDEX, ((turn.angle - expected) / turn.duration) ** 2)
                     self._enter_rest()
@@ -681,22 +645,16 @@ class HeadingTracker:
 
     def _snapshot_before(self, lag: float) -> Snapshot | None:
         """Return the state `lag` s before the last step of this rest; None if before its begin."""
-        snapshots, until = self._snapshots, self._rest_integral.duration - lag + TIME_TOLERANCE
-        if snapshots[0].rate_integral.duration > until:
-            return None
-        place = max(len(snapshots) - 1 - round(lag / _STEP_DURATION), 0)
-        while place + 1 < len(snapshots) and snapshots[place + 1].rate_integral.duration <= until:
-            place += 1
-        while snapshots[place].rate_integral.duration > until:
-            place -= 1
-        return snapshots[place]
+        place = bisect_right(self._snapshots, self._rest_integral.duration - lag + TIME_TOLERANCE,
+                             key=lambda each: each.rate_integral.duration)
+        return self._snapshots[place - 1] if place else None
 
     # From rest to motion and back
 
     def _enter_rest(self) -> None:
         """Begin a rest."""
         self.is_resting, self._rest_integral = True, self._zero_integral
-        self._recognition_left, self._wheels_stand = 0.0, False
+        self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
         _, median = self._rest_scatter.mean_and_median(np.zeros(1))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
@@ -707,21 +665,12 @@ class HeadingTracker:
         self.is_resting, self._quiet_duration = False, quiet_duration
         self._recent_blocks, self._held_integral = deque[RateIntegral](), self._zero_integral
 
-    def _search_rest_again(self) -> None:
-        """Restart the detection of rest; a rest may continue."""
-        if self.is_resting:
-            self._recognition_left = _RECOGNITION_TIME
-        self._enter_motion(WINDOW_DURATION)
-
     def _revert_to_motion(self, lag: float) -> None:
         """Revise a rest to a motion since `lag` s before the last block."""
         self._advance_state()
         snapshot = self._snapshot_before(max(lag, WINDOW_DURATION)) or self._snapshots[0]
-        sudden = lag <= WINDOW_DURATION
-        if not sudden and self._rest_integral.duration < _MIN_REST_DURATION - TIME_TOLERANCE:
-            snapshot = self._snapshots[0]
         turn = self._rest_integral - snapshot.rate_integral
-        if sudden:
+        if lag <= WINDOW_DURATION:
             snapshot, turn = self._locate_motion_start(snapshot, turn)
         self._suspected_turn = (self._slow_turn_since(snapshot, turn)
                                 if lag >= MEAN_LAGS[0] else None)
@@ -792,7 +741,7 @@ class HeadingTracker:
         self._block, self._wheels_moved = Block(), False
         self._energy.clear()
         self._filter.clear()
-        self._search_rest_again()
+        self._enter_motion(WINDOW_DURATION)
         duration = max(interval, 0.0)
         if interval > 0.0:
             self.intervals.count_lost(interval)
@@ -884,7 +833,6 @@ class HeadingTracker:
         self._wander_rate = self._state.wander_rate[0]
         self._calibration_errors = self._state.calibration_errors[0]
         self._error_sensitivity = self._bias_sensitivity = None
-        self._bias_margin = _BIAS_MARGIN_SIGMAS * self.bias[1]
         self._open_variance, self._state_version = None, self._state_version + 1
         estimate = (float(self._state.mean[HEADING_INDEX])
                     + (0.0 if self.is_resting
@@ -900,10 +848,11 @@ class HeadingTracker:
         self._initialize_state(self._model_noise, np.nan_to_num(covariance), heading,
                                variance + math.tau ** 2, age)
         self.heading, self.rate, self.deleted_heading = heading, 0.0, 0.0
-        self._recognition_left, self._still_sensitivity, self._suspected_turn = 0.0, None, None
+        self._still_sensitivity = self._suspected_turn = None
         if self._last_sample is not None:
             self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
-        self._energy, self._block = EnergyDetector(*self._detector_settings), Block()
+        self._energy, self._block = EnergyDetector(
+            self._model_noise, self._settings.false_alarms), Block()
         self._wheels_moved = False
         self._filter.clear()
         self._enter_motion(WINDOW_DURATION)

@@ -32,9 +32,12 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pair
-from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import Prior
-from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
+from gyro_calibration.heading.heading_estimator import (
+    Assumptions,
+    HeadingEstimator,
+    TEMPERATURE_TIMEOUT,
+)
 from gyro_calibration.heading.integration import Threshold
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE

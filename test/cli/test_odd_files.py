@@ -312,7 +312,7 @@ def test_a_calibration_that_is_not_used_is_reported(model, calibration, hint, tm
                          [(-7200.0, True), (60.0, True), (3.0e7, False), (2.0e9, False)])
 def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
     """Until the clock is set: a robot without a battery for it starts in the past."""
-    from gyro_calibration.heading.assumptions import Assumptions
+    from gyro_calibration.heading.heading_estimator import Assumptions
     now, variance = 1.7e9, (1e-5) ** 2
     date = str(np.datetime64(round(now + ahead), 's')) + '+00:00'
     calibration = SelfCalibration(0.0, 0.01, ((1e-8, 0.0), (0.0, variance)), date)

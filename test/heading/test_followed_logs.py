@@ -13,9 +13,8 @@
 import math
 
 from gyro_calibration.cli.main import main
-from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
-from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.heading_estimator import Assumptions, HeadingEstimator
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
