@@ -19,9 +19,8 @@ is what the compensation node does in the interval of one sample.
 import math
 
 from gyro_calibration.ros.calibration_session import PROFILE
-from gyro_calibration.ros.parameters import parameter_values
+from gyro_calibration.ros.inputs import parameter_values, Velocity
 from gyro_calibration.ros.pipeline import PARAMETERS, Pipeline
-from gyro_calibration.ros.wheels import Velocity
 from robot import INTERVAL, Robot
 
 BEGIN = 1_700_000_000  # s since 1970

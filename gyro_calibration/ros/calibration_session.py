@@ -55,10 +55,9 @@ from gyro_calibration.model.motion import (
     read_motion,
 )
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.clock import Clock, node_time, StampDelay
 from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
+from gyro_calibration.ros.inputs import Clock, node_time, StampDelay, Velocity
 from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
@@ -85,24 +84,17 @@ _NO_RECEIVER = ('no other node receives cmd_vel: start what moves the robot, rem
                 'topic, or change cmd_vel_stamped')
 
 
-@dataclass(frozen=True)
-class AcceptanceRules:
-    """Criteria for accepting a run; with 0 `turns` the gyro determines their number."""
-
-    limits: RunLimits = RunLimits()
-    odometry: ReferenceErrors = ReferenceErrors()
-    turns: int = 0
-
-
 @dataclass
 class CalibrationRun:
     """A calibration in progress."""
 
     kind: str  # PROFILE, ODOMETRY, TURNS or REST
     duration: float  # of the compared motion, s; inf until `finish`
-    rules: AcceptanceRules
     last_received: float  # time of the last sample, or of the request, s of the steady clock
     motion: Motion | None = None  # the profile
+    limits: RunLimits = RunLimits()
+    reference_errors: ReferenceErrors = ReferenceErrors()  # of odometry
+    turns: int = 0  # whole turns; with 0 the gyro determines their number
     end_reason: str | None = None  # reason of the end; '' where the samples are complete
     times: list[float] = field(default_factory=list)  # stamps, s
     outputs: list[float] = field(default_factory=list)  # rad/s
@@ -140,9 +132,8 @@ class CalibrationRun:
     @property
     def extra_duration(self) -> float:
         """Return the duration of samples after the motion, s."""
-        limits = self.rules.limits
         return {REST: 0.0, TURNS: REST_AFTER_TURNS}.get(
-            self.kind, limits.max_time_offset + SETTLING_TIME + limits.rest_duration)
+            self.kind, self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration)
 
     @property
     def max_duration(self) -> float:
@@ -302,12 +293,11 @@ class CalibrationSession:
         now = self._clock.steady()
         if drives and now - self._last_foreign_command < 1.0:
             return 'another node sends commands on cmd_vel: stop it, and run again'
-        rules = AcceptanceRules(
-            RunLimits(max_bias=values.calibration_maximum_bias),
+        self._start_time, self._is_silent, self.warning = node_time(self._clock), False, ''
+        self.run = CalibrationRun(
+            kind, duration, now, motion, RunLimits(max_bias=values.calibration_maximum_bias),
             ReferenceErrors(scale_deviation=values.calibration_odometry_scale_deviation),
             values.calibration_turns)
-        self._start_time, self._is_silent, self.warning = node_time(self._clock), False, ''
-        self.run = CalibrationRun(kind, duration, rules, now, motion)
         self._drive = Drive(self.run, motion, self._clock) if motion and drives else None
         self._monitor.restart()
         return ''
@@ -385,7 +375,7 @@ class CalibrationSession:
                           'to true and run again')
             if not drive.is_waiting(receivers):
                 usual = self._estimator.tracker.intervals.usual_interval
-                timeout = min(max(DRIVE_SAMPLE_TIMEOUT, 4.0 * usual), run.rules.limits.max_gap)
+                timeout = min(max(DRIVE_SAMPLE_TIMEOUT, 4.0 * usual), run.limits.max_gap)
                 is_driven = True
         # Decided at the second poll: after a pause of this process, queued samples are delivered
         # after its timers.
@@ -470,7 +460,7 @@ class CalibrationSession:
                 raise DataRefused(run.end_reason)
             return True, self._apply_calibration(run)
         except DataRefused as error:
-            late = (drive.describe_lateness(run.rules.limits)
+            late = (drive.describe_lateness(run.limits)
                     if drive and not run.end_reason else '')
             return False, f'{late} (the run shows: {error})' if late else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
@@ -515,8 +505,8 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
 
     """
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
-    limits, temperature = run.rules.limits, (float(np.mean(run.temperatures))
-                                             if run.temperatures else None)
+    limits = run.limits
+    temperature = float(np.mean(run.temperatures)) if run.temperatures else None
     if run.kind == REST:
         bias, deviation = calibrate_bias(time - time[0], rate, limits, noise, output)
         turned = 0.0  # rad; by the headings or the rates of odometry
@@ -531,7 +521,7 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
         return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), date, temperature,
                                'rest'), ''
     if run.kind == TURNS:
-        found = calibrate_turns(time - time[0], rate, run.rules.turns or None, limits, noise,
+        found = calibrate_turns(time - time[0], rate, run.turns or None, limits, noise,
                                 output=output)
         return (to_model_record(found.fit, 'turns', date, temperature),
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
@@ -539,7 +529,7 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     by_odometry, time = run.kind == ODOMETRY, time - begin
     inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
-                         reference=run.rules.odometry if by_odometry else None,
+                         reference=run.reference_errors if by_odometry else None,
                          output=output[inside], prior=prior)
     remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
     if fit.goodness:

@@ -46,11 +46,19 @@ from gyro_calibration.ros.calibration_session import (
     REST,
     ROS_TIME_PAUSED,
 )
-from gyro_calibration.ros.clock import Clock, RosTime, StampDelay
 from gyro_calibration.ros.health_monitor import HealthMonitor, RepeatedOutputDetector
-from gyro_calibration.ros.parameters import Parameter
+from gyro_calibration.ros.inputs import (
+    Clock,
+    COMMAND,
+    MAX_VELOCITY_AGE,
+    ODOMETRY,
+    Parameter,
+    RosTime,
+    StampDelay,
+    Velocity,
+    Wheels,
+)
 from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.ros.wheels import COMMAND, MAX_VELOCITY_AGE, ODOMETRY, Velocity, Wheels
 
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
@@ -196,10 +204,7 @@ class Pipeline:
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
         self._frame: str | None = None
         self.publisher_conflict, self._interleaved_count = '', 0
-        # For a driver that was restarted and may send faster: arrival of the last sample, s, and
-        # the longest interval since a silence, ns.
-        self._have_same_name, self._last_arrival, self._max_interval = False, clock.steady(), 0
-        self._backlog = 0.0  # delay of the last samples, ns
+        self._last_arrival, self._backlog = clock.steady(), 0.0  # delay of the last samples, ns
         self._trusted_heading = 0.0, 0.0
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._frozen_stamp: tuple[float, float] | None = None
@@ -325,8 +330,6 @@ class Pipeline:
                     now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
-        self._max_interval = (0 if now - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
-                              else max(self._max_interval, stamp - self._last_stamp))
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
@@ -473,7 +476,6 @@ class Pipeline:
         self.publisher_conflict = '' if len(names) < 2 else (
             f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), and '
             'their samples cannot be distinguished: give each gyro a topic of its own')
-        self._have_same_name = len(names) > len(set(names)) == 1
         if not self.publisher_conflict:
             self._interleaved_count = 0
         if self._interleaved_count > 1:
@@ -491,20 +493,16 @@ class Pipeline:
 
         A sample of a second publisher divides an interval, so that one part is at most half of it.
         A restarted driver sends alone, although the middleware lists the killed one for up to 20
-        s, and may send at another rate. Delayed samples also follow too soon, until they have
-        caught up.
+        s; one that sends twice as fast is refused until then. Delayed samples also follow too
+        soon, until they have caught up.
 
         """
         usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
-        interval = stamp - self._last_stamp
-        behind = self._backlog
+        interval, behind = stamp - self._last_stamp, self._backlog
         begins = self._clock.steady() - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
         self._backlog = 0.0 if begins else min(max(behind + interval - usual, 0.0),
                                                NSEC_PER_SEC * DRIVE_SAMPLE_TIMEOUT)
-        if self._have_same_name:
-            usual = min(usual, self._max_interval)
-        if not (2.0 * interval > usual or behind):
-            self._interleaved_count += 1
+        self._interleaved_count += not (2.0 * interval > usual or behind)
         if self._interleaved_count > 1:
             self._refuse_all(self.publisher_conflict)
 
@@ -561,7 +559,6 @@ class Pipeline:
         if event := self.estimator.update_table(date, is_final):
             self.journal.event = event
         self.store.store_table(date, is_final)
-        self.store.poll()
 
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""

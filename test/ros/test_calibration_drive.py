@@ -24,7 +24,7 @@ from gyro_calibration.ros.calibration_session import (
     SAMPLE_TIMEOUT,
     TURNS,
 )
-from gyro_calibration.ros.wheels import Velocity
+from gyro_calibration.ros.inputs import Velocity
 import numpy as np
 import pytest
 from rig import driven, INTERVAL, MODEL, PROFILE, rested, Rig, Robot

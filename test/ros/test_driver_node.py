@@ -31,7 +31,7 @@ from gyro_calibration.ros.driver_node import (
     SampleMessages,
     settings_from_parameters,
 )
-from gyro_calibration.ros.parameters import parameter_values
+from gyro_calibration.ros.inputs import parameter_values
 from gyro_calibration.ros.runner import ERROR, OK, WARN
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
@@ -47,7 +47,7 @@ KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temper
 
 @pytest.mark.parametrize(('given', 'sentence'), [
     ({'protocol': 'bogus'},
-     r"parameter protocol is 'bogus', but must be kvh_dsp3000, .*csv or auto"),
+     "protocol 'bogus' is not known: choose one of csv, .*, or auto to find it by listening"),
     ({'invert': 'maybe'}, "parameter invert is 'maybe', but must be default, always or never"),
     ({'increments': True}, 'parameter increments is True, but must be default, always or never'),
     ({'columns': ['time_s'], 'protocol': 'csv'}, 'exactly one must be gyro_dps'),
@@ -209,12 +209,12 @@ def test_steps_of_the_clock_are_counted():
 
 
 def test_listening_is_a_warning_and_what_was_recognized_is_reported():
-    world = World(30.0, baud=find_protocol('minimu9').baud)
-    world.gyro('minimu9')
+    world = World(30.0, baud=find_protocol('kvh_ecore').baud)
+    world.gyro('kvh_ecore')
     reports = reported(world, 'auto')
     assert reports[0][:2] == (WARN, 'listening for a protocol')
-    assert (reports[-1][2]['protocol'] == 'minimu9'
-            and 'minimu9 explains' in reports[-1][2]['detected'])
+    assert (reports[-1][2]['protocol'] == 'kvh_ecore'
+            and 'kvh_ecore explains' in reports[-1][2]['detected'])
 
 
 # As a robot runs it: its own process, a pseudo-terminal for the gyro, and DDS

@@ -16,7 +16,6 @@ from pathlib import Path
 import resource
 import subprocess
 import sys
-import threading
 from types import SimpleNamespace
 
 from gyro_calibration.files import open_replacement, remove_leftovers, write_atomically
@@ -117,47 +116,6 @@ def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path)
     taught(memory)
     memory.store_table(NOW, is_final=True)
     assert not (tmp_path / 'biases.yaml').exists()
-
-
-def test_what_another_node_writes_to_the_same_file_is_reported_until_this_one_writes(remember):
-    first, second = remember(), remember()
-    first.poll()
-    assert not first.shared_hint
-    second.store_calibration(SelfCalibration(0.01, 0.02))
-    first.poll()
-    second.poll()
-    assert 'was written by another process' in first.shared_hint and not second.shared_hint
-    first.store_calibration(SelfCalibration(0.01, 0.03))
-    assert not first.shared_hint
-
-
-def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_lost_reports_it(remember):
-    """Two threads keep calibrations in step; the one that is not in the file must report it."""
-    memories, step, rounds = (remember(), remember()), threading.Barrier(3, timeout=20.0), 200
-
-    def keep(memory, bias):
-        for _ in range(rounds):
-            step.wait()
-            memory.store_calibration(SelfCalibration(0.01, bias))
-            step.wait()
-    writers = [threading.Thread(target=keep, args=(memory, bias))
-               for memory, bias in zip(memories, (0.1, 0.2))]
-    for writer in writers:
-        writer.start()
-    unknown = 0
-    for _ in range(rounds):
-        step.wait()
-        step.wait()
-        held = remember().model
-        for memory in memories:
-            memory.poll()
-            unknown += memory.model != held and not memory.shared_hint
-    for writer in writers:
-        writer.join()
-    assert unknown == 0
-
-
-# Kills and a full disk
 
 
 @pytest.mark.parametrize('kills', [60, pytest.param(500, marks=pytest.mark.evidence)])
