@@ -272,14 +272,6 @@ def test_columns_units_scales_and_axes_are_those_of_the_settings(name, settings,
     assert sample.output == pytest.approx(rate, rel=1e-4)
 
 
-def test_a_lost_port_does_not_join_two_halves():
-    decoder = opened('csv')
-    decoder.feed(b'0.1,1')
-    decoder.reset()
-    assert decoder.feed(b'2.5,20.0\n0.2,3.0,20.0\n') == [Sample(3.0 * DPS, 20.0, 0.2)]
-    assert decoder.discarded_bytes == 13
-
-
 @pytest.mark.parametrize(('name', 'values', 'message'), [
     ('csv', {'sensitivity': -1.0}, 'set invert'),
     ('csv', {'sensitivity': math.nan}, 'above 0'),

@@ -11,7 +11,6 @@
 """The driver: its parameters, messages and diagnostics, and as a process with DDS."""
 
 import itertools
-import math
 import re
 import subprocess
 import sys
@@ -63,14 +62,6 @@ def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
     assert len(str(refused.value).splitlines()) == 1
 
 
-def test_parameters_become_settings():
-    given = {'sensitivity': 0.002, 'invert': 'always', 'increments': 'never', 'axis': 'y',
-             'full_scale': 2, 'columns': ['gyro_counts']}
-    assert settings_from_parameters(parameter_values(PARAMETERS, given)) == Settings(
-        0.002, True, 'y', ('gyro_counts',), 2.0, False, None)
-    assert settings_from_parameters(parameter_values(PARAMETERS)) == Settings()
-
-
 # Messages
 
 
@@ -101,13 +92,6 @@ def test_a_message_holds_the_rate_about_z_and_marks_what_is_not_measured():
     messages.fill(SampleMean(0.0, Sample(0.5), 1))
     assert messages.imu.linear_acceleration.z == 0.0
     assert list(messages.imu.linear_acceleration_covariance) == [-1.0, *8 * [0.0]]
-
-
-@pytest.mark.parametrize(('name', 'deviation'),
-                         [('kvh_dsp3000', 0.0111), ('kvh_1750', 0.0088), ('csv', 0.5)])
-def test_the_assumed_noise_is_that_of_the_data_sheet_or_half_a_degree_a_second(name, deviation):
-    assert math.sqrt(find_protocol(name).sample_variance(Settings())) == pytest.approx(
-        math.radians(deviation), rel=0.01)
 
 
 # Diagnostics
