@@ -142,7 +142,7 @@ _SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower th
 #: Longest silence of a board that restarts when its port is opened, and longest delay before a
 #: lost port is opened again, s.
 _RESTART_DURATION = 5.0
-#: Interval of attempts to recognize the protocol, and first delay before a port is opened again, s.
+#: Interval of attempts to recognize the protocol, and first delay before a port is reopened, s.
 _ATTEMPT_INTERVAL = 0.1
 #: Listening time at a baud, s, in which a gyro of 10 Hz sends enough; and interval of requests to
 #: send, since a gyro that starts does not receive them.
