@@ -218,15 +218,6 @@ class Connection:
     clock : returns seconds of a steady clock
     make_port : makes a `SerialPort` of a path and a baud
 
-    Attributes
-    ----------
-    protocol, clock, baud : None and 0 until the protocol is known
-    path : the device of the port when it was last opened, links resolved
-    detected : result of the recognition by listening, in a sentence
-    open_count : number of times that the port was opened
-    waited_duration : total waiting time for the port, s
-    longest_gap : longest time between two samples, s; 0 while none exceeds 1.5 periods
-
     Raises
     ------
     ValueError : the protocol is unknown, or settings that it needs are missing
@@ -242,15 +233,18 @@ class Connection:
         self._bauds = (baud,) if baud else BAUDS
         self._on_change, self._read_clock, self._make_port = on_change, clock, make_port
         self.state = ConnectionState('opening')
-        self.protocol: Protocol | None = None
+        self.protocol: Protocol | None = None  # until it is known
         self.clock: SampleClock | None = None
         self._decoder: Decoder | None = None
         self._port: SerialPort | None = None
         self._last_stamp = -math.inf
         self._previous_counts, self._samples, self._reopen_delay, self._read_bytes = (
             ConnectionCounts(), 0, _ATTEMPT_INTERVAL, 0)
-        self.baud, self.path, self.detected, self.last_error = 0, '', '', ''
-        self.open_count, self.waited_duration, self.longest_gap = 0, 0.0, 0.0
+        self.baud, self.last_error = 0, ''
+        self.path = ''  # the device of the port when it was last opened, links resolved
+        self.detected = ''  # result of the recognition by listening, in a sentence
+        self.open_count, self.waited_duration = 0, 0.0  # s
+        self.longest_gap = 0.0  # between two samples, s; 0 while none exceeds 1.5 periods
         self._is_auto = protocol == AUTO
         if not self._is_auto:
             try:
