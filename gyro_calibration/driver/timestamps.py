@@ -129,20 +129,16 @@ def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
 
 
 class _SampleCounter:
-    """
-    Numbers samples in nominal periods; the usual advance is `mean_advance`.
-
-    By the sequence of the device, by its time, or by counting. The number may be wrong by a
-    multiple of `ambiguity` samples; `ambiguity` is 0 where the device gives its time.
-
-    """
+    """Numbers samples in nominal periods: by sequence or time of the device, or by counting."""
 
     def __init__(self, rate: float, modulus: int):
         self._rate, self._modulus = rate, modulus
         self.reset()
 
     def reset(self) -> None:
-        self.mean_advance, self.ambiguity = 1.0, 1
+        self.mean_advance = 1.0  # the usual one
+        #: Of how many samples the number may be wrong by a multiple; 0 by the time of the device.
+        self.ambiguity = 1
         self._advances = deque[float](maxlen=_MEDIAN_SIZE)
         self._sequence: int | None = None
         self._time: float | None = None
@@ -224,22 +220,12 @@ class SampleClock:
     Stamps samples; stamps increase strictly.
 
     Corrections by the line, see `LowerLine`, are slewed. A stamp jumps only where later arrivals
-    show that samples were lost. The nominal rate of the gyro is used for the first samples only:
-    its clock is 2 to 3 % off from unit to unit.
+    show that samples were lost. The nominal rate of the gyro, Hz, is used for the first samples
+    only: its clock is 2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0
+    without one, and `min_stamp` the last stamp of another clock.
 
-    Parameters
-    ----------
-    rate : nominal samples per second
-    modulus : modulus of `Sample.sequence`; 0 for a device without a sequence
-    min_stamp : lower limit of the stamps: the last stamp of another clock
-
-    Attributes
-    ----------
-    lost_count : samples lost so far while the port was open: missing in the sequence or in the
-        time of the device, damaged, or shown by the lateness of all later samples
-    period : fitted interval between samples, s
-    jitter : root mean squares over the last 10 s: lateness of samples, and deviation of stamps
-        from the line, s
+    `lost_count` are the samples lost while the port was open: missing in the sequence or in the
+    time of the device, damaged, or shown by the lateness of all later samples.
 
     """
 
@@ -265,7 +251,7 @@ class SampleClock:
 
     @property
     def jitter(self) -> tuple[float, float]:
-        """Root mean squares of lateness and of the deviation of stamps from the line, s."""
+        """Root mean squares over 10 s of lateness, and of stamps against the line, s."""
         return math.sqrt(self._mean_squares[0]), math.sqrt(self._mean_squares[1])
 
     def interrupt(self) -> None:
@@ -477,15 +463,11 @@ class HostTimeConverter:
     def convert_sample(self, stamp: float, previous_time: float, usual_interval: float,
                        arrival_interval: float = 0.0) -> float:
         """
-        Return the time of a sample.
+        Return the time of a sample, s; all arguments are in s.
 
-        Parameters
-        ----------
-        stamp : seconds
-        previous_time : time of the previous sample, s; -inf for the first, which shows no step
-        usual_interval : interval, s; inf while it is not known
-        arrival_interval : time between their arrivals, s; it equals the jump of the stamps over a
-            gap, but not over a step of the clock
+        The previous time is -inf for the first sample, which shows no step, and the usual interval
+        inf while it is not known. Over a gap the jump of the stamps equals the time between their
+        arrivals, but not over a step of the clock.
 
         """
         if previous_time == -math.inf:

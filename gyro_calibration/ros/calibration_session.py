@@ -61,22 +61,15 @@ from gyro_calibration.ros.state_store import StateStore
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-#: Duration of the rest after whole turns, s.
-REST_AFTER_TURNS = 2.5
-#: Longest duration of a run that waits for `finish`, s.
-FINISH_TIMEOUT = 600.0
-#: Time without a sample after which a run without a drive ends, s.
+REST_AFTER_TURNS = 2.5  # s; duration of the rest after whole turns
+FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
+#: Time without a sample after which a run without a drive ends, and longest wait for a node that
+#: receives the commands, s; discovery may take 3 s.
 SAMPLE_TIMEOUT = 5.0
-#: Time without a sample after which a drive ends, s; four intervals of a slower gyro.
-DRIVE_SAMPLE_TIMEOUT = 0.25
-#: Longest wait for a node that receives the commands, s; discovery may take 3 s.
-DISCOVERY_TIMEOUT = 5.0
-#: Longest turn of the robot after the last command, s: latency and deceleration.
-STOPPING_DURATION = 1.5
-#: Least change of the odometry heading over a run that shows a turn, rad.
-_MIN_TURN_ANGLE = 1.0 * DEGREE
-#: Longest pause of the node in a drive, s: after it the base has stopped by itself, or turned on.
-_MAX_NODE_PAUSE = 1.0
+DRIVE_SAMPLE_TIMEOUT = 0.25  # s; likewise of a drive; four intervals of a slower gyro
+STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
+_MIN_TURN_ANGLE = 1.0 * DEGREE  # rad; least change of the odometry heading that shows a turn
+_MAX_NODE_PAUSE = 1.0  # s; after a longer one in a drive the base has stopped, or turned on
 
 ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '
                    'or set use_sim_time to false')
@@ -187,7 +180,7 @@ class Drive:
         now = self._clock.steady()
         pause, self._last_poll = now - self._last_poll, now
         if self.is_waiting(receivers):
-            return _NO_RECEIVER if now - self._start_time > DISCOVERY_TIMEOUT else ''
+            return _NO_RECEIVER if now - self._start_time > SAMPLE_TIMEOUT else ''
         if not receivers:
             return _NO_RECEIVER
         if is_ros_time_paused:
@@ -356,10 +349,9 @@ class CalibrationSession:
         """
         Send the next command of a drive, or end a run by its guards.
 
-        To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second, with
-        the parameters of the node, the number of other nodes that receive the commands, whether
-        ROS time has stood still for longer than `DRIVE_SAMPLE_TIMEOUT`, and why the samples cannot
-        be used, or ''.
+        To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second.
+        `receivers` is the number of other nodes that receive the commands, and `conflict` why the
+        samples cannot be used, or ''.
 
         """
         run, drive, now = self.run, self._drive, self._clock.steady()

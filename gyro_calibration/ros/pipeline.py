@@ -101,30 +101,21 @@ PARAMETERS = (
               'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
-#: Upper limit of ROS time, ns: `builtin_interfaces/Time` has 31 bits for seconds.
-_MAX_ROS_TIME = NSEC_PER_SEC << 31
-#: Silence after which the gyro may have been without power, s; its bias may have changed.
-_POWER_OFF_SILENCE = 10.0
-#: Averaging time of the rate that must be zero before a drive, s.
-_TURN_CHECK_DURATION = 0.5
-#: Largest angular acceleration of a turn between two samples, rad/s²: the default of Nav2's
-#: controllers.
-_MAX_ANGULAR_ACCELERATION = 3.2
-#: Largest step of the temperature that is used at once, K; a larger one must be confirmed by the
-#: next.
-_MAX_TEMPERATURE_STEP = 5.0
+_MAX_ROS_TIME = NSEC_PER_SEC << 31  # ns; `builtin_interfaces/Time` has 31 bits for seconds
+_POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
+_TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
+_MAX_ANGULAR_ACCELERATION = 3.2  # rad/s²; between two samples: the default of Nav2's controllers
+_MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
 #: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill.
 _MAX_HEADING_CHANGE_AT_REST = 1.0 * DEGREE
-#: Two jumps back of the stamps within this time, s, show several publishers.
-_INTERLEAVING_WINDOW = 1.0
+_INTERLEAVING_WINDOW = 1.0  # s; two jumps back of the stamps in it show several publishers
 
 
 class CorrectedSample(NamedTuple):
     """
     A corrected sample: stamp, ns, heading, rad, rate, rad/s, and their variances.
 
-    Where the noise of the gyro is unknown, the variance of the heading is that of an unmeasured
-    quantity, and the variance of the rate includes the assumed bias.
+    Where the noise of the gyro is unknown, the heading counts as not measured.
 
     """
 
@@ -305,13 +296,8 @@ class Pipeline:
         """
         Return a sample corrected, or None where it cannot be used.
 
-        Parameters
-        ----------
-        stamp : ns
-        output : rad/s
-        specific_force : along the input axis, m/s²; None if unknown
-        receivers : number of other nodes that receive cmd_vel
-        frame : of the gyro
+        The stamp is in ns, the output in rad/s, and the specific force along the input axis in
+        m/s²; `receivers` is the number of other nodes that receive cmd_vel.
 
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()

@@ -17,7 +17,6 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration.ros.calibration_session import (
-    DISCOVERY_TIMEOUT,
     Drive,
     ODOMETRY,
     REST,
@@ -331,14 +330,14 @@ def test_a_drive_waits_for_a_receiver_of_its_commands_for_5_s(tmp_path, comes):
     rig = rested(tmp_path, calibration_drive=True)
     rig.receivers, begin = 0, rig.clock.now
     assert not rig.begin()
-    rig.go(0.5 * DISCOVERY_TIMEOUT)
+    rig.go(0.5 * SAMPLE_TIMEOUT)
     assert rig.session.run.elapsed == 0.0 and not rig.ended
     rig.receivers = int(comes)
     success, message = rig.end(40.0)
     assert success == comes
     if not comes:
         assert 'no other node receives cmd_vel' in message
-        assert rig.clock.now - begin == pytest.approx(DISCOVERY_TIMEOUT, abs=0.1)
+        assert rig.clock.now - begin == pytest.approx(SAMPLE_TIMEOUT, abs=0.1)
 
 
 # After a drive
