@@ -10,14 +10,15 @@
 
 """The state files of a robot: what is read, kept and reported, through kills and a full disk."""
 
-import json
+import itertools
 import os
-from pathlib import Path
 import resource
+import signal
 import subprocess
 import sys
 from types import SimpleNamespace
 
+from gyro_calibration import files
 from gyro_calibration.files import open_replacement, remove_leftovers, write_atomically
 from gyro_calibration.heading.bias_table import MIN_WRITE_INTERVAL, Prior
 from gyro_calibration.model.gyro_model import SelfCalibration
@@ -118,17 +119,34 @@ def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path)
     assert not (tmp_path / 'biases.yaml').exists()
 
 
-@pytest.mark.parametrize('kills', [60, pytest.param(500, marks=pytest.mark.evidence)])
-def test_kills_leave_the_old_files_or_the_new_ones(tmp_path, kills):
-    """A process writes what the node writes, with the same code."""
-    command = [sys.executable, Path(__file__).parents[1] / 'killed_writer.py', tmp_path,
-               str(kills)]
-    found = json.loads(
-        subprocess.run(command, check=True, capture_output=True, timeout=300).stdout)
-    assert found['torn'] == 0 and found['hints'] == ''
-    assert min(*found['old'], *found['new'], found['half_written']) > kills / 50, (
-        f'kills too early or too late: {found}')
-    assert found['left'] == ['biases.yaml', 'calibration.yaml']
+def is_killed_at(number, write):
+    """Write in a child, and kill it before a line of files.py by its number in the run."""
+    child = os.fork()
+    if not child:
+        lines = itertools.count()
+
+        def trace(frame, *_):
+            if frame.f_code.co_filename != files.__file__:
+                return None
+            if next(lines) == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return trace
+        sys.settrace(trace)
+        write()
+        os._exit(0)
+    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+
+
+def test_a_kill_at_any_line_leaves_the_old_file_or_the_new_one(remember, tmp_path):
+    memory, found = remember(ONE), []
+    memory.store_calibration(SelfCalibration(0.01, 1e-3))
+    old = (tmp_path / 'calibration.yaml').read_bytes()
+    while is_killed_at(len(found),
+                       lambda: memory.store_calibration(SelfCalibration(0.02, 1e-3))):
+        found.append((tmp_path / 'calibration.yaml').read_bytes())
+        (tmp_path / 'calibration.yaml').write_bytes(old)
+    new = (tmp_path / 'calibration.yaml').read_bytes()
+    assert new != old and set(found) == {old, new}
 
 
 def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_is_not(tmp_path):
