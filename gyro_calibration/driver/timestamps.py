@@ -42,18 +42,18 @@ _Point = tuple[float, float]
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
 _WINDOW_BLOCKS = 64  # number of blocks in the window
-_SETTLING_DURATION = 2.0  # s; least span of a line before its period shows lost samples
+#: Least span of a line before its period shows lost samples, and time constant of the difference
+#: of two clocks, s.
+_SETTLING_DURATION = 2.0
 _SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
-_JITTER_DURATION = 10.0  # s; averaging time of the jitter
+#: Averaging time of the jitter, and time for which older stamps may come after a clock was set, s.
+_RECENT_DURATION = 10.0
 _MIN_LATENESS = 0.5e-3  # s; that proves a loss: the host may wake up later than before
 _OUTLIER_LATENESS = 0.02  # s; largest lateness with a correct sequence, above the 16 ms of a burst
 _MEDIAN_SIZE = 8  # number of intervals of a device whose median is the usual one
 _MAX_TIME_JUMP = 3.0  # s; largest continuous step of the time of a device
 _CLOCK_STEP_THRESHOLD = 0.1  # s; largest difference of a clock that is slewed, not set
-_MIXED_STAMPS_DURATION = 10.0  # s; for which older stamps may arrive after a clock was set
-_MAX_READING_DURATION = 0.05  # s; longest duration of a simultaneous reading of two clocks
-_DIFFERENCE_TIME_CONSTANT = 2.0  # s; time constant of the difference of two clocks
 
 
 class LowerLine:
@@ -67,14 +67,9 @@ class LowerLine:
 
     def __init__(self, slope: float):
         self.slope = slope
-        self._points: deque[_Point] = deque(maxlen=_WINDOW_BLOCKS)
+        self.points: deque[_Point] = deque(maxlen=_WINDOW_BLOCKS)
         self._anchor = (0.0, 0.0)
         self._begin, self._block_begin = 0.0, -math.inf
-
-    @property
-    def is_known(self) -> bool:
-        """Whether there is a point."""
-        return bool(self._points)
 
     def value_at(self, x: float) -> float:
         """Return the height of the line."""
@@ -82,31 +77,31 @@ class LowerLine:
 
     def time_span(self) -> float:
         """Return the height of the last point above the first one ever added."""
-        return self._points[-1][1] - self._begin if self._points else 0.0
+        return self.points[-1][1] - self._begin if self.points else 0.0
 
     def add(self, x: float, y: float) -> None:
         """Add a point that is not lower than the one before; x is larger than before."""
-        if not self._points:
+        if not self.points:
             self._begin, self._anchor = y, (x, y)
         if y - self._block_begin >= _LINE_WINDOW / _WINDOW_BLOCKS:
-            self._points.append((x, y))
+            self.points.append((x, y))
             self._block_begin = y
-        elif y - self.slope * x <= self._points[-1][1] - self.slope * self._points[-1][0]:
-            self._points[-1] = (x, y)
+        elif y - self.slope * x <= self.points[-1][1] - self.slope * self.points[-1][0]:
+            self.points[-1] = (x, y)
         else:
             return
         self._fit()
 
     def shift(self, start: float, offset: float) -> None:
         """Shift the points from a height on along x, and drop points that they overtake."""
-        moved = [(x + offset, y) for x, y in self._points if y >= start]
+        moved = [(x + offset, y) for x, y in self.points if y >= start]
         first = moved[0][0] if moved else math.inf
-        kept = [(x, y) for x, y in self._points if y < start and x < first]
-        self._points = deque([*kept, *moved], _WINDOW_BLOCKS)
+        kept = [(x, y) for x, y in self.points if y < start and x < first]
+        self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
     def _fit(self) -> None:
-        hull = _lower_hull(self._points)
-        middle = sum(x for x, _ in self._points) / len(self._points)
+        hull = _lower_hull(self.points)
+        middle = sum(x for x, _ in self.points) / len(self.points)
         left, right = next((edge for edge in pairwise(hull) if edge[1][0] >= middle),
                            (hull[-1], None))
         self._anchor = left
@@ -287,7 +282,7 @@ class SampleClock:
 
     def _max_advance(self, number: float, arrival: float) -> float:
         """Return the largest advance from a number to a sample that has arrived."""
-        if not self._line.is_known:
+        if not self._line.points:
             return math.inf
         margin = 0.5 * max(self.period, _MIN_LATENESS) if self.is_settled else _OUTLIER_LATENESS
         left = (arrival + margin - self._line.value_at(number)) / self._line.slope
@@ -345,7 +340,7 @@ class SampleClock:
 
     def _make_increasing(self, stamps: list[float], arrival: float) -> list[float]:
         first, last = (arrival - stamp + self._slew_offset for stamp in (stamps[0], stamps[-1]))
-        weight = min(1.0, len(stamps) * self.period / _JITTER_DURATION)
+        weight = min(1.0, len(stamps) * self.period / _RECENT_DURATION)
         # mean square of a lateness that is linear from the first sample to the last
         late, (before, after) = ((first * first + first * last + last * last) / 3.0,
                                  self._mean_squares)
@@ -372,7 +367,7 @@ def read_clock_pair(steady_clock: Callable[[], float],
     for _ in range(5):
         before, value = steady_clock(), other_clock()
         after = steady_clock()
-        if after - before <= _MAX_READING_DURATION:
+        if after - before <= 0.5 * _CLOCK_STEP_THRESHOLD:
             return 0.5 * (before + after), value
     return None
 
@@ -420,7 +415,7 @@ class NodeTimeConverter:
         step = self.steps.update(steady_time, node_time)
         error = node_time - steady_time - self._difference
         if not step and abs(error) <= _CLOCK_STEP_THRESHOLD:
-            self._difference += min(1.0, elapsed / _DIFFERENCE_TIME_CONSTANT) * error
+            self._difference += min(1.0, elapsed / _SETTLING_DURATION) * error
             return 0.0
         if was_set_back:
             self._last_stamp = -math.inf
@@ -450,7 +445,7 @@ class HostTimeConverter:
     def update(self, steady_time: float, date: float) -> float:
         """Take the times of both clocks, s; return the step of the date."""
         self._recent_steps = [each for each in self._recent_steps
-                              if steady_time - each[1] <= _MIXED_STAMPS_DURATION]
+                              if steady_time - each[1] <= _RECENT_DURATION]
         step = self.steps.update(steady_time, date)
         if step:
             self._recent_steps.append((step, steady_time))

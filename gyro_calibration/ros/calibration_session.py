@@ -101,8 +101,7 @@ class CalibrationRun:
         self.times.append(time)
         self.outputs.append(output)
         self.rates.append(rate)
-        if temperature is not None:
-            self.temperatures.append(temperature)
+        self.temperatures += [] if temperature is None else [temperature]
 
     def finish(self) -> str:
         """End the motion now; return the remaining instruction for the user."""
