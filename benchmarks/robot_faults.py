@@ -37,12 +37,13 @@ import time
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import TwistStamped  # noqa: E402
 from processes import apart, end, node_command  # noqa: E402
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from robot import now, Robot, RosRobot, SecondCommander  # noqa: E402
+from robot import now, Robot, RosRobot  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -84,6 +85,27 @@ HEADER = ['fault', 'turned after it, deg', 'zero commanded after, s',
 
 def _short(text, most=150):
     return ' '.join(text.split())[:most].replace('|', '/')
+
+
+class SecondCommander:
+    """Somebody else on cmd_vel at 20 Hz, who commands a rate, rad/s; None for nothing."""
+
+    def __init__(self, node):
+        self.rate, self._publisher = None, node.create_publisher(TwistStamped, 'cmd_vel', 10)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        while not self._stop.wait(0.05):
+            if self.rate is not None:
+                message = TwistStamped()
+                message.twist.angular.z = self.rate
+                self._publisher.publish(message)
+
+    def close(self):
+        self._stop.set()
+        self._thread.join()
 
 
 class Stage:

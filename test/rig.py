@@ -19,9 +19,8 @@ is what the compensation node does in the interval of one sample.
 import math
 
 from gyro_calibration.ros.calibration_session import PROFILE
-from gyro_calibration.ros.parameters import parameter_values
+from gyro_calibration.ros.inputs import parameter_values, Velocity
 from gyro_calibration.ros.pipeline import PARAMETERS, Pipeline
-from gyro_calibration.ros.wheels import Velocity
 from robot import INTERVAL, Robot
 
 BEGIN = 1_700_000_000  # s since 1970
@@ -30,19 +29,11 @@ MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 1.0e-4}\n'
 
 
 class StepClock:
-    """
-    The clocks of a node, stepped by a test.
-
-    Attributes
-    ----------
-    now : steady clock, s
-    set_by : what somebody set the clock of the host by, s
-    ros : time of a simulation, s; None where there is none
-
-    """
+    """The clocks of a node, stepped by a test; `ros` is the time of a simulation, s."""
 
     def __init__(self, ros=None):
-        self.now, self.set_by, self.ros = 1000.0, 0.0, ros
+        self.now, self.ros = 1000.0, ros
+        self.set_by = 0.0  # what somebody set the clock of the host by, s
 
     def steady(self):
         return self.now
@@ -58,40 +49,24 @@ class Rig:
     """
     A pipeline, a robot that obeys its commands, and what comes out.
 
-    Parameters
-    ----------
-    folder : where model and calibration are kept
-    model : text of the model file; '' for none
-    robot : Robot, or None for one with the defaults
-    ros : begin of a simulation, s, whose time the stamps follow
-    calibration_file : pathlib.Path, or None for one in the folder
-    **parameters
-        Of the node; ``calibration_drive=True`` stands for ``calibration.drive``.
-
-    Attributes
-    ----------
-    pipeline, clock, robot
-    commands : list of (time, rate), s of the steady clock and rad/s
-    outputs : list of what `Pipeline.sample` returned, without None
-    truth : dict of the true heading, rad, by stamp, ns
-    publishers : list of names; who publishes the samples
-    receivers, callers : other nodes that receive cmd_vel, and clients of the service that
-        calibrates
-    ros_speed : seconds of the simulation in one second; 0 while it stands
-    speed : seconds of the robot and of the simulation in one second of the steady clock
-    other : what somebody else commands at 20 Hz, rad/s
-    fed : stamp of the last sample of `feed`, ns
+    The model is the text of its file, '' for none; stamps follow a simulation that begins at
+    `ros`, s. Of the parameters of the node ``calibration_drive=True`` is ``calibration.drive``.
 
     """
 
     def __init__(self, folder, model=MODEL, robot=None, ros=None, calibration_file=None,
                  **parameters):
         self.clock, self.robot = StepClock(ros), robot or Robot()
-        self.commands, self.outputs, self.truth = [], [], {}
-        self.publishers, self.receivers, self.ros_speed, self.other = (
-            ['/driver_node'], 1, 1.0, None)
-        self.callers = 1
-        self.fed, self._steps, self._stamp, self._echoes = BEGIN * NSEC_PER_SEC, 0, 0, []
+        self.commands = []  # time of the steady clock, s, and rate, rad/s
+        self.outputs = []  # what `Pipeline.add_sample` returned, without None
+        self.truth = {}  # true heading, rad, by stamp, ns
+        self.publishers = ['/driver_node']  # who publishes the samples
+        self.receivers = self.callers = 1  # of cmd_vel, and clients that calibrate
+        self.ros_speed = 1.0  # seconds of the simulation in one second; 0 while it stands
+        self.speed = 1.0  # seconds of robot and simulation in one second of the steady clock
+        self.other = None  # what somebody else commands at 20 Hz, rad/s
+        self.fed = BEGIN * NSEC_PER_SEC  # stamp of the last sample of `feed`, ns
+        self._steps, self._stamp, self._echoes, self._timers = 0, 0, [], {}
         if model:
             (folder / 'model.yaml').write_text(model)
             parameters = {'model_file': str(folder / 'model.yaml'), **parameters}
@@ -100,7 +75,6 @@ class Rig:
         self.calibration_file = calibration_file or folder / 'calibration.yaml'
         self.pipeline = Pipeline(parameter_values(PARAMETERS, self._given), self.calibration_file,
                                  self.clock, self._send)
-        self._timers, self.speed = {}, 1.0
         self.session, self.journal = self.pipeline.session, self.pipeline.journal
 
     def _send(self, rate):
@@ -175,20 +149,10 @@ class Rig:
 
     def feed(self, outputs, interval=INTERVAL, temperature=None, force=None, moving=None):
         """
-        Play outputs of a gyro, rad/s, without the robot.
+        Play outputs of a gyro, rad/s, without the robot; return what came out for each.
 
-        Parameters
-        ----------
-        outputs : sequence of float
-        interval : between samples, s
-        temperature : sequence of float, float or None
-            With each sample, degC.
-        force : specific force along the input axis, m/s²
-        moving : rate that odometry shows, rad/s
-
-        Returns
-        -------
-        list of what came out for each sample
+        The temperature, degC, may be one or one a sample; `moving` is the rate that odometry
+        shows, rad/s.
 
         """
         found = []

@@ -39,41 +39,22 @@ STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 @dataclass(frozen=True)
 class Reading:
-    """
-    What the robot reports after a step.
+    """What the robot reports after a step."""
 
-    Attributes
-    ----------
-    stamp : time of sample and odometry, s
-    output : rate that the gyro reports, rad/s; None while it is unplugged
-    heading, rate : odometry: heading, rad, not wrapped, and yaw rate, rad/s
-
-    """
-
-    stamp: float
-    output: float | None
-    heading: float
-    rate: float
+    stamp: float  # of sample and odometry, s
+    output: float | None  # rate that the gyro reports, rad/s; None while it is unplugged
+    heading: float  # by odometry, rad, not wrapped
+    rate: float  # by odometry, rad/s
 
 
 class Robot:
     """
     A base that follows commands late, and a gyro on it.
 
-    Parameters
-    ----------
-    scale_factor_error, bias, noise : errors of the gyro: 1, rad/s, and rad/s (standard deviation
-        of a sample)
-    latency, lag : time until a command acts, and time constant of the drives, s
-    timeout : the base stops when it has heard no command for so long, s
-    stamp : stamp of the start, s
-
-    Attributes
-    ----------
-    time : since the start, s
-    heading, rate : the truth, rad and rad/s
-    unplugged, stamps_stand, deaf : set by a test: the gyro is silent; stamps do not go on; the
-        base ignores commands and keeps on doing what it did last
+    Errors of the gyro are in 1 and rad/s; the noise is the standard deviation of a sample. A
+    command acts after the latency, with the time constant `lag` of the drives, s; the base stops
+    when it has heard none for the timeout, s. A test sets that the gyro is `unplugged`, that
+    `stamps_stand`, or that the base is `deaf`: it goes on with what it did last.
 
     """
 
@@ -113,39 +94,15 @@ class Robot:
         return Reading(self._stamp, None if self.unplugged else output, self.heading, self.rate)
 
 
-@dataclass(frozen=True)
-class Moment:
-    """The true heading, rad, at one time of the steady clock, s."""
-
-    time: float
-    heading: float
-
-
 class RosRobot:
     """
     A `Robot` on topics: cmd_vel in; odom, imu/data_raw and, if it is simulated, /clock out.
 
-    A thread steps it by the steady clock. Callbacks come in the thread of the node's executor.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Its executor is spun by the caller.
-    robot : Robot
-    speed : simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and
-        stamps are those of the node's clock
-    stamped : commands are TwistStamped
-
-    Attributes
-    ----------
-    commands : list of (time, rate)
-        Everything that came on cmd_vel, by the steady clock, s and rad/s.
-    headings : true heading, rad, by the stamp of the sample, ns
-    moments : list of Moment
-        The truth at each step.
-    clock_absent, clock_stands : set by a test: /clock is not published; or no more, and stamps
-        stand. The base goes on
-    also : called with each Imu message after it was published: a second driver
+    A thread steps it by the steady clock; the executor of the node is spun by the caller. `speed`
+    is that of /clock, which stamps follow; None for stamps by the node's clock. `commands` are
+    those that came, with their times, `headings` the true ones by the stamp, ns, and `moments` by
+    the steady clock. A test sets `clock_absent` or `clock_stands`, with the stamps; `also` is
+    called with each Imu message: a second driver.
 
     """
 
@@ -179,7 +136,7 @@ class RosRobot:
                 self._publish(self.robot.step())
 
     def _publish(self, reading):
-        self.moments.append(Moment(now(), reading.heading))
+        self.moments.append((now(), reading.heading))
         stamp = self._stamp(reading)
         self.headings[stamp] = reading.heading
         header = {'sec': stamp // 10 ** 9, 'nanosec': stamp % 10 ** 9}
@@ -212,7 +169,7 @@ class RosRobot:
 
     def turned_since(self, since):
         """Return the angle turned since a time of the steady clock, rad, in either direction."""
-        after = [moment.heading for moment in self.moments if moment.time >= since]
+        after = [heading for time_, heading in self.moments if time_ >= since]
         return sum(abs(b - a) for a, b in zip(after, after[1:]))
 
     def close(self):
@@ -227,31 +184,3 @@ def _set(header, stamp, frame):
 def now():
     """Return the steady clock, s."""
     return time.clock_gettime(STEADY)
-
-
-class SecondCommander:
-    """
-    Somebody else on cmd_vel at 20 Hz: a soft stop (rate 0) or teleop, as TwistStamped.
-
-    Attributes
-    ----------
-    rate : what it commands, rad/s; None for nothing
-
-    """
-
-    def __init__(self, node):
-        self.rate, self._publisher = None, node.create_publisher(TwistStamped, 'cmd_vel', 10)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self):
-        while not self._stop.wait(0.05):
-            if self.rate is not None:
-                message = TwistStamped()
-                message.twist.angular.z = self.rate
-                self._publisher.publish(message)
-
-    def close(self):
-        self._stop.set()
-        self._thread.join()

@@ -72,14 +72,12 @@ class SimulatedRobot:
     A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model.
 
     Where this process is delayed, the samples are late, but the robot has turned meanwhile as
-    commanded. Each phase has its own noise, so that the noise of a seed does not depend on the
-    beginning of a phase.
+    commanded.
 
     """
 
     model: GyroModel
-    phase_noise: list[Array]  # of each phase (start, each attempt to calibrate, drive), rad/s
-    phase: int = 0
+    noise: Array  # of each sample, rad/s
     #: Not yet applied, each with the time of its receipt, s, and the rate, rad/s.
     commands: deque[tuple[float, float]] = field(default_factory=deque)
     #: Of each sample the time by the clock of this machine, s, and the true heading, rad.
@@ -88,9 +86,7 @@ class SimulatedRobot:
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
         command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
-        noises = (noise for phase, values in enumerate(self.phase_noise) for noise in values
-                  if self.phase <= phase)
-        for number, noise in enumerate(noises):
+        for number, noise in enumerate(self.noise):
             due = begin + number * SAMPLE_INTERVAL
             time.sleep(max(0.0, due - time.monotonic()))
             while self.commands and self.commands[0][0] <= due:
@@ -208,10 +204,8 @@ def run_demo(out: Path, seed: int) -> Answer:
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
                       ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     write_model(model_file, GyroModel(noise=XV3500.noise))  # only the noise of the gyro is known
-    generator = np.random.default_rng(seed)
-    start, run, drive = (simulate_noise(XV3500.noise, 6000, SAMPLE_INTERVAL, generator)
-                         for _ in range(3))
-    robot = SimulatedRobot(XV3500.model, [start, *[run] * MAX_ATTEMPTS, drive])
+    robot = SimulatedRobot(XV3500.model, simulate_noise(
+        XV3500.noise, 30000, SAMPLE_INTERVAL, np.random.default_rng(seed)))
     with ExitStack() as stack:
         stack.enter_context(Emulator(find_protocol(PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))
@@ -223,11 +217,11 @@ def run_demo(out: Path, seed: int) -> Answer:
         stack.callback(rclpy.try_shutdown)
         client = DemoClient(robot)
         stack.callback(client.close)
-        begin = _calibrate_and_drive(client, robot)
+        begin = _calibrate_and_drive(client)
     return _evaluate(out, robot, client, begin, seed)
 
 
-def _calibrate_and_drive(client: DemoClient, robot: SimulatedRobot) -> float:
+def _calibrate_and_drive(client: DemoClient) -> float:
     """Calibrate and drive; return the time at which the drive began, s."""
     total = round(CALIBRATION_MOTION.duration + 4.0 + DRIVE_MOTION.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
@@ -240,10 +234,9 @@ def _calibrate_and_drive(client: DemoClient, robot: SimulatedRobot) -> float:
                               'programs, and run the demo again')
             time.sleep(0.02)
         bar.set_description('calibrating on the motion profile')
-        calibrate(client, robot, bar)
+        calibrate(client, bar)
         client.call_service('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
-        robot.phase = len(robot.phase_noise) - 1
         begin, started = time.time(), time.monotonic()
         while (elapsed := time.monotonic() - started) < DRIVE_MOTION.duration:
             client.command_rate(float(DRIVE_MOTION.rate_at(np.array(elapsed))))
@@ -253,10 +246,9 @@ def _calibrate_and_drive(client: DemoClient, robot: SimulatedRobot) -> float:
     return begin
 
 
-def calibrate(client: DemoClient, robot: SimulatedRobot, bar: tqdm) -> None:
+def calibrate(client: DemoClient, bar: tqdm) -> None:
     """Calibrate; a refused run is repeated, since this robot turns late on a busy machine."""
     for attempt in range(1, MAX_ATTEMPTS + 1):
-        robot.phase = attempt
         try:
             client.call_service('compensation_node/calibrate', 60.0, lambda: _wait(bar, 0.2))
             return

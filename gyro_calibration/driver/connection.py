@@ -19,6 +19,7 @@ the caller.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 import errno
 import glob
@@ -29,7 +30,7 @@ import select
 from statistics import fmean
 import termios
 import threading
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from gyro_calibration.driver.protocols import (
     AUTO,
@@ -44,8 +45,6 @@ from gyro_calibration.driver.protocols import (
 )
 from gyro_calibration.driver.timestamps import read_steady_clock, SampleClock
 import serial
-
-_Result = TypeVar('_Result')
 
 _REMEDIES = {
     errno.ENOENT: 'it does not exist: plug the gyro in, or set another port',
@@ -90,7 +89,7 @@ class SerialPort:
 
     def read(self) -> bytes:
         """Return the available bytes; wait for the first one up to the timeout."""
-        def read_available(port: serial.Serial) -> bytes:
+        with self._open_port() as port:
             # read of pyserial returns the first byte alone, and needs two more calls for the rest
             if not select.select([port], [], [], self._timeout)[0]:
                 return b''
@@ -99,21 +98,16 @@ class SerialPort:
                 raise OSError(errno.EIO, 'end of file')
             return data
 
-        return self._call_port(read_available)
-
     def write(self, data: bytes) -> None:
         """Send bytes to the device."""
-        self._call_port(lambda port: port.write(data))
+        with self._open_port() as port:
+            port.write(data)
 
     def set_baud(self, baud: int) -> None:
         """Change the baud rate and discard input, without opening the port again."""
-        self.baud = baud
-
-        def change(port: serial.Serial) -> None:
-            port.baudrate = baud
+        with self._open_port() as port:
+            self.baud = port.baudrate = baud
             port.reset_input_buffer()
-
-        self._call_port(change)
 
     def close(self) -> None:
         """Close the port, if it is open."""
@@ -121,11 +115,12 @@ class SerialPort:
         if port is not None:
             port.close()
 
-    def _call_port(self, action: Callable[[serial.Serial], _Result]) -> _Result:
+    @contextmanager
+    def _open_port(self) -> Iterator[serial.Serial]:
         if self._port is None:
             raise PortError(f'{self.path} is not open: open it first')
         try:
-            return action(self._port)
+            yield self._port
         except (OSError, ValueError, termios.error) as error:
             self.close()
             raise PortError(f'lost {self.path}: {_describe_error(error)}') from error
@@ -144,11 +139,14 @@ def _describe_error(error: BaseException) -> str:
 
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
 _SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
-_REOPEN_DELAYS = (0.1, 5.0)  # s; first and longest delay before a lost port is opened again
-_RESTART_DURATION = 5.0  # s; longest silence of a board that restarts when its port is opened
-_REQUEST_INTERVAL = 0.8  # s; of requests to send: a gyro that starts does not receive them
-_LISTENING_DURATION = 1.0  # s; listening time, in which a gyro of 10 Hz sends enough
-_RECOGNITION_INTERVAL = 0.1  # s; interval of attempts to recognize the protocol
+#: Longest silence of a board that restarts when its port is opened, and longest delay before a
+#: lost port is opened again, s.
+_RESTART_DURATION = 5.0
+#: Interval of attempts to recognize the protocol, and first delay before a port is reopened, s.
+_ATTEMPT_INTERVAL = 0.1
+#: Listening time at a baud, s, in which a gyro of 10 Hz sends enough; and interval of requests to
+#: send, since a gyro that starts does not receive them.
+_LISTENING_DURATION = 1.0
 
 
 @dataclass(frozen=True)
@@ -220,15 +218,6 @@ class Connection:
     clock : returns seconds of a steady clock
     make_port : makes a `SerialPort` of a path and a baud
 
-    Attributes
-    ----------
-    protocol, clock, baud : None and 0 until the protocol is known
-    path : the device of the port when it was last opened, links resolved
-    detected : result of the recognition by listening, in a sentence
-    open_count : number of times that the port was opened
-    waited_duration : total waiting time for the port, s
-    longest_gap : longest time between two samples, s; 0 while none exceeds 1.5 periods
-
     Raises
     ------
     ValueError : the protocol is unknown, or settings that it needs are missing
@@ -244,15 +233,18 @@ class Connection:
         self._bauds = (baud,) if baud else BAUDS
         self._on_change, self._read_clock, self._make_port = on_change, clock, make_port
         self.state = ConnectionState('opening')
-        self.protocol: Protocol | None = None
+        self.protocol: Protocol | None = None  # until it is known
         self.clock: SampleClock | None = None
         self._decoder: Decoder | None = None
         self._port: SerialPort | None = None
         self._last_stamp = -math.inf
         self._previous_counts, self._samples, self._reopen_delay, self._read_bytes = (
-            ConnectionCounts(), 0, _REOPEN_DELAYS[0], 0)
-        self.baud, self.path, self.detected, self.last_error = 0, '', '', ''
-        self.open_count, self.waited_duration, self.longest_gap = 0, 0.0, 0.0
+            ConnectionCounts(), 0, _ATTEMPT_INTERVAL, 0)
+        self.baud, self.last_error = 0, ''
+        self.path = ''  # the device of the port when it was last opened, links resolved
+        self.detected = ''  # result of the recognition by listening, in a sentence
+        self.open_count, self.waited_duration = 0, 0.0  # s
+        self.longest_gap = 0.0  # between two samples, s; 0 while none exceeds 1.5 periods
         self._is_auto = protocol == AUTO
         if not self._is_auto:
             try:
@@ -289,7 +281,7 @@ class Connection:
                     begin = self._read_clock()
                     stop.wait(self._reopen_delay)
                     self.waited_duration += self._read_clock() - begin
-                    self._reopen_delay = min(2.0 * self._reopen_delay, _REOPEN_DELAYS[1])
+                    self._reopen_delay = min(2.0 * self._reopen_delay, _RESTART_DURATION)
         finally:
             self._close()
 
@@ -356,7 +348,7 @@ class Connection:
                 self._report_or_raise(self._no_data_message(_SILENCE_TIMEOUT), deadline)
             if data and now >= due:
                 recognition = recognize_protocol(data, self._settings)
-                due, end = now + _RECOGNITION_INTERVAL, min(end, now + _LISTENING_DURATION)
+                due, end = now + _ATTEMPT_INTERVAL, min(end, now + _LISTENING_DURATION)
                 if recognition.protocol is not None or now >= end:
                     return recognition
         return recognize_protocol(b'', self._settings)
@@ -384,7 +376,7 @@ class Connection:
                 yield self._make_chunk(samples, now)
                 received, begin, counts = received + len(samples), now, []
                 continue
-            if not received and now - last_request >= _REQUEST_INTERVAL:
+            if not received and now - last_request >= _LISTENING_DURATION:
                 assert self.protocol is not None
                 port.write(self.protocol.startup)
                 last_request = now
@@ -436,7 +428,7 @@ class Connection:
                 self.longest_gap = longest
         self._samples, self._last_stamp = self._samples + len(samples), stamps[-1]
         if self.state.name != 'reading':
-            self._reopen_delay = _REOPEN_DELAYS[0]
+            self._reopen_delay = _ATTEMPT_INTERVAL
             self._set_state(ConnectionState('reading'))
         return Chunk(samples, stamps, arrival)
 

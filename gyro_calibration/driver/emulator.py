@@ -18,10 +18,9 @@ read and ignored.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 import contextlib
 from dataclasses import replace
-import math
 import os
 from pathlib import Path
 import select
@@ -43,7 +42,7 @@ class Emulator:
     Use it as a context manager, which sends from a thread of its own, or call `emulate`, which
     sends until the samples end. Each sample is taken from the source after the one before it was
     sent, so a source may be endless and may depend on commands. The first sample is sent at once.
-    Above 2 kHz a few samples are sent together. Samples without a sequence are numbered from 0 on.
+    Samples without a sequence are numbered from 0 on.
 
     Parameters
     ----------
@@ -60,9 +59,6 @@ class Emulator:
     FileExistsError : the path of the link exists and is not a link
 
     """
-
-    #: s; samples due within this time are written together, since waits are not shorter
-    _BATCH_DURATION = 0.0005
 
     def __init__(self, protocol: Protocol, samples: Iterable[Sample],
                  settings: Settings | None = None, speed: float = 1.0,
@@ -100,7 +96,18 @@ class Emulator:
                 pass
             self._stop.wait(_SETTLING_DELAY)
         self._send(self._protocol.preamble)
-        self._send_in_time()
+        encode, start, begin = self._protocol.encoder(self._settings), time.monotonic(), None
+        for number, sample in enumerate(self._samples):
+            if sample.time is None:
+                raise ValueError('a sample has no time at which to send it: set Sample.time in '
+                                 'seconds')
+            due = sample.time / self._speed
+            begin = due if begin is None else begin
+            wait = start + due - begin - time.monotonic()
+            if self._stop.wait(wait) if wait > 0.0 else self._stop.is_set():
+                return
+            self._send(encode(sample if sample.sequence is not None
+                              else replace(sample, sequence=number)))
         if self.has_reader():
             self._stop.wait(_LINGER_DURATION)
 
@@ -144,35 +151,6 @@ class Emulator:
         temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
         os.symlink(self.path, temporary)
         os.replace(temporary, self.link)
-
-    def _timed_frames(self) -> Iterator[tuple[float, bytes]]:
-        """Give the time of each sample after the first, s by the host clock, and its bytes."""
-        begin, encode = None, self._protocol.encoder(self._settings)
-        for number, sample in enumerate(self._samples):
-            if sample.time is None:
-                raise ValueError('a sample has no time at which to send it: set Sample.time in '
-                                 'seconds')
-            due = sample.time / self._speed
-            begin = due if begin is None else begin
-            if sample.sequence is None:
-                sample = replace(sample, sequence=number)
-            yield due - begin, encode(sample)
-
-    def _send_in_time(self) -> None:
-        """Send each sample at its time, or with others that are due at once."""
-        start, pending, sent = time.monotonic(), b'', -math.inf
-        for due, data in self._timed_frames():
-            if pending and start + due > time.monotonic():
-                self._send(pending)
-                pending, sent = b'', time.monotonic()
-            wait = max(start + due, sent + self._BATCH_DURATION) - time.monotonic()
-            if self._stop.wait(wait if start + due > time.monotonic() else 0.0):
-                return
-            pending += data
-            if time.monotonic() >= sent + self._BATCH_DURATION:
-                self._send(pending)
-                pending, sent = b'', time.monotonic()
-        self._send(pending)
 
     def _send(self, data: bytes) -> None:
         while data and not self._stop.is_set():

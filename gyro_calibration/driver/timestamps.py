@@ -42,18 +42,18 @@ _Point = tuple[float, float]
 _MIN_STAMP_STEP = 1e-6  # s; least step of stamps: the resolution of a double in seconds since 1970
 _LINE_WINDOW = 20.0  # s; of the line: 200 arrivals at 10 Hz, little drift of a warming clock
 _WINDOW_BLOCKS = 64  # number of blocks in the window
-_SETTLING_DURATION = 2.0  # s; least span of a line before its period shows lost samples
+#: Least span of a line before its period shows lost samples, and time constant of the difference
+#: of two clocks, s.
+_SETTLING_DURATION = 2.0
 _SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
-_JITTER_DURATION = 10.0  # s; averaging time of the jitter
+#: Averaging time of the jitter, and time for which older stamps may come after a clock was set, s.
+_RECENT_DURATION = 10.0
 _MIN_LATENESS = 0.5e-3  # s; that proves a loss: the host may wake up later than before
 _OUTLIER_LATENESS = 0.02  # s; largest lateness with a correct sequence, above the 16 ms of a burst
 _MEDIAN_SIZE = 8  # number of intervals of a device whose median is the usual one
 _MAX_TIME_JUMP = 3.0  # s; largest continuous step of the time of a device
 _CLOCK_STEP_THRESHOLD = 0.1  # s; largest difference of a clock that is slewed, not set
-_MIXED_STAMPS_DURATION = 10.0  # s; for which older stamps may arrive after a clock was set
-_MAX_READING_DURATION = 0.05  # s; longest duration of a simultaneous reading of two clocks
-_DIFFERENCE_TIME_CONSTANT = 2.0  # s; time constant of the difference of two clocks
 
 
 class LowerLine:
@@ -67,14 +67,9 @@ class LowerLine:
 
     def __init__(self, slope: float):
         self.slope = slope
-        self._points: deque[_Point] = deque(maxlen=_WINDOW_BLOCKS)
+        self.points: deque[_Point] = deque(maxlen=_WINDOW_BLOCKS)
         self._anchor = (0.0, 0.0)
         self._begin, self._block_begin = 0.0, -math.inf
-
-    @property
-    def is_known(self) -> bool:
-        """Whether there is a point."""
-        return bool(self._points)
 
     def value_at(self, x: float) -> float:
         """Return the height of the line."""
@@ -82,31 +77,31 @@ class LowerLine:
 
     def time_span(self) -> float:
         """Return the height of the last point above the first one ever added."""
-        return self._points[-1][1] - self._begin if self._points else 0.0
+        return self.points[-1][1] - self._begin if self.points else 0.0
 
     def add(self, x: float, y: float) -> None:
         """Add a point that is not lower than the one before; x is larger than before."""
-        if not self._points:
+        if not self.points:
             self._begin, self._anchor = y, (x, y)
         if y - self._block_begin >= _LINE_WINDOW / _WINDOW_BLOCKS:
-            self._points.append((x, y))
+            self.points.append((x, y))
             self._block_begin = y
-        elif y - self.slope * x <= self._points[-1][1] - self.slope * self._points[-1][0]:
-            self._points[-1] = (x, y)
+        elif y - self.slope * x <= self.points[-1][1] - self.slope * self.points[-1][0]:
+            self.points[-1] = (x, y)
         else:
             return
         self._fit()
 
     def shift(self, start: float, offset: float) -> None:
         """Shift the points from a height on along x, and drop points that they overtake."""
-        moved = [(x + offset, y) for x, y in self._points if y >= start]
+        moved = [(x + offset, y) for x, y in self.points if y >= start]
         first = moved[0][0] if moved else math.inf
-        kept = [(x, y) for x, y in self._points if y < start and x < first]
-        self._points = deque([*kept, *moved], _WINDOW_BLOCKS)
+        kept = [(x, y) for x, y in self.points if y < start and x < first]
+        self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
     def _fit(self) -> None:
-        hull = _lower_hull(self._points)
-        middle = sum(x for x, _ in self._points) / len(self._points)
+        hull = _lower_hull(self.points)
+        middle = sum(x for x, _ in self.points) / len(self.points)
         left, right = next((edge for edge in pairwise(hull) if edge[1][0] >= middle),
                            (hull[-1], None))
         self._anchor = left
@@ -129,20 +124,16 @@ def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
 
 
 class _SampleCounter:
-    """
-    Numbers samples in nominal periods; the usual advance is `mean_advance`.
-
-    By the sequence of the device, by its time, or by counting. The number may be wrong by a
-    multiple of `ambiguity` samples; `ambiguity` is 0 where the device gives its time.
-
-    """
+    """Numbers samples in nominal periods: by sequence or time of the device, or by counting."""
 
     def __init__(self, rate: float, modulus: int):
         self._rate, self._modulus = rate, modulus
         self.reset()
 
     def reset(self) -> None:
-        self.mean_advance, self.ambiguity = 1.0, 1
+        self.mean_advance = 1.0  # the usual one
+        #: Of how many samples the number may be wrong by a multiple; 0 by the time of the device.
+        self.ambiguity = 1
         self._advances = deque[float](maxlen=_MEDIAN_SIZE)
         self._sequence: int | None = None
         self._time: float | None = None
@@ -224,22 +215,12 @@ class SampleClock:
     Stamps samples; stamps increase strictly.
 
     Corrections by the line, see `LowerLine`, are slewed. A stamp jumps only where later arrivals
-    show that samples were lost. The nominal rate of the gyro is used for the first samples only:
-    its clock is 2 to 3 % off from unit to unit.
+    show that samples were lost. The nominal rate of the gyro, Hz, is used for the first samples
+    only: its clock is 2 to 3 % off from unit to unit. `modulus` is that of `Sample.sequence`, 0
+    without one, and `min_stamp` the last stamp of another clock.
 
-    Parameters
-    ----------
-    rate : nominal samples per second
-    modulus : modulus of `Sample.sequence`; 0 for a device without a sequence
-    min_stamp : lower limit of the stamps: the last stamp of another clock
-
-    Attributes
-    ----------
-    lost_count : samples lost so far while the port was open: missing in the sequence or in the
-        time of the device, damaged, or shown by the lateness of all later samples
-    period : fitted interval between samples, s
-    jitter : root mean squares over the last 10 s: lateness of samples, and deviation of stamps
-        from the line, s
+    `lost_count` are the samples lost while the port was open: missing in the sequence or in the
+    time of the device, damaged, or shown by the lateness of all later samples.
 
     """
 
@@ -265,7 +246,7 @@ class SampleClock:
 
     @property
     def jitter(self) -> tuple[float, float]:
-        """Root mean squares of lateness and of the deviation of stamps from the line, s."""
+        """Root mean squares over 10 s of lateness, and of stamps against the line, s."""
         return math.sqrt(self._mean_squares[0]), math.sqrt(self._mean_squares[1])
 
     def interrupt(self) -> None:
@@ -301,7 +282,7 @@ class SampleClock:
 
     def _max_advance(self, number: float, arrival: float) -> float:
         """Return the largest advance from a number to a sample that has arrived."""
-        if not self._line.is_known:
+        if not self._line.points:
             return math.inf
         margin = 0.5 * max(self.period, _MIN_LATENESS) if self.is_settled else _OUTLIER_LATENESS
         left = (arrival + margin - self._line.value_at(number)) / self._line.slope
@@ -359,7 +340,7 @@ class SampleClock:
 
     def _make_increasing(self, stamps: list[float], arrival: float) -> list[float]:
         first, last = (arrival - stamp + self._slew_offset for stamp in (stamps[0], stamps[-1]))
-        weight = min(1.0, len(stamps) * self.period / _JITTER_DURATION)
+        weight = min(1.0, len(stamps) * self.period / _RECENT_DURATION)
         # mean square of a lateness that is linear from the first sample to the last
         late, (before, after) = ((first * first + first * last + last * last) / 3.0,
                                  self._mean_squares)
@@ -386,7 +367,7 @@ def read_clock_pair(steady_clock: Callable[[], float],
     for _ in range(5):
         before, value = steady_clock(), other_clock()
         after = steady_clock()
-        if after - before <= _MAX_READING_DURATION:
+        if after - before <= 0.5 * _CLOCK_STEP_THRESHOLD:
             return 0.5 * (before + after), value
     return None
 
@@ -434,7 +415,7 @@ class NodeTimeConverter:
         step = self.steps.update(steady_time, node_time)
         error = node_time - steady_time - self._difference
         if not step and abs(error) <= _CLOCK_STEP_THRESHOLD:
-            self._difference += min(1.0, elapsed / _DIFFERENCE_TIME_CONSTANT) * error
+            self._difference += min(1.0, elapsed / _SETTLING_DURATION) * error
             return 0.0
         if was_set_back:
             self._last_stamp = -math.inf
@@ -464,7 +445,7 @@ class HostTimeConverter:
     def update(self, steady_time: float, date: float) -> float:
         """Take the times of both clocks, s; return the step of the date."""
         self._recent_steps = [each for each in self._recent_steps
-                              if steady_time - each[1] <= _MIXED_STAMPS_DURATION]
+                              if steady_time - each[1] <= _RECENT_DURATION]
         step = self.steps.update(steady_time, date)
         if step:
             self._recent_steps.append((step, steady_time))
@@ -477,15 +458,11 @@ class HostTimeConverter:
     def convert_sample(self, stamp: float, previous_time: float, usual_interval: float,
                        arrival_interval: float = 0.0) -> float:
         """
-        Return the time of a sample.
+        Return the time of a sample, s; all arguments are in s.
 
-        Parameters
-        ----------
-        stamp : seconds
-        previous_time : time of the previous sample, s; -inf for the first, which shows no step
-        usual_interval : interval, s; inf while it is not known
-        arrival_interval : time between their arrivals, s; it equals the jump of the stamps over a
-            gap, but not over a step of the clock
+        The previous time is -inf for the first sample, which shows no step, and the usual interval
+        inf while it is not known. Over a gap the jump of the stamps equals the time between their
+        arrivals, but not over a step of the clock.
 
         """
         if previous_time == -math.inf:

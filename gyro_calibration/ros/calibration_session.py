@@ -55,43 +55,26 @@ from gyro_calibration.model.motion import (
     read_motion,
 )
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros.clock import Clock, node_time, StampDelay
 from gyro_calibration.ros.health_monitor import describe_change, HealthMonitor
+from gyro_calibration.ros.inputs import Clock, node_time, StampDelay, Velocity
 from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
-#: Duration of the rest after whole turns, s.
-REST_AFTER_TURNS = 2.5
-#: Longest duration of a run that waits for `finish`, s.
-FINISH_TIMEOUT = 600.0
-#: Time without a sample after which a run without a drive ends, s.
+REST_AFTER_TURNS = 2.5  # s; duration of the rest after whole turns
+FINISH_TIMEOUT = 600.0  # s; longest duration of a run that waits for `finish`
+#: Time without a sample after which a run without a drive ends, and longest wait for a node that
+#: receives the commands, s; discovery may take 3 s.
 SAMPLE_TIMEOUT = 5.0
-#: Time without a sample after which a drive ends, s; four intervals of a slower gyro.
-DRIVE_SAMPLE_TIMEOUT = 0.25
-#: Longest wait for a node that receives the commands, s; discovery may take 3 s.
-DISCOVERY_TIMEOUT = 5.0
-#: Longest turn of the robot after the last command, s: latency and deceleration.
-STOPPING_DURATION = 1.5
-#: Least change of the odometry heading over a run that shows a turn, rad.
-_MIN_TURN_ANGLE = 1.0 * DEGREE
-#: Longest pause of the node in a drive, s: after it the base has stopped by itself, or turned on.
-_MAX_NODE_PAUSE = 1.0
+DRIVE_SAMPLE_TIMEOUT = 0.25  # s; likewise of a drive; four intervals of a slower gyro
+STOPPING_DURATION = 1.5  # s; longest turn after the last command: latency and deceleration
+_MIN_TURN_ANGLE = 1.0 * DEGREE  # rad; least change of the odometry heading that shows a turn
+_MAX_NODE_PAUSE = 1.0  # s; after a longer one in a drive the base has stopped, or turned on
 
 ROS_TIME_PAUSED = ('ROS time stands still: start or resume the simulation that publishes /clock, '
                    'or set use_sim_time to false')
 _NO_RECEIVER = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel to its '
                 'topic, or change cmd_vel_stamped')
-
-
-@dataclass(frozen=True)
-class AcceptanceRules:
-    """Criteria for accepting a run; with 0 `turns` the gyro determines their number."""
-
-    limits: RunLimits = RunLimits()
-    odometry: ReferenceErrors = ReferenceErrors()
-    turns: int = 0
 
 
 @dataclass
@@ -100,9 +83,11 @@ class CalibrationRun:
 
     kind: str  # PROFILE, ODOMETRY, TURNS or REST
     duration: float  # of the compared motion, s; inf until `finish`
-    rules: AcceptanceRules
     last_received: float  # time of the last sample, or of the request, s of the steady clock
     motion: Motion | None = None  # the profile
+    limits: RunLimits = RunLimits()
+    reference_errors: ReferenceErrors = ReferenceErrors()  # of odometry
+    turns: int = 0  # whole turns; with 0 the gyro determines their number
     end_reason: str | None = None  # reason of the end; '' where the samples are complete
     times: list[float] = field(default_factory=list)  # stamps, s
     outputs: list[float] = field(default_factory=list)  # rad/s
@@ -116,8 +101,7 @@ class CalibrationRun:
         self.times.append(time)
         self.outputs.append(output)
         self.rates.append(rate)
-        if temperature is not None:
-            self.temperatures.append(temperature)
+        self.temperatures += [] if temperature is None else [temperature]
 
     def finish(self) -> str:
         """End the motion now; return the remaining instruction for the user."""
@@ -140,9 +124,8 @@ class CalibrationRun:
     @property
     def extra_duration(self) -> float:
         """Return the duration of samples after the motion, s."""
-        limits = self.rules.limits
         return {REST: 0.0, TURNS: REST_AFTER_TURNS}.get(
-            self.kind, limits.max_time_offset + SETTLING_TIME + limits.rest_duration)
+            self.kind, self.limits.max_time_offset + SETTLING_TIME + self.limits.rest_duration)
 
     @property
     def max_duration(self) -> float:
@@ -196,7 +179,7 @@ class Drive:
         now = self._clock.steady()
         pause, self._last_poll = now - self._last_poll, now
         if self.is_waiting(receivers):
-            return _NO_RECEIVER if now - self._start_time > DISCOVERY_TIMEOUT else ''
+            return _NO_RECEIVER if now - self._start_time > SAMPLE_TIMEOUT else ''
         if not receivers:
             return _NO_RECEIVER
         if is_ros_time_paused:
@@ -302,12 +285,11 @@ class CalibrationSession:
         now = self._clock.steady()
         if drives and now - self._last_foreign_command < 1.0:
             return 'another node sends commands on cmd_vel: stop it, and run again'
-        rules = AcceptanceRules(
-            RunLimits(max_bias=values.calibration_maximum_bias),
+        self._start_time, self._is_silent, self.warning = node_time(self._clock), False, ''
+        self.run = CalibrationRun(
+            kind, duration, now, motion, RunLimits(max_bias=values.calibration_maximum_bias),
             ReferenceErrors(scale_deviation=values.calibration_odometry_scale_deviation),
             values.calibration_turns)
-        self._start_time, self._is_silent, self.warning = node_time(self._clock), False, ''
-        self.run = CalibrationRun(kind, duration, rules, now, motion)
         self._drive = Drive(self.run, motion, self._clock) if motion and drives else None
         self._monitor.restart()
         return ''
@@ -366,10 +348,9 @@ class CalibrationSession:
         """
         Send the next command of a drive, or end a run by its guards.
 
-        To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second, with
-        the parameters of the node, the number of other nodes that receive the commands, whether
-        ROS time has stood still for longer than `DRIVE_SAMPLE_TIMEOUT`, and why the samples cannot
-        be used, or ''.
+        To be called every `Drive.INTERVAL` while `is_driving`, else a few times per second.
+        `receivers` is the number of other nodes that receive the commands, and `conflict` why the
+        samples cannot be used, or ''.
 
         """
         run, drive, now = self.run, self._drive, self._clock.steady()
@@ -385,7 +366,7 @@ class CalibrationSession:
                           'to true and run again')
             if not drive.is_waiting(receivers):
                 usual = self._estimator.tracker.intervals.usual_interval
-                timeout = min(max(DRIVE_SAMPLE_TIMEOUT, 4.0 * usual), run.rules.limits.max_gap)
+                timeout = min(max(DRIVE_SAMPLE_TIMEOUT, 4.0 * usual), run.limits.max_gap)
                 is_driven = True
         # Decided at the second poll: after a pause of this process, queued samples are delivered
         # after its timers.
@@ -470,7 +451,7 @@ class CalibrationSession:
                 raise DataRefused(run.end_reason)
             return True, self._apply_calibration(run)
         except DataRefused as error:
-            late = (drive.describe_lateness(run.rules.limits)
+            late = (drive.describe_lateness(run.limits)
                     if drive and not run.end_reason else '')
             return False, f'{late} (the run shows: {error})' if late else str(error)
         except Exception as error:  # the robot stands; answer the caller and continue
@@ -515,8 +496,8 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
 
     """
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
-    limits, temperature = run.rules.limits, (float(np.mean(run.temperatures))
-                                             if run.temperatures else None)
+    limits = run.limits
+    temperature = float(np.mean(run.temperatures)) if run.temperatures else None
     if run.kind == REST:
         bias, deviation = calibrate_bias(time - time[0], rate, limits, noise, output)
         turned = 0.0  # rad; by the headings or the rates of odometry
@@ -531,7 +512,7 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
         return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), date, temperature,
                                'rest'), ''
     if run.kind == TURNS:
-        found = calibrate_turns(time - time[0], rate, run.rules.turns or None, limits, noise,
+        found = calibrate_turns(time - time[0], rate, run.turns or None, limits, noise,
                                 output=output)
         return (to_model_record(found.fit, 'turns', date, temperature),
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
@@ -539,7 +520,7 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     by_odometry, time = run.kind == ODOMETRY, time - begin
     inside = (time >= -limits.max_time_offset) & (time <= motion.duration + limits.max_time_offset)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
-                         reference=run.rules.odometry if by_odometry else None,
+                         reference=run.reference_errors if by_odometry else None,
                          output=output[inside], prior=prior)
     remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
     if fit.goodness:

@@ -39,7 +39,7 @@ from gyro_calibration.driver.timestamps import (
     read_steady_clock,
 )
 from gyro_calibration.logs.cdr import NOT_REPORTED_COVARIANCE, NSEC_PER_SEC, z_axis_covariance
-from gyro_calibration.ros.parameters import Parameter
+from gyro_calibration.ros.inputs import Parameter
 from gyro_calibration.ros.runner import (
     call_every,
     declare_parameters,

@@ -31,17 +31,14 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-#: Duration of a stretch, and of its parts in the test of steadiness, s.
-STRETCH_DURATION, _PART_DURATION = 10.0, 1.0
-#: Largest accepted ratio of the noise to that of the model; figures are inexact and change.
-_MAX_NOISE_RATIO = 1.25
-#: Largest accepted ratio of the noise of the model to the measured one: a filtered output has less
-#: noise in neighbouring blocks.
+STRETCH_DURATION, _PART_DURATION = 10.0, 1.0  # s; of a stretch, and of its parts that are compared
+_MAX_NOISE_RATIO = 1.25  # largest accepted one to the noise of the model; figures change
+#: Largest accepted ratio of the noise of the model to the measured one, 1: a filtered output has
+#: less noise in neighbouring blocks.
 _MAX_NOISE_REDUCTION = 3.0
-#: Least rate of a turn by odometry, rad/s.
-_MIN_TURN_RATE = 0.05
-#: Number of successive stretches that decide in an unannounced rest: a robot on a straight path
-#: may vibrate for some time.
+_MIN_TURN_RATE = 0.05  # rad/s; least rate of a turn by odometry
+#: Number of stretches in a row that decide in a rest that was not announced: a robot on a straight
+#: path may vibrate for some time.
 _DECIDING_STRETCHES = 3
 
 
@@ -111,14 +108,10 @@ class HealthMonitor:
 
     def __init__(self, noise: Noise, false_alarm_rate: float, standstill_rate: float = 0.0):
         """
-        Start without samples.
+        Start without samples; `noise` is that of the model.
 
-        Parameters
-        ----------
-        noise : of the model; without an angle random walk the monitor is off
-        false_alarm_rate : largest rate of false alarms at rest, 1/h; 0 switches the monitor off
-        standstill_rate : means below this, rad/s, are rest; one above may be a steady turn, and
-            counts only if it is the same in several stretches
+        The largest rate of false alarms at rest is in 1/h. Means below the standstill rate, rad/s,
+        are rest; one above may be a steady turn, and counts only if it stays in several stretches.
 
         """
         self._noise, self.standstill_rate = noise, standstill_rate
@@ -199,19 +192,11 @@ def examine_stretch(time: Array, output: Array, rate: Array, noise: Noise, level
 
     A coarsely quantized output does not show the noise: the tests allow for the error by rounding.
 
-    Parameters
-    ----------
-    time, output, rate : s and rad/s, shape (n,); the rate is after model and self-calibration
-    noise : of the model
-    level : probability of each of the four false alarms
-    step : quantization step of the output, rad/s; inf where the output never changed
-    bias_variance : of the bias by its calibration, (rad/s)²; nan where it is not known
-    age : of that calibration, s
-    is_announced : whether the rest was announced
-
-    Returns
-    -------
-    the result; None where the rate is not steady, samples are too few, or values are too large
+    Time, output and rate, after model and self-calibration, are in s and rad/s, of shape (n,); the
+    level is the probability of each of the four false alarms, the step that of the quantization,
+    rad/s, inf where the output never changed. The variance of the bias, (rad/s)², is that of its
+    calibration of an age in s, nan where it is not known. Return None where the rate is not
+    steady, samples are too few, or values are too large.
 
     """
     if max(np.abs(output).max(), np.abs(rate).max()) > MAX_MAGNITUDE:

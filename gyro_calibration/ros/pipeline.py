@@ -49,11 +49,19 @@ from gyro_calibration.ros.calibration_session import (
     REST,
     ROS_TIME_PAUSED,
 )
-from gyro_calibration.ros.clock import Clock, RosTime, StampDelay
 from gyro_calibration.ros.health_monitor import HealthMonitor, RepeatedOutputDetector
-from gyro_calibration.ros.parameters import Parameter
+from gyro_calibration.ros.inputs import (
+    Clock,
+    COMMAND,
+    MAX_VELOCITY_AGE,
+    ODOMETRY,
+    Parameter,
+    RosTime,
+    StampDelay,
+    Velocity,
+    Wheels,
+)
 from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.ros.wheels import COMMAND, MAX_VELOCITY_AGE, ODOMETRY, Velocity, Wheels
 
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
@@ -96,30 +104,21 @@ PARAMETERS = (
               'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
-#: Upper limit of ROS time, ns: `builtin_interfaces/Time` has 31 bits for seconds.
-_MAX_ROS_TIME = NSEC_PER_SEC << 31
-#: Silence after which the gyro may have been without power, s; its bias may have changed.
-_POWER_OFF_SILENCE = 10.0
-#: Averaging time of the rate that must be zero before a drive, s.
-_TURN_CHECK_DURATION = 0.5
-#: Largest angular acceleration of a turn between two samples, rad/s²: the default of Nav2's
-#: controllers.
-_MAX_ANGULAR_ACCELERATION = 3.2
-#: Largest step of the temperature that is used at once, K; a larger one must be confirmed by the
-#: next.
-_MAX_TEMPERATURE_STEP = 5.0
+_MAX_ROS_TIME = NSEC_PER_SEC << 31  # ns; `builtin_interfaces/Time` has 31 bits for seconds
+_POWER_OFF_SILENCE = 10.0  # s; the gyro may have been without power, and its bias have changed
+_TURN_CHECK_DURATION = 0.5  # s; averaging time of the rate that must be zero before a drive
+_MAX_ANGULAR_ACCELERATION = 3.2  # rad/s²; between two samples: the default of Nav2's controllers
+_MAX_TEMPERATURE_STEP = 5.0  # K; a larger one must be confirmed by the next temperature
 #: Change of the odometry heading at zero rate, rad, after which odometry does not show standstill.
 _MAX_HEADING_CHANGE_AT_REST = 1.0 * DEGREE
-#: Two jumps back of the stamps within this time, s, show several publishers.
-_INTERLEAVING_WINDOW = 1.0
+_INTERLEAVING_WINDOW = 1.0  # s; two jumps back of the stamps in it show several publishers
 
 
 class CorrectedSample(NamedTuple):
     """
     A corrected sample: stamp, ns, heading, rad, rate, rad/s, and their variances.
 
-    Where the noise of the gyro is unknown, the variance of the heading is that of an unmeasured
-    quantity, and the variance of the rate includes the assumed bias.
+    Where the noise of the gyro is unknown, the heading counts as not measured.
 
     """
 
@@ -199,10 +198,7 @@ class Pipeline:
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
         self._frame: str | None = None
         self.publisher_conflict, self._interleaved_count = '', 0
-        # For a driver that was restarted and may send faster: arrival of the last sample, s, and
-        # the longest interval since a silence, ns.
-        self._have_same_name, self._last_arrival, self._max_interval = False, clock.steady(), 0
-        self._backlog = 0.0  # delay of the last samples, ns
+        self._last_arrival, self._backlog = clock.steady(), 0.0  # delay of the last samples, ns
         self._trusted_heading = 0.0, 0.0
         # Begin of samples with a repeated stamp, s, and the largest rate among them, rad/s.
         self._frozen_stamp: tuple[float, float] | None = None
@@ -303,13 +299,8 @@ class Pipeline:
         """
         Return a sample corrected, or None where it cannot be used.
 
-        Parameters
-        ----------
-        stamp : ns
-        output : rad/s
-        specific_force : along the input axis, m/s²; None if unknown
-        receivers : number of other nodes that receive cmd_vel
-        frame : of the gyro
+        The stamp is in ns, the output in rad/s, and the specific force along the input axis in
+        m/s²; `receivers` is the number of other nodes that receive cmd_vel.
 
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
@@ -328,8 +319,6 @@ class Pipeline:
                     now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
-        self._max_interval = (0 if now - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
-                              else max(self._max_interval, stamp - self._last_stamp))
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
@@ -476,7 +465,6 @@ class Pipeline:
         self.publisher_conflict = '' if len(names) < 2 else (
             f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), and '
             'their samples cannot be distinguished: give each gyro a topic of its own')
-        self._have_same_name = len(names) > len(set(names)) == 1
         if not self.publisher_conflict:
             self._interleaved_count = 0
         if self._interleaved_count > 1:
@@ -494,20 +482,16 @@ class Pipeline:
 
         A sample of a second publisher divides an interval, so that one part is at most half of it.
         A restarted driver sends alone, although the middleware lists the killed one for up to 20
-        s, and may send at another rate. Delayed samples also follow too soon, until they have
-        caught up.
+        s; one that sends twice as fast is refused until then. Delayed samples also follow too
+        soon, until they have caught up.
 
         """
         usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual_interval
-        interval = stamp - self._last_stamp
-        behind = self._backlog
+        interval, behind = stamp - self._last_stamp, self._backlog
         begins = self._clock.steady() - self._last_arrival > DRIVE_SAMPLE_TIMEOUT
         self._backlog = 0.0 if begins else min(max(behind + interval - usual, 0.0),
                                                NSEC_PER_SEC * DRIVE_SAMPLE_TIMEOUT)
-        if self._have_same_name:
-            usual = min(usual, self._max_interval)
-        if not (2.0 * interval > usual or behind):
-            self._interleaved_count += 1
+        self._interleaved_count += not (2.0 * interval > usual or behind)
         if self._interleaved_count > 1:
             self._refuse_all(self.publisher_conflict)
 
@@ -564,7 +548,6 @@ class Pipeline:
         if event := self.estimator.update_table(date, is_final):
             self.journal.event = event
         self.store.store_table(date, is_final)
-        self.store.poll()
 
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""

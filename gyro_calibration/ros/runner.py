@@ -31,7 +31,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from gyro_calibration.ros.parameters import Parameter, parameter_values
+from gyro_calibration.ros.inputs import Parameter, parameter_values
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,

@@ -345,10 +345,10 @@ def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not
             raise answer
     with tqdm(total=60, disable=True) as bar:
         if refusals < MAX_ATTEMPTS:
-            calibrate(SimpleNamespace(call_service=call), SimpleNamespace(phase=0), bar)
+            calibrate(SimpleNamespace(call_service=call), bar)
         else:
             with pytest.raises(CallRefused, match='slipped'):
-                calibrate(SimpleNamespace(call_service=call), SimpleNamespace(phase=0), bar)
+                calibrate(SimpleNamespace(call_service=call), bar)
     assert capsys.readouterr().err.count('slipped; once more') == min(refusals, MAX_ATTEMPTS - 1)
 
 

@@ -95,28 +95,12 @@ def test_auto_finds_the_protocol_and_reports_it(name):
     assert reading.connection.baud == find_protocol(name).baud
 
 
-def test_auto_with_a_baud_listens_at_that_one_only():
-    world = World(3.0)
-    world.send(b'\x00\x01\x02')
-    assert 'no protocol was recognized at 57600 bit/s' in Reading(world, baud=57600).problems[0]
-
-
 def test_auto_asks_for_what_the_protocol_needs():
     world, counts = World(5.0), Settings(columns=('gyro_counts',))
     world.gyro('csv', settings=Settings(columns=('gyro_counts',), sensitivity=0.001))
     problem = Reading(world, settings=counts).problems[0]
     assert problem.startswith(
         'csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
-
-
-def test_another_gyro_in_the_same_place_is_recognized():
-    world = World(60.0)
-    world.gyro('kvh_dsp3000', end=20.0)
-    world.gyro('minimu9', begin=20.0)
-    reading = Reading(world)
-    assert (reading.connection.protocol is find_protocol('minimu9')
-            and reading.states[-1].name == 'reading')
-    assert reading.connection.counts().samples == len(reading.samples) > 4000
 
 
 def test_stamps_go_on_when_another_gyro_is_recognized():
@@ -253,14 +237,6 @@ def test_a_board_that_takes_long_to_restart_is_waited_for(protocol):
     reading = Reading(world, protocol, settings=ONE_COLUMN)
     assert reading.samples and reading.connection.open_count == 1
     assert reading.problems == [NOTHING]
-
-
-def test_a_board_that_sends_something_else_while_it_starts_is_found_at_a_given_baud():
-    world = World(10.0)
-    world.send(b'\x00\x01\x02', end=3.0)
-    world.send(b'1.0\r\n', begin=3.0)
-    reading = Reading(world, settings=ONE_COLUMN, baud=115200)
-    assert reading.problems and reading.samples and reading.connection.open_count == 1
 
 
 def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known():

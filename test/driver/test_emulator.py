@@ -14,7 +14,6 @@ from dataclasses import replace
 import itertools
 import math
 import os
-import threading
 import time
 
 from gyro_calibration.driver.connection import PortError, SerialPort
@@ -57,17 +56,6 @@ def test_a_reader_gets_every_sample(name, tmp_path):
         [sample.output for sample in samples(200)], abs=resolution)
 
 
-def test_nothing_is_lost_when_the_samples_end(tmp_path):
-    emulator = Emulator(find_protocol('csv'), samples(5000), speed=math.inf,
-                        link=tmp_path / 'gyro', wait_for_reader=True)
-    thread = threading.Thread(target=emulate, args=[emulator])
-    thread.start()
-    while not (tmp_path / 'gyro').exists():
-        time.sleep(0.001)
-    assert len(read_all(tmp_path / 'gyro', 'csv')) == 5000
-    thread.join()
-
-
 @pytest.mark.parametrize('speed', [1.0, 10.0])
 def test_samples_come_at_their_times(speed):
     """Where a busy machine holds them up, the next ones come at their times again."""
@@ -108,19 +96,6 @@ def test_a_replay_waits_for_its_reader():
     assert received[-1].time - received[0].time == pytest.approx(0.01 * (len(received) - 1))
 
 
-def test_what_the_driver_sends_is_ignored():
-    with Emulator(find_protocol('kvh_dsp3000'), samples(rate=100.0),
-                  wait_for_reader=True) as emulator:
-        port, decoder, received = (SerialPort(emulator.path, 38400),
-                                   find_protocol('kvh_dsp3000').decoder(), [])
-        port.open()
-        while len(received) < 30:
-            port.write(b'RRR' * 100)
-            received += decoder.feed(port.read())
-        port.close()
-    assert decoder.discarded_bytes == 0
-
-
 def test_the_link_is_replaced_and_removed_unless_another_gyro_has_taken_it(tmp_path):
     link = tmp_path / 'gyro'
     link.symlink_to('/nonexistent')
@@ -139,14 +114,6 @@ def test_a_file_in_the_place_of_the_link_is_kept(tmp_path):
     with pytest.raises(FileExistsError, match='give another path'):
         Emulator(find_protocol('csv'), samples(), link=tmp_path / 'notes').open()
     assert (tmp_path / 'notes').read_text() == 'precious'
-
-
-def test_stop_ends_an_endless_gyro_at_once():
-    emulator = Emulator(find_protocol('csv'), samples(rate=0.01))
-    begin = time.monotonic()
-    with emulator:
-        pass
-    assert time.monotonic() - begin < 5.0  # of 100 s; a busy machine is late
 
 
 @pytest.mark.parametrize('given, words', [

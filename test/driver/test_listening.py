@@ -119,14 +119,6 @@ def test_a_device_of_another_kind_is_no_format_at_any_baud():
             assert recognition.protocol is None, (ratio, content, recognition.summary)
 
 
-def test_noise_is_no_format():
-    generator = random.Random(3)
-    for _ in range(50):
-        recognition = recognize_protocol(generator.randbytes(8192))
-        assert recognition.protocol is None and recognition.explained_share < 0.01
-        assert 'no known format' in recognition.summary or 'too few' in recognition.summary
-
-
 def joined(name, count):
     return b''.join(frames(name, count))
 

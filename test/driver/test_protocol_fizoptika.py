@@ -80,22 +80,3 @@ def test_halves_with_garbage_between_are_not_joined():
     decoder.reset()
     second, = decoder.feed(frame(2, 3, 0x01))
     assert first.health == second.health == {}
-
-
-def test_an_emulated_unit_takes_both_halves_at_one_instant():
-    """From one sample to the next the high byte changes, and halves of two would be 2 degC off."""
-    step = 250.0 / 0x8000
-    encode = PROTOCOL.encoder(ONE_COUNT)
-    warmer = -50.0 + 0x2600 * step
-    _, sample = decoded(encode(Sample(0.0, warmer - step, sequence=0)),
-                        encode(Sample(0.0, warmer, sequence=1)))
-    assert sample.temperature == pytest.approx(warmer - step, abs=0.1 * step)
-
-
-def test_an_emulated_unit_says_of_itself_what_the_sample_says():
-    encode = PROTOCOL.encoder(ONE_COUNT)
-    samples = decoded(*(encode(Sample(0.0, sequence=number, health={'source_current_a': 0.2}))
-                        for number in range(8)))
-    currents = [sample.health['source_current_a']
-                for sample in samples if 'source_current_a' in sample.health]
-    assert currents == pytest.approx([0.2], abs=1e-4)

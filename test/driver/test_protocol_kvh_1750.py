@@ -98,13 +98,6 @@ def test_the_temperature_has_a_sign(temperature):
     assert again.temperature == temperature
 
 
-def test_the_sequence_wraps_at_128():
-    samples = decoded(b''.join(PROTOCOL.encoder()(Sample(0.1, sequence=number))
-                               for number in range(300)))
-    assert ([sample.sequence for sample in samples] == [number % 128 for number in range(300)]
-            and PROTOCOL.modulus == 128)
-
-
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 3e38])
 def test_a_float_that_is_no_rate_is_refused_and_one_that_is_no_force_left_out(value):
     decoder = PROTOCOL.decoder(Settings(increments=False))

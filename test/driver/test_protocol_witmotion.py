@@ -58,8 +58,3 @@ def test_frames_of_other_kinds_are_passed_over():
     samples = decoder.feed(b''.join(frame(kind, 1, 2, 3, 4)
                                     for kind in (0x50, 0x51, 0x52, 0x53, 0x54, 0x59, 0x5A)))
     assert len(samples) == 1 and decoder.discarded_bytes == 0
-
-
-def test_a_frame_is_written_byte_by_byte_as_the_data_sheet_has_it():
-    assert (PROTOCOL.encoder()(Sample(math.radians(31.25), 25.0))
-            == bytes.fromhex('5552000000000002C40976'))

@@ -18,9 +18,11 @@ Any bytes, in any pieces, are decoded in test_fuzz.py: alike, and right again af
 from dataclasses import replace
 import itertools
 import math
+from pathlib import Path
 import random
 import time
 
+from gyro_calibration.driver import protocols
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import pytest
 from serial_faults import SETTINGS
@@ -45,6 +47,12 @@ VECTORS = [
     ('razor', b'#YPRAG=-142.28,-5.38,33.52,0.1,0.1,1.0,0.01,0.01,-0.01\r\n', 0.01 / DPS),
     ('csv', b'12.5,-3.25,24.5\r\n', -3.25),
 ]
+
+
+def test_each_module_of_the_folder_is_a_format_and_describes_itself():
+    modules = {path.stem for path in Path(protocols.__file__).parent.glob('*.py')}
+    assert len(PROTOCOLS) == len(modules - {'__init__', 'protocol'}) > 0
+    assert all(protocol.text.strip() for protocol in PROTOCOLS.values())
 
 
 def stream(name, count=20, seed=1):
@@ -270,14 +278,6 @@ COARSE = Settings(sensitivity=0.00875 * DPS)  # a MinIMU-9 set to 250 deg/s stil
 def test_columns_units_scales_and_axes_are_those_of_the_settings(name, settings, data, rate):
     sample, = opened(name, settings).feed(data)
     assert sample.output == pytest.approx(rate, rel=1e-4)
-
-
-def test_a_lost_port_does_not_join_two_halves():
-    decoder = opened('csv')
-    decoder.feed(b'0.1,1')
-    decoder.reset()
-    assert decoder.feed(b'2.5,20.0\n0.2,3.0,20.0\n') == [Sample(3.0 * DPS, 20.0, 0.2)]
-    assert decoder.discarded_bytes == 13
 
 
 @pytest.mark.parametrize(('name', 'values', 'message'), [

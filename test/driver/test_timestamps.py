@@ -191,17 +191,6 @@ def test_what_was_counted_too_often_is_taken_back(rate, generator):
     assert run.error() < 0.003
 
 
-def test_what_damage_hides_is_counted_as_the_decoder_says(generator):
-    times = true_times(100, 0.01, 30.0)
-    kept = generator.random(times.size) >= 0.03
-    kept[[0, -1]] = True
-    missing = np.zeros(times.size, int)
-    missing[kept] = np.diff(np.flatnonzero(kept), prepend=-1) - 1
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, missing=missing)
-    assert run.clock.lost_count == pytest.approx(run.truly_lost, abs=2)
-    assert run.error() < 0.0015
-
-
 def test_the_time_of_the_device_is_fitted_like_a_number(generator):
     """Here it tells of lost samples, too, and of the uneven loop of a microcontroller."""
     times = true_times(100, 0.0, 30.0) + generator.uniform(-5e-4, 5e-4, 3000)
@@ -211,17 +200,6 @@ def test_the_time_of_the_device_is_fitted_like_a_number(generator):
                time=50.0 + times / 1.02)
     assert run.error() < 0.001
     assert run.clock.lost_count == run.truly_lost
-
-
-@pytest.mark.parametrize('jump', [-20.0, 1.0, 2000.0])
-def test_a_damaged_time_of_the_device_harms_for_a_moment_only(jump, generator):
-    times = true_times(100, 0.0, 30.0)
-    said = times.copy()
-    said[1500] += jump
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
-    assert run.error(25.0) < 0.001
-    assert run.clock.lost_count <= 1
-    assert (np.diff(run.stamps) > 0.0).all()
 
 
 DAMAGED = {  # time, generator -> what a line that is damaged there says
@@ -240,26 +218,6 @@ def test_times_of_the_device_that_are_often_damaged_lose_no_sample(damage, gener
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
     assert run.clock.lost_count < 0.5 * np.count_nonzero(said != np.round(50.0 + times, 3))
     assert abs(run.stamps - times).max() < 0.1
-
-
-def test_a_long_damaged_field_loses_no_more_samples_than_the_time_has_room_for(generator):
-    """Its bytes are as many as those of 20 lines; the time of the device knows better."""
-    times = true_times(100, 0.0, 30.0)
-    kept = generator.random(times.size) >= 0.01
-    kept[[0, -1]] = True
-    missing = 20 * (np.diff(np.flatnonzero(kept), prepend=-1) > 1)
-    every = np.zeros(times.size, int)
-    every[kept] = missing
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, missing=every,
-               time=50.0 + times)
-    assert run.clock.lost_count == run.truly_lost
-
-
-def test_a_first_interval_that_is_too_short_loses_no_sample_later(generator):
-    times = true_times(100, 0.0, 10.0)
-    said = np.concatenate([[50.0 + times[1] - 1e-4], 50.0 + times[1:]])
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
-    assert run.clock.lost_count == 0 and run.clock.period == pytest.approx(0.01, rel=0.01)
 
 
 def test_a_device_that_was_restarted_begins_anew(generator):
@@ -303,12 +261,6 @@ def test_a_gyro_that_becomes_ten_times_slower_or_faster_has_lost_nothing(generat
         assert run.clock.lost_count <= 2
         assert run.error(30.0) < 0.002
         assert (np.diff(run.stamps) > 0.0).all()
-
-
-def test_many_samples_at_one_instant_still_increase():
-    clock = SampleClock(1000.0)
-    stamps = [stamp for _ in range(100) for stamp in clock.stamp_samples([Sample(0.0)] * 3, 17.0)]
-    assert all(later > earlier for earlier, later in pairwise(stamps))
 
 
 def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(generator):

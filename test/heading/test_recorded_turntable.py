@@ -15,7 +15,7 @@ import math
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.ros.calibration_session import ODOMETRY
-from gyro_calibration.ros.wheels import Velocity
+from gyro_calibration.ros.inputs import Velocity
 import numpy as np
 import pytest
 from rig import Rig

@@ -11,7 +11,6 @@
 """The driver: its parameters, messages and diagnostics, and as a process with DDS."""
 
 import itertools
-import math
 import re
 import subprocess
 import sys
@@ -31,7 +30,7 @@ from gyro_calibration.ros.driver_node import (
     SampleMessages,
     settings_from_parameters,
 )
-from gyro_calibration.ros.parameters import parameter_values
+from gyro_calibration.ros.inputs import parameter_values
 from gyro_calibration.ros.runner import ERROR, OK, WARN
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
@@ -47,7 +46,7 @@ KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temper
 
 @pytest.mark.parametrize(('given', 'sentence'), [
     ({'protocol': 'bogus'},
-     r"parameter protocol is 'bogus', but must be kvh_dsp3000, .*csv or auto"),
+     "protocol 'bogus' is not known: choose one of csv, .*, or auto to find it by listening"),
     ({'invert': 'maybe'}, "parameter invert is 'maybe', but must be default, always or never"),
     ({'increments': True}, 'parameter increments is True, but must be default, always or never'),
     ({'columns': ['time_s'], 'protocol': 'csv'}, 'exactly one must be gyro_dps'),
@@ -61,14 +60,6 @@ def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
         values = parameter_values(PARAMETERS, given)
         Connection(values.port, values.protocol, values.baud, settings_from_parameters(values))
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_parameters_become_settings():
-    given = {'sensitivity': 0.002, 'invert': 'always', 'increments': 'never', 'axis': 'y',
-             'full_scale': 2, 'columns': ['gyro_counts']}
-    assert settings_from_parameters(parameter_values(PARAMETERS, given)) == Settings(
-        0.002, True, 'y', ('gyro_counts',), 2.0, False, None)
-    assert settings_from_parameters(parameter_values(PARAMETERS)) == Settings()
 
 
 # Messages
@@ -101,13 +92,6 @@ def test_a_message_holds_the_rate_about_z_and_marks_what_is_not_measured():
     messages.fill(SampleMean(0.0, Sample(0.5), 1))
     assert messages.imu.linear_acceleration.z == 0.0
     assert list(messages.imu.linear_acceleration_covariance) == [-1.0, *8 * [0.0]]
-
-
-@pytest.mark.parametrize(('name', 'deviation'),
-                         [('kvh_dsp3000', 0.0111), ('kvh_1750', 0.0088), ('csv', 0.5)])
-def test_the_assumed_noise_is_that_of_the_data_sheet_or_half_a_degree_a_second(name, deviation):
-    assert math.sqrt(find_protocol(name).sample_variance(Settings())) == pytest.approx(
-        math.radians(deviation), rel=0.01)
 
 
 # Diagnostics
@@ -209,12 +193,12 @@ def test_steps_of_the_clock_are_counted():
 
 
 def test_listening_is_a_warning_and_what_was_recognized_is_reported():
-    world = World(30.0, baud=find_protocol('minimu9').baud)
-    world.gyro('minimu9')
+    world = World(30.0, baud=find_protocol('kvh_ecore').baud)
+    world.gyro('kvh_ecore')
     reports = reported(world, 'auto')
     assert reports[0][:2] == (WARN, 'listening for a protocol')
-    assert (reports[-1][2]['protocol'] == 'minimu9'
-            and 'minimu9 explains' in reports[-1][2]['detected'])
+    assert (reports[-1][2]['protocol'] == 'kvh_ecore'
+            and 'kvh_ecore explains' in reports[-1][2]['detected'])
 
 
 # As a robot runs it: its own process, a pseudo-terminal for the gyro, and DDS

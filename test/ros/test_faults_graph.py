@@ -10,7 +10,6 @@
 
 """The graph under faults: any order of starting, killed and stalled nodes, a clock that is set."""
 
-import contextlib
 import itertools
 import math
 import os
@@ -162,52 +161,6 @@ def _kill(node):
     node.waited = True
     os.killpg(node.process.pid, signal.SIGKILL)
     node.process.wait()
-
-
-@pytest.fixture
-def listeners(impatient):
-    """Return a function that starts a process with so many subscribers and waits for them."""
-    processes = []
-
-    def start(count):
-        command = [sys.executable, Path(__file__).parents[1] / 'listeners.py', str(count)]
-        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True,
-                                          env=impatient))
-        # rclpy prints there, too, that it is started again
-        assert b'listening\n' in iter(processes[-1].stdout.readline, b'')
-        return processes[-1]
-    yield start
-    for process in processes:
-        # one that is killed may hold a lock in shared memory, for which all others wait for ever
-        os.killpg(process.pid, signal.SIGCONT)
-        process.send_signal(signal.SIGINT)
-    for process in processes:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.communicate(timeout=20.0)
-        process.kill()
-        process.communicate()
-
-
-def test_neither_ten_subscribers_nor_one_that_stalls_cost_the_others_anything(
-        compensation, start_node, listeners, tmp_path):
-    _, heard = compensation()
-    start_node('driver_node', DRIVER | {'port': tmp_path / 'gyro'})
-    turning = Turning(tmp_path / 'gyro')
-    with turning.emulator:
-        heard.more(200)
-        alone = heard.latency(turning, 0)
-        stalled = listeners(1)
-        begin = len(heard.numbers)
-        heard.more(50)
-        os.killpg(stalled.pid, signal.SIGSTOP)
-        place = len(heard.numbers)
-        heard.more(300)
-        assert heard.latency(turning, place) < alone + WAITING
-        listeners(10)
-        place = len(heard.numbers)
-        heard.more(200)
-        assert heard.latency(turning, place) < alone + WAITING
-        assert heard.missing(begin) == 0
 
 
 _HANGING = """

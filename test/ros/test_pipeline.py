@@ -24,7 +24,7 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import simulate_gyro_output
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import REST
-from gyro_calibration.ros.wheels import Velocity
+from gyro_calibration.ros.inputs import Velocity
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -225,15 +225,6 @@ def test_the_threshold_filter_deletes_rates_at_rest_until_it_is_switched_off(tmp
     assert rig.feed([0.1 * DEGREE] * 2)[-1].rate == pytest.approx(0.1 * DEGREE)
 
 
-def test_the_method_may_change_while_it_runs_and_the_heading_does_not_jump(tmp_path):
-    rig = Rig(tmp_path, model=KNOWN)
-    before = rig.feed(noisy(20.0), SLOW)[-1].heading
-    rig.set(stationary_method='none')
-    after = rig.feed(noisy(0.4, seed=1), SLOW)
-    assert all(each.rate != 0.0 for each in after[2:])
-    assert after[-1].heading == pytest.approx(before, abs=0.01)
-
-
 @pytest.mark.parametrize('wheels', ['odom', 'both'])
 def test_wheels_decide_on_slow_turns(tmp_path, wheels):
     rig, slow = Rig(tmp_path, model=KNOWN, wheels=wheels), 0.05 * DEGREE
@@ -283,12 +274,6 @@ def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill
     assert abs(error) < 4.0 * deviation, (error, deviation)
 
 
-def test_wheels_that_are_not_asked_decide_nothing(tmp_path):
-    rates = noisy(30.0, 0.05 * DEGREE)
-    without = Rig(tmp_path, model=KNOWN).feed(rates, SLOW)
-    assert Rig(tmp_path, model=KNOWN).feed(rates, SLOW, moving=0.3) == without
-
-
 # Several publishers
 
 
@@ -316,14 +301,6 @@ def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     assert rig.outputs[-1].heading < 0.5 * 0.2
     rig.feed(np.full(150, 0.5))
     assert not rig.pipeline.conflict
-
-
-def test_a_driver_that_comes_back_with_another_frame_is_none_of_two(tmp_path):
-    rig = Rig(tmp_path, model='')
-    rig.feed(np.full(100, 0.5))
-    for _ in range(100):
-        rig.skip(INTERVAL)
-        assert rig.pipeline.add_sample(rig.fed, 0.5, frame='other')
 
 
 def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_path):
@@ -364,8 +341,7 @@ def test_a_turn_between_two_rests_while_two_publishers_send_is_in_the_variance(t
     assert not rig.pipeline.conflict and 2.0 < abs(error) < 3.0 * deviation, (error, deviation)
 
 
-@pytest.mark.parametrize('pause, interval', [(0.4, INTERVAL), (1.5, 0.002), (1.5, 0.005),
-                                             (1.5, 0.02), (1.5, 0.05)])
+@pytest.mark.parametrize('pause, interval', [(0.4, INTERVAL), (1.5, 0.006), (1.5, 0.05)])
 def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path, pause, interval):
     """Its dead predecessor is listed for up to 20 s; the stamps show that one alone sends."""
     rig = Rig(tmp_path, model='')
@@ -475,12 +451,6 @@ def test_the_temperature_is_used_extrapolated_held_or_replaced(
     assert rig.journal.counts['temperature_clipped'] == counted
 
 
-def test_a_rate_beyond_the_calibrated_range_is_counted(tmp_path):
-    rig = Rig(tmp_path, model=TEMPERATURE_MODEL)
-    rig.feed(np.full(10, 1.5), temperature=30.0)
-    assert rig.journal.counts['beyond_range'] + rig.journal.counts['refused_samples'] == 10
-
-
 def test_biases_of_two_temperatures_are_kept_for_the_next_start(tmp_path):
     shift = 10.0 * 0.02 * DEGREE
     (tmp_path / 'calibration_biases.yaml').write_text('format: something else\n')
@@ -512,13 +482,6 @@ def test_a_gyro_that_was_silent_for_10_s_may_have_been_without_power(
     rig.skip(stamps, steady=steady)
     rig.feed([0.0])
     assert rig.pipeline.estimator.restart_count == beginnings
-
-
-def test_a_simulation_that_pauses_is_no_silence(tmp_path):
-    rig = rested(tmp_path, ros=1000.0)
-    rig.clock.now += 60.0
-    rig.go(1.0)
-    assert rig.pipeline.estimator.restart_count == 1
 
 
 @pytest.mark.parametrize('step', [3600.0, -3600.0, -0.5, 2e7])
@@ -658,12 +621,6 @@ def test_a_time_offset_moves_the_published_stamps(tmp_path):
     assert [rig.fed - each.stamp for each in found] == [40_000_000, 30_000_000, 20_000_000]
 
 
-def test_a_channel_that_no_message_brings_is_named(tmp_path):
-    rig = Rig(tmp_path, model=model({'supply_sensitivity': {'supply_sensitivity': 0.01}}))
-    assert rig.feed(np.full(3, 0.5))[-1].rate == 0.5
-    assert 'supply' in ' '.join(rig.pipeline.estimator.missing_channels(rig.journal.channels))
-
-
 def test_over_a_jump_back_of_the_stamps_the_past_of_an_effect_goes_on(tmp_path):
     lag = {'thermal_lag': {'thermal_lag': 1e-3, 'time_constant': 40.0}}
     rig = Rig(tmp_path, model=model(lag), stationary_threshold=0.0)
@@ -693,7 +650,7 @@ def test_with_a_bad_model_raw_rates_go_on_and_the_problem_names_the_file(tmp_pat
 
 @pytest.fixture
 def reported():
-    module = pytest.importorskip('gyro_calibration.ros.compensation_report')
+    module = pytest.importorskip('gyro_calibration.ros.compensation_node')
     reports = {}
 
     def report(rig):

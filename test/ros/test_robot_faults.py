@@ -25,7 +25,7 @@ import sys
 import time
 
 import pytest
-from robot import now, Robot, RosRobot, SecondCommander
+from robot import now, Robot, RosRobot
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray
@@ -127,68 +127,6 @@ def test_without_a_clock_of_the_simulation_nothing_drives_and_where_it_stops_the
     answer = stage.drive()
     begin, robot.clock_stands = now(), True
     assert stage.refused(answer, 'ROS time stands still', begin) < 2.0
-
-
-def test_at_four_times_the_speed_with_both_wheels_no_guard_ends_a_run(stage):
-    """Its result is right; or a busy machine is named, on which 10 ms of the robot are too few."""
-    robot = stage.robot(speed=4.0)
-    stage.node(use_sim_time='true', wheels='both')
-    answer = stage.drive()
-    begin = now()
-    stage.wait_until(answer.done, 60.0, 'the answer')
-    result = answer.result()
-    if not stage.is_held_up(result.message):
-        assert 'scale factor error 3.' in result.message
-        assert robot.turned_since(begin) > math.radians(200.0), 'the rest of 315 deg'
-    stage.wait_until(lambda: robot.commands[-1][1] == 0.0 and abs(robot.robot.rate) < 0.01)
-
-
-def test_an_unplugged_gyro_stops_the_robot_and_the_diagnostics_name_it(stage):
-    robot = stage.robot()
-    stage.node()
-    answer = stage.drive()
-    begin, robot.robot.unplugged = now(), True
-    assert stage.refused(answer, 'no sample came', begin) < 2.0
-    stage.says('no samples on imu/data_raw for')
-
-
-def test_a_second_commander_is_obeyed_at_once(stage):
-    """A soft stop first, then teleop."""
-    robot, other = stage.robot(stamped=True), SecondCommander(stage.ros.node)
-    stage.closing.append(other.close)
-    stage.node(cmd_vel_stamped='true')
-    for rate in (0.0, 0.3):
-        answer = stage.drive()
-        begin, other.rate = now(), rate
-        stage.wait_until(answer.done, 30.0, 'the answer')
-        assert any(each in answer.result().message
-                   for each in ('another node sent a command', *HELD_UP)), answer.result().message
-        own = [when
-               for when, each in list(robot.commands) if each not in (0.0, rate) and when > begin]
-        assert max(own, default=begin) - begin < 2.0
-        stage.wait_until(lambda: abs(robot.robot.rate - rate) < 0.01,  # noqa: B023
-                         10.0, 'the other one has it')
-        answer = stage.call()
-        stage.wait_until(answer.done, 30.0, 'the answer')
-        assert not answer.result().success, 'somebody else commands the robot'
-        other.rate = None
-        time.sleep(1.2)  # a command of another node is remembered for 1 s
-
-
-def test_two_publishers_of_samples_are_named_and_no_heading_is_made_of_them(stage):
-    robot = stage.robot()
-    stage.node()
-    second = stage.ros.node.create_publisher(Imu, 'imu/data_raw', 100)
-    robot.also = second.publish
-    stage.says('publishers send on imu/data_raw (/test_client, /test_client)')
-    received = len(stage.samples)
-    robot.robot.command(0.7)
-    stage.wait_until(lambda: robot.robot.heading > 1.0, what='a turn')
-    assert len(stage.samples) < received + 50
-    answer = stage.call()
-    stage.wait_until(answer.done, 30.0, 'the answer')
-    assert 'publishers send on imu/data_raw' in answer.result().message
-    robot.robot.command(0.0)
 
 
 _CALLER = """

@@ -12,7 +12,7 @@
 
 import math
 
-from gyro_calibration.ros.wheels import (
+from gyro_calibration.ros.inputs import (
     COASTING_DURATION,
     COMMAND,
     MAX_VELOCITY_AGE,

@@ -45,62 +45,32 @@ _MAX_RATE_DEVIATION = 0.05  # largest of the sample rate, 1; the clocks of gyros
 
 @dataclass(frozen=True)
 class Sample:
-    """
-    One sample of a gyro.
+    """One sample of a gyro; None where the device does not send a value."""
 
-    Attributes
-    ----------
-    output : rad/s, counter-clockwise positive
-    temperature : degC; None where the device sends none with this sample
-    time : seconds, by the clock of the device
-    sequence : count of the device, modulo `Protocol.modulus`
-    missing : estimated samples lost directly before this one: damaged, marked as invalid by the
-        device, or refused. A sequence or the elapsed time has priority.
-    specific_force : m/s², along the input axis
-    health : further values of the device with this sample, by names with units: ``supply_v``,
-        ``source_current_a``
-
-    """
-
-    output: float
-    temperature: float | None = None
-    time: float | None = None
-    sequence: int | None = None
+    output: float  # rad/s, counter-clockwise positive
+    temperature: float | None = None  # degC
+    time: float | None = None  # s, by the clock of the device
+    sequence: int | None = None  # count of the device, modulo `Protocol.modulus`
+    #: Estimated samples lost directly before this one: damaged, marked as invalid by the device,
+    #: or refused. A sequence or the elapsed time has priority.
     missing: int = 0
-    specific_force: float | None = None
+    specific_force: float | None = None  # m/s², along the input axis
+    #: Further values, by names with units: ``supply_v``, ``source_current_a``.
     health: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """
-    Mounting and scaling of a gyro; None is the default of its protocol.
+    """Mounting and scaling of a gyro; None is the default of its protocol."""
 
-    Attributes
-    ----------
-    sensitivity : rad/s per count, or per unit of the device
-    invert : whether the device counts clockwise turns positive
-    axis : ``'x'``, ``'y'`` or ``'z'``: the one to read of a gyro with three
-    columns : of the protocol ``csv``, in names of the log format; columns with other names are
-        skipped
-    full_scale : rad/s; samples beyond it are refused
-    increments : whether the device is set to send the angle since its last sample in place of the
-        rate
-    sample_rate : setting of the device, Hz; an increment times this rate is the rate of turn
-
-    Raises
-    ------
-    ValueError : a value is not possible
-
-    """
-
-    sensitivity: float | None = None
-    invert: bool | None = None
-    axis: str = 'z'
+    sensitivity: float | None = None  # rad/s per count, or per unit of the device
+    invert: bool | None = None  # whether the device counts clockwise turns positive
+    axis: str = 'z'  # x, y or z: the one to read of a gyro with three
+    #: Of the protocol ``csv``, in names of the log format; those with other names are skipped.
     columns: tuple[str, ...] = ('time_s', 'gyro_dps', 'temperature_degc')
-    full_scale: float | None = None
-    increments: bool | None = None
-    sample_rate: float | None = None
+    full_scale: float | None = None  # rad/s; samples beyond it are refused
+    increments: bool | None = None  # whether the device sends angles since its last sample
+    sample_rate: float | None = None  # Hz; an angle times this rate is the rate of turn
 
     def __post_init__(self) -> None:
         for name in ('sensitivity', 'full_scale', 'sample_rate'):
@@ -189,54 +159,28 @@ class Splitter:
 
 @dataclass(frozen=True)
 class Protocol:
-    """
-    A wire format.
+    """A wire format."""
 
-    Attributes
-    ----------
-    name : of the parameter ``protocol``
-    text : what documents state of it: devices, layout of a frame, sources, what is not verified
-    baud : bits per second, with 8 data bits, no parity and 1 stop bit
-    rate : nominal samples per second; see `nominal_rate`
-    sensitivity : rad/s per unit of the device, or rad where it sends increments; None for counts
-        that differ from unit to unit, whose sensitivity must be set
-    splitter : returns a new `Splitter`
-    parser : ``parser(settings)`` returns the parser of one connection, see `ParseFrame` and
-        `stateless`
-    writer : ``writer(settings)`` returns the writer of one device, see `WriteFrame` and
-        `stateless`
-    invert : whether the device counts clockwise turns positive
-    full_scale : rad/s
-    largest_count : of a device that sends counts; the full scale is this times the sensitivity
-    noise_density : white noise of the rate, rad/s/√Hz, by the data sheet of the gyro; None if not
-        known
-    increments : whether the device sends angles since its last sample, unless it is set to rates
-    startup : request to the device to send
-    preamble : first bytes of the emulated device, so that its first sample is not taken for the
-        rest of a line
-    modulus : of the sequence of the device; 0 where it has none
-    normal_ranges : normal ranges of the values of `Sample.health`
-    check : ``check(settings)`` raises ValueError if settings are missing or wrong
-
-    """
-
-    name: str
-    text: str
-    baud: int
-    rate: float
+    name: str  # of the parameter ``protocol``
+    text: str | None  # what documents state: devices, layout of a frame, sources, unverified
+    baud: int  # with 8 data bits, no parity and 1 stop bit
+    rate: float  # nominal samples per second; see `nominal_rate`
+    #: rad/s per unit of the device, or rad where it sends angles; None for counts that differ from
+    #: unit to unit, whose sensitivity must be set.
     sensitivity: float | None
     splitter: Callable[[], Splitter]
-    parser: Callable[[Settings], ParseFrame]
-    writer: Callable[[Settings], WriteFrame]
-    invert: bool = False
-    full_scale: float = math.radians(2000.0)
-    largest_count: int | None = None
-    noise_density: float | None = None
-    increments: bool = False
-    startup: bytes = b''
-    preamble: bytes = b''
-    modulus: int = 0
-    normal_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    parser: Callable[[Settings], ParseFrame]  # makes that of one connection
+    writer: Callable[[Settings], WriteFrame]  # makes that of one device
+    invert: bool = False  # whether the device counts clockwise turns positive
+    full_scale: float = math.radians(2000.0)  # rad/s
+    largest_count: int | None = None  # times the sensitivity it is the full scale
+    noise_density: float | None = None  # white noise by the data sheet, rad/s/√Hz
+    increments: bool = False  # whether it sends angles since its last sample, unless set to rates
+    startup: bytes = b''  # request to the device to send
+    preamble: bytes = b''  # of an emulated device, whose first line is then no rest of a line
+    modulus: int = 0  # of the sequence of the device; 0 where it has none
+    normal_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # of `health`
+    #: Raises ValueError if settings are missing or wrong.
     check: Callable[[Settings], None] = lambda settings: None
 
     def check_settings(self, settings: Settings) -> None:

@@ -1,0 +1,263 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+What a node takes from outside, without rclpy: parameters, clocks, and the motion of the wheels.
+
+Parameters are a table with checks of their values. The clocks are steady seconds, the date, and
+ROS time, which may be paused. The motion is that of odometry and commands of the last second.
+
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+import math
+import reprlib
+from types import SimpleNamespace
+from typing import Protocol
+
+_TYPE_NAMES: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number',
+                                str: 'text', list: 'a list of strings'}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node; its type is the type of its default."""
+
+    name: str  # groups are separated by a dot, as in ``calibration.maximum_bias``
+    default: bool | int | float | str | Sequence[str]
+    description: str  # one sentence, without the unit
+    unit: str = ''
+    range: tuple[float, float] | None = None  # noqa: A003  lowest and highest value allowed
+    dynamic: bool = False  # may be set while the node runs
+    choices: tuple[str, ...] = ()  # allowed values of a text; empty for any
+
+    @property
+    def attribute(self) -> str:
+        """Return the attribute in the record of values: ``calibration_maximum_bias``."""
+        return self.name.replace('.', '_')
+
+    @property
+    def choices_text(self) -> str:
+        """Return the choices as text; '' if any value is allowed."""
+        return f'{", ".join(self.choices[:-1])} or {self.choices[-1]}' if self.choices else ''
+
+    def check(self, value: object) -> object:
+        """
+        Return the value in the type of the default; an integer is accepted for a float.
+
+        A `ValueError` states the valid ones.
+
+        """
+        if isinstance(self.default, float) and type(value) is int and abs(value) < 1 << 63:
+            value = float(value)
+        several = isinstance(self.default, Sequence) and not isinstance(self.default, str)
+        wanted: type = list if several else type(self.default)
+        texts = value if isinstance(value, list) else [value]
+        if (type(value) is not wanted
+                or several and not all(isinstance(each, str) for each in texts)):
+            self._refuse(value, self.choices_text or f'{_TYPE_NAMES[wanted]}, for example '
+                         f'{self.default!r}')
+        if any('\0' in each for each in texts if isinstance(each, str)):
+            self._refuse(value, 'without a zero byte')
+        if isinstance(value, float) and not math.isfinite(value):
+            self._refuse(value, f'finite, for example {self.default!r}')
+        if self.range and isinstance(value, (int, float)):
+            low, high = self.range
+            if not low <= value <= high:
+                self._refuse(value, f'from {low} to {high} {self.unit}'.rstrip())
+        if self.choices and value not in self.choices:
+            self._refuse(value, self.choices_text)
+        return value
+
+    def _refuse(self, value: object, wanted: str) -> None:
+        raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be {wanted}')
+
+
+def parameter_values(table: Sequence[Parameter],
+                     given: Mapping[str, object] | None = None) -> SimpleNamespace:
+    """Return the values of a table by attribute: checked given values, else defaults."""
+    given = given or {}
+    return SimpleNamespace(**{each.attribute: each.check(given[each.name]) if each.name in given
+                              else each.default for each in table})
+
+
+class Clock(Protocol):
+    """The clocks that a node reads; tests inject their own."""
+
+    def steady(self) -> float:
+        """Return seconds of the steady clock, for all guards and time-outs."""
+
+    def date(self) -> float:
+        """Return seconds since 1970 by the clock of the host."""
+
+    def simulated(self) -> float | None:
+        """Return simulated time, s, 0 before the simulation starts; None without one."""
+
+
+def node_time(clock: Clock) -> float:
+    """Return the time of the simulation, s, where there is one, else of the steady clock."""
+    simulated = clock.simulated()
+    return clock.steady() if simulated is None else simulated
+
+
+class StampDelay:
+    """
+    Delay of stamps behind the clock of a node, and a test whether both advance equally.
+
+    `min_delay` is the least delay of recent samples, s; nan before the first.
+
+    """
+
+    def __init__(self, clock: Clock, tolerance: float, window: float):
+        """Start without samples; tolerance of their delay and window of the test, both in s."""
+        self._clock, self._tolerance, self._window = clock, tolerance, window
+        self.min_delay = math.nan
+        # Time of arrival and delay, s, of samples with less delay than any after them.
+        self._min_delays = deque[tuple[float, float]]()
+        self._previous: tuple[float, float] | None = None
+
+    def add(self, time: float) -> float:
+        """Add the stamp of a sample, s; return its delay beyond the least one, s."""
+        now = node_time(self._clock)
+        while self._min_delays and self._min_delays[-1][1] >= now - time:
+            self._min_delays.pop()
+        self._min_delays.append((now, now - time))
+        # few samples are delayed for longer than this window, s, and a gyro clock that is 3 % off
+        # drifts by 15 ms in it
+        while now - self._min_delays[0][0] > 0.5:
+            self._min_delays.popleft()
+        self.min_delay = self._min_delays[0][1]
+        return now - time - self.min_delay
+
+    def find_fault(self) -> str:
+        """Return a sentence if stamps and clock advance differently; else ''."""
+        now = node_time(self._clock)
+        then, before = self._previous or (now, self.min_delay)
+        elapsed, grown = now - then, self.min_delay - before
+        # In a fast simulation the same delay is more simulated time.
+        limit = self._tolerance * (1.0 if self._clock.simulated() is None else 4.0)
+        # the clocks of gyros are up to 3 % off
+        if abs(grown) > limit + 0.05 * abs(elapsed):
+            return (f'this computer was busy, or the clock of the driver is wrong: the stamps on '
+                    f'imu/data_raw advanced by {elapsed - grown:.2f} s in {elapsed:.2f} s; reduce '
+                    'the load, or check that clock and use_sim_time')
+        if self._min_delays and (self._previous is None or elapsed > self._window):
+            self._previous = now, self.min_delay
+        return ''
+
+
+class RosTime:
+    """
+    Whether ROS time advances.
+
+    `paused_duration` is the time since its last advance, s of the steady clock; 0 where it is not
+    simulated, inf before a simulation starts.
+
+    """
+
+    def __init__(self) -> None:
+        """Start without readings."""
+        self.paused_duration = 0.0
+        self._last: float | None = -1.0
+        self._last_change = self._last_poll = 0.0
+
+    def poll(self, clock: Clock) -> None:
+        """
+        Compare with the last poll; to be called by one timer.
+
+        Only the time up to that poll counts: after a pause of this process, queued messages of
+        /clock are delivered after its timers.
+        """
+        now, time = clock.steady(), clock.simulated()
+        if time != self._last:
+            self._last, self._last_change, self._last_poll = time, now, now
+        if time is None:
+            self.paused_duration = 0.0
+        else:
+            self.paused_duration = self._last_poll - self._last_change if time else math.inf
+        self._last_poll = now
+
+
+#: Largest age of a velocity that is used, s.
+MAX_VELOCITY_AGE = 1.0
+#: Longest motion after the last command to move, s.
+COASTING_DURATION = 0.5
+#: Largest speeds of wheels at standstill, m/s and rad/s.
+STANDSTILL_SPEED, _STANDSTILL_RATE = 0.001, 0.0002
+ODOMETRY, COMMAND = 'odom', 'cmd_vel'
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """A velocity as `geometry_msgs/Twist` has it, m/s and rad/s."""
+
+    linear: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    angular: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def is_finite(self) -> bool:
+        """Tell whether all parts are finite."""
+        return all(math.isfinite(part) for part in (*self.linear, *self.angular))
+
+    @property
+    def is_moving(self) -> bool:
+        """Tell whether it exceeds the speeds at standstill."""
+        return (any(abs(part) > STANDSTILL_SPEED for part in self.linear)
+                or any(abs(part) > _STANDSTILL_RATE for part in self.angular))
+
+
+class Wheels:
+    """The last velocity from each source, by the steady clock."""
+
+    def __init__(self) -> None:
+        """Start without velocities."""
+        self._last: dict[str, tuple[float, Velocity]] = {}
+        # begin of uninterrupted standstill by each source, s
+        self._standing_since: dict[str, float] = {}
+        self._last_motion_command = -math.inf
+
+    def add(self, source: str, velocity: Velocity, now: float) -> None:
+        """Add a velocity at its time of arrival, s; one that is not finite is ignored."""
+        if not velocity.is_finite:
+            return
+        then, _ = self._last.get(source, (-math.inf, None))
+        if velocity.is_moving or now - then > MAX_VELOCITY_AGE:
+            self._standing_since[source] = now
+        self._last[source] = now, velocity
+        if velocity.is_moving and source == COMMAND:
+            self._last_motion_command = now
+
+    def is_moving(self, now: float, sources: Collection[str] = (ODOMETRY, COMMAND)) -> bool | None:
+        """Return whether the robot moves by these sources; None without recent data."""
+        fresh = [velocity.is_moving for source, (then, velocity) in self._last.items()
+                 if source in sources and now - then <= MAX_VELOCITY_AGE]
+        if not fresh:
+            return None
+        return (any(fresh)
+                or COMMAND in sources and now - self._last_motion_command < COASTING_DURATION)
+
+    def has_stood(self, since: float, now: float, sources: Collection[str]) -> bool:
+        """Tell whether one of these sources has shown standstill since a time, s."""
+        return self.is_moving(now, sources) is False and any(
+            self._standing_since[source] <= since
+            for source in sources if source in self._standing_since)
+
+    def turn_rate(self, now: float) -> float:
+        """Return the rate about z by odometry, rad/s; 0 without recent data."""
+        then, velocity = self._last.get(ODOMETRY, (-math.inf, Velocity()))
+        return velocity.angular[2] if now - then <= MAX_VELOCITY_AGE else 0.0
+
+    def age(self, now: float) -> float:
+        """Return the age of the last velocity, s."""
+        return now - max((then for then, _ in self._last.values()), default=-math.inf)
