@@ -12,6 +12,7 @@
 Compare estimators of scale factor error and bias with the Cramér-Rao bound, on 20 s of motion.
 
     python benchmarks/efficiency.py [RUNS]
+    python benchmarks/efficiency.py methods [RUNS]
 
 The built-in motion at 100 Hz against an encoder, which is read with each sample and starts
 anywhere within a step; s = 3 %, b = 0.5 deg/s. Four cases: a fine and a coarse encoder, low and
@@ -29,6 +30,9 @@ independent from rest to rest.
 While an encoder moves, its errors are of neither kind: they are known where it steps. So an
 estimator that uses the steps may be better than both.
 
+With `methods`, the three methods of self-calibration are compared on simulated runs of the Epson
+XV-3500: the rms errors of docs/explanation/self_calibration.md.
+
 """
 
 from __future__ import annotations
@@ -40,9 +44,13 @@ import sys
 
 from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading
+from gyro_calibration.calibration.self_calibration import METHODS as SELF_CALIBRATIONS
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import CALIBRATION_MOTION, Motion, motion_from_headings
+from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
+from scipy.signal import lfilter
 
 INTERVAL = 0.01
 TIME = np.arange(2001) * INTERVAL
@@ -128,5 +136,41 @@ def table(runs: int) -> str:
     return '\n'.join(lines)
 
 
+# the three methods of self-calibration
+
+def encoder(number: int) -> Motion:
+    """Return the motion by an encoder with steps of 0.5 deg at 20 Hz, from a random start."""
+    time, step = np.arange(401) / 20.0, 0.5 * DEGREE
+    begin = np.random.default_rng([number, 1]).uniform(0.0, step)
+    return motion_from_headings(
+        time, np.round((CALIBRATION_MOTION.heading_at(time) + begin) / step) * step)
+
+
+def compare_methods(runs: int = 200, lag: float = 0.2) -> str:
+    """Return a table of the rms errors of each method; a robot lags behind the profile, s."""
+    kept = np.exp(-INTERVAL / lag)
+    cases = {
+        'as the profile says': (RATE, lambda number: CALIBRATION_MOTION),
+        'gyro 50 ms late': (CALIBRATION_MOTION.rate_at(TIME - 0.05),
+                            lambda number: CALIBRATION_MOTION),
+        f'robot lags by {lag} s': (lfilter([1.0 - kept], [1.0, -kept], RATE),
+                                   lambda number: CALIBRATION_MOTION),
+        'encoder, 0.5 deg, 20 Hz': (RATE, encoder)}
+    lines = ['| run | method | rms error of s | rms error of b |', '|---|---|---|---|']
+    for case, (rate, reference) in cases.items():
+        outputs = [XV3500.model.output(rate, 25.0) + simulate_noise(
+            XV3500.noise, len(TIME), INTERVAL, np.random.default_rng(run)) for run in range(runs)]
+        for name, method in SELF_CALIBRATIONS.items():
+            fits = [method(TIME, output, reference(run)) for run, output in enumerate(outputs)]
+            s, b = np.sqrt(np.mean(np.square(
+                [(fit.scale_factor_error, fit.bias) for fit in fits]
+                - np.array(XV3500.true_values)), axis=0))
+            lines.append(f'| {case} | `{name}` | {100 * s:.3f} % | {b / DEGREE:.4f} deg/s |')
+    return '\n'.join(lines)
+
+
 if __name__ == '__main__':
-    print(table(int(sys.argv[1]) if len(sys.argv) > 1 else 400))
+    if sys.argv[1:2] == ['methods']:
+        print(compare_methods(*map(int, sys.argv[2:3])))
+    else:
+        print(table(int(sys.argv[1]) if len(sys.argv) > 1 else 400))

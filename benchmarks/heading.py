@@ -125,17 +125,12 @@ def _tracked(known: Known, factor: float = 1.0, wheels: bool = False
     sensitivity, still = (rate_sensitivity(model, drive.output, value, 25.0)
                           for value in (rate, 0.0))
     tracker = HeadingTracker(noise, uncertainty_covariance(model), Settings(), keeps_steps=True)
-    looks = _looks(drive)
-    heading, variance, looked = np.empty(len(rate)), [], set(looks.tolist())
-    moving = drive.moving.tolist() if wheels else [None] * len(rate)
-    for index, sample in enumerate(zip(drive.time.tolist(), rate.tolist(),
-                                       np.ascontiguousarray(sensitivity.T), moving)):
-        tracker.add(*sample, still)
-        heading[index] = tracker.heading
-        if index in looked:
-            variance.append(tracker.variance)
+    heading, variance, *_ = tracker.follow(
+        drive.time, rate, np.ascontiguousarray(sensitivity.T),
+        drive.moving.tolist() if wheels else None, still).T
     later, with_hindsight, _ = smooth_track(tracker, drive.time, rate)
-    return Estimate(heading, np.array(variance)), Estimate(later, with_hindsight[looks])
+    looks = _looks(drive)
+    return Estimate(heading, variance[looks]), Estimate(later, with_hindsight[looks])
 
 
 def _looks(drive: Drive) -> np.ndarray:

@@ -15,9 +15,9 @@ Compare the tracked heading with an oracle that is told when the robot rests.
 
 Four gyros on four kinds of drive. Noise, motion and oracle are computed here and share nothing
 with the package: flicker is a sum of Gauss-Markov processes half a decade apart, a straight way
-wobbles at random, and the oracle is a Kalman filter and smoother over steps of 0.5 s that is told
-when the robot rests and knows the noise. Both begin with a rest of 20 s before the drive and a
-scale factor known within 0.05 %.
+wobbles at random, and the oracle (`bounds`) is a Kalman filter and smoother over steps of 0.5 s
+that is told when the robot rests and knows the noise. Both begin with a rest of 20 s before the
+drive and a scale factor known within 0.05 %.
 
 The table has the mean absolute heading error of the oracle and, as a ratio to it, that of this
 program, live and with hindsight, and the share of all looks (one a second) inside the stated 95 %,
@@ -32,6 +32,7 @@ import argparse
 from dataclasses import dataclass
 import math
 
+from bounds import CONSTANTS, prior, RATIO, told_rests
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.model.compensation import rate_sensitivity, uncertainty_covariance
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
@@ -43,31 +44,21 @@ from scipy.signal import lfilter
 DEG = math.pi / 180.0
 #: The scale factor is known within, 1; the rest before the drive lasts, s.
 SCALE, CALIBRATED = 0.0005, 20.0
-#: Time constants of the flicker, s, and the ratio of neighbours.
-RATIO = math.sqrt(10.0)
-CONSTANTS = 0.1 * RATIO ** np.arange(11)
-#: The oracle steps so often, s; of a squared normal error over its variance, 95 % are below.
-STEP, BAND = 0.5, 3.841
+#: Of a squared normal error over its variance, 95 % are below.
+BAND = 3.841
 
 
 @dataclass(frozen=True)
 class Gyro:
-    """Noise: angle random walk, rad/√s, bias instability, rad/s, rate random walk; interval, s."""
+    """Noise, and the interval of the samples, s."""
 
-    walk: float
-    instability: float
-    rate_walk: float
+    noise: Noise
     interval: float
-
-    @property
-    def flicker(self) -> float:
-        """Return the variance of each process of the flicker, (rad/s)²."""
-        return self.instability ** 2 * math.log(RATIO) / math.pi
 
 
 def gyro(walk: float, instability: float, rate_walk: float, rate: float) -> Gyro:
     """Return a gyro by deg/√h, deg/h, deg/h/√h and samples a second."""
-    return Gyro(walk * DEG / 60.0, instability * DEG / 3600.0, rate_walk * DEG / 216000.0,
+    return Gyro(Noise(walk * DEG / 60.0, instability * DEG / 3600.0, rate_walk * DEG / 216000.0),
                 1.0 / rate)
 
 
@@ -151,70 +142,19 @@ DRIVES = ('delivery', 'picking', 'patrol', 'mowing')
 def output_of(one: Gyro, rate: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Return what the gyro says, rad/s."""
     count, warm = len(rate), round(600.0 / one.interval)
-    bias = np.cumsum(generator.standard_normal(count)) * one.rate_walk * math.sqrt(one.interval)
+    bias = (np.cumsum(generator.standard_normal(count)) * one.noise.rate_random_walk
+            * math.sqrt(one.interval))
+    flicker = one.noise.bias_instability ** 2 * math.log(RATIO) / math.pi  # of each process
     for constant in CONSTANTS:
         left = math.exp(-one.interval / constant)
         new = generator.standard_normal(warm + count) * math.sqrt(
-            one.flicker * (1.0 - left ** 2))
-        new[0] = generator.standard_normal() * math.sqrt(one.flicker)
+            flicker * (1.0 - left ** 2))
+        new[0] = generator.standard_normal() * math.sqrt(flicker)
         bias += lfilter([1.0], [1.0, -left], new)[warm:]
     return (rate * (1.0 + SCALE * generator.standard_normal()) + bias
             + generator.normal(0.0, 1.0 * DEG)
-            + generator.standard_normal(count) * one.walk / math.sqrt(one.interval))
-
-
-# The oracle: state is heading, scale factor error, bias with its walk, flicker
-
-def oracle(one: Gyro, output: np.ndarray, rests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the headings, rad, live and with hindsight, of who is told the rests."""
-    size, interval = 3 + len(CONSTANTS), one.interval
-    steps = np.concatenate([[0.0], 0.5 * interval * (output[1:] + output[:-1])])
-    turned = np.cumsum(steps)
-    still = np.concatenate([rests[1:] & rests[:-1], [False]])
-    corners = np.unique(np.concatenate([
-        np.flatnonzero(np.diff(still)) + 1, np.arange(0, len(output), round(STEP / interval)),
-        [0, len(output) - 1]]))
-    mean, spread = np.zeros(size), np.diag(
-        [0.0, SCALE ** 2, (3.0 * DEG) ** 2, *np.full(len(CONSTANTS), one.flicker)])
-    states, predicted, matrices = [], [], []
-    for begin, end in zip(corners[:-1], corners[1:]):
-        duration = (end - begin) * interval
-        left = np.exp(-duration / CONSTANTS)
-        matrix = np.diag(np.concatenate([[1.0, 1.0, 1.0], left]))
-        grown = np.diag(np.concatenate([[0.0, 0.0, one.rate_walk ** 2 * duration],
-                                        one.flicker * (1.0 - left ** 2)]))
-        white = one.walk ** 2 / duration
-        rate = (turned[end] - turned[begin]) / duration
-        seen = np.concatenate([[0.0, 0.0, 1.0], np.ones(len(CONSTANTS))])
-        if still[begin]:
-            along = spread @ seen
-            gain = along / (seen @ along + white)
-            mean, spread = mean + gain * (rate - seen @ mean), spread - np.outer(gain, along)
-            filtered = mean, spread
-            mean = matrix @ mean
-        else:
-            filtered = mean, spread
-            matrix[0, 1], matrix[0, 2:] = -rate * duration, -duration
-            mean = matrix @ mean
-            mean[0] += rate * duration
-            grown[0, 0] = white * duration ** 2
-        states.append(filtered)
-        spread = matrix @ spread @ matrix.T + grown
-        predicted.append((mean, spread))
-        matrices.append(matrix)
-    later = [predicted[-1][0]]
-    for (mean, spread), (ahead, after), matrix in zip(states[::-1], predicted[::-1],
-                                                      matrices[::-1]):
-        gain = np.linalg.lstsq(after, matrix @ spread, rcond=1e-13)[0].T
-        later.append(mean + gain @ (later[-1] - ahead))
-    moved = np.concatenate([[0.0], np.cumsum((steps[1:]) * ~still[:-1])])
-
-    def through(values: list[float]) -> np.ndarray:
-        known = np.array(values)
-        return moved + np.interp(np.arange(len(output)), corners, known - moved[corners])
-
-    live = through([0.0, *(float(mean[0]) for mean, _ in predicted)])
-    return live, through([float(mean[0]) for mean in later[::-1]])
+            + generator.standard_normal(count) * one.noise.angle_random_walk
+            / math.sqrt(one.interval))
 
 
 # This program
@@ -222,9 +162,8 @@ def oracle(one: Gyro, output: np.ndarray, rests: np.ndarray) -> tuple[np.ndarray
 def program(one: Gyro, output: np.ndarray, hindsight: bool) -> tuple[np.ndarray, ...]:
     """Return headings and variances, live or with hindsight, behind a rest before the drive."""
     first = round(CALIBRATED / one.interval)
-    noise = Noise(one.walk, one.instability, one.rate_walk)
-    bias, variance = (float(
-        output[:first].mean()), one.walk ** 2 / CALIBRATED + noise.allan_floor ** 2)
+    noise, bias = one.noise, float(output[:first].mean())
+    variance = noise.angle_random_walk ** 2 / CALIBRATED + noise.allan_floor ** 2
     model = GyroModel(noise=noise, self_calibration=SelfCalibration(
         0.0, bias, ((SCALE ** 2, 0.0), (0.0, variance))))
     rest = output[first:]
@@ -245,7 +184,9 @@ def score(one: Gyro, kind: str, minutes: float, generator: np.random.Generator
     true = np.concatenate([[0.0], np.cumsum(0.5 * one.interval * (rate[1:] + rate[:-1]))])
     true = true[first:] - true[first]
     found: dict[str, float] = {'rests': float(rests[first:].mean())}
-    for name, heading in zip(('live', 'later'), oracle(one, output, rests)):
+    told = told_rests(np.arange(len(output)) * one.interval, output, rests, one.noise,
+                      *prior(one.noise, SCALE, 3.0 * DEG))
+    for name, (heading, _) in zip(('live', 'later'), told):
         found[f'oracle, {name}'] = float(
             np.abs(heading[first:] - heading[first] - true).mean()) / DEG
     for name, hindsight in (('live', False), ('later', True)):

@@ -20,7 +20,7 @@ are not possible `InputError`; all of them are a `ValueError` whose text says wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -40,7 +40,12 @@ from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.calibration.self_calibration import default_reference_errors, ReferenceErrors
 from gyro_calibration.cli import allan as allan_answer
 from gyro_calibration.cli import plots
-from gyro_calibration.cli.compensate import CompensatedBlock, integrate_log, track_log
+from gyro_calibration.cli.compensate import (
+    check_finite,
+    CompensatedBlock,
+    integrate_log,
+    track_log,
+)
 from gyro_calibration.cli.diagnose import diagnose_logs, write_diagnosis
 from gyro_calibration.cli.fit import calibrate, draw_headings, dwell_lines, heading_lines
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
@@ -197,7 +202,7 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     `ValueError` says that no row of the log is plausible.
 
     """
-    return _make_headings(log, list(integrate_log([log], model, Threshold(0.0), 'the log')))
+    return _make_headings(log, integrate_log([log], model, Threshold(0.0)))
 
 
 def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
@@ -214,12 +219,12 @@ def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     if not model.noise.angle_random_walk:
         raise InputError('the model has no angle random walk, by which rests are found; '
                          'allan finds it in a log at rest')
-    return _make_headings(log, list(track_log(log, model, hindsight, 'the log')))
+    return _make_headings(log, iter([track_log(log, model, hindsight, 'the log')]))
 
 
-def _make_headings(log: Log, found: list[CompensatedBlock]) -> Headings:
-    parts = [piece.full_columns() for piece in found]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
+    (block,) = check_finite(blocks, 'the log')
+    columns = block.full_columns()
     return Headings(log, columns['rate_rad_s'], columns['rate_std_rad_s'],
                     columns.get('heading_rad'), columns.get('heading_std_rad'), columns)
 

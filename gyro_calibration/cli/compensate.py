@@ -75,6 +75,8 @@ def run(given: argparse.Namespace) -> Answer:
 
 #: Other inputs of effects: quantity of a log -> channel, and the sentence where the log lacks it.
 _MISSING_INPUTS = {
+    'temperature': ('temperature', 'The log has no temperature: '
+                    'the model was used at its reference temperature.'),
     'specific_force': ('specific_force',
                        'The log has no specific force: 0 m/s² was assumed.'),
     'supply': ('supply', 'The log has no supply voltage: its effect was left out.'),
@@ -92,7 +94,6 @@ class _Totals:
     refused_samples: int = 0
     temperature_clipped: int = 0
     beyond_range: int = 0
-    temperature_known: bool = False
     unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
@@ -111,7 +112,6 @@ class _Totals:
         self.refused_samples += len(log) - len(columns['rate_rad_s']) - without
         self.temperature_clipped += int(columns['temperature_clipped'].sum())
         self.beyond_range += int(columns['beyond_range'].sum())
-        self.temperature_known = log.temperature is not None
         self.unknown = tuple(
             quantity for quantity in _MISSING_INPUTS if getattr(log, quantity) is None)
         if len(columns.get('heading_rad', ())):
@@ -147,12 +147,14 @@ def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
                           found: _Totals) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and update the counts."""
     if given.rest or given.hindsight:
-        blocks = track_log(verb.read(given), model, given.hindsight, given.log)
+        blocks = iter([track_log(verb.read(given), model, given.hindsight, given.log)])
     else:
         threshold = Threshold(given.threshold * DEGREE, given.window,
                               model.noise.angle_random_walk)
-        blocks = integrate_log(verb.read_blocks(given), model, threshold, given.log)
-    for piece in blocks:
+        # what is interpolated to the stamps needs the whole log
+        logs = [verb.read(given)] if model.moves_stamps else verb.read_blocks(given)
+        blocks = integrate_log(logs, model, threshold)
+    for piece in check_finite(blocks, given.log):
         found.add(piece)
         yield piece.log, piece.full_columns()
     if found.rows == found.rows_without_output:
@@ -161,10 +163,9 @@ def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
         raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
 
 
-def _check_finite(pieces: Iterator[CompensatedBlock], model: GyroModel,
-                  file: str) -> Iterator[CompensatedBlock]:
+def check_finite(pieces: Iterator[CompensatedBlock], file: str) -> Iterator[CompensatedBlock]:
     """Refuse a sample for which the model gives no finite rate or heading."""
-    for piece in _interpolate_to_stamps(pieces) if model.moves_stamps else pieces:
+    for piece in pieces:
         for name, values in piece.columns.items():
             # a standard deviation may be unknown, nan
             finite = ~np.isinf(values) if '_std_' in name else np.isfinite(values)
@@ -178,14 +179,9 @@ def _check_finite(pieces: Iterator[CompensatedBlock], model: GyroModel,
         yield piece
 
 
-def integrate_log(logs: Iterable[Log], model: GyroModel, threshold: Threshold,
-                  name: str) -> Iterator[CompensatedBlock]:
+def integrate_log(logs: Iterable[Log], model: GyroModel,
+                  threshold: Threshold) -> Iterator[CompensatedBlock]:
     """Give the blocks of a log, each with its rates and, where it has a time, its heading."""
-    yield from _check_finite(_integrate_blocks(logs, model, threshold), model, name)
-
-
-def _integrate_blocks(logs: Iterable[Log], model: GyroModel,
-                      threshold: Threshold) -> Iterator[CompensatedBlock]:
     integrator = BlockIntegrator(threshold, model.noise, uncertainty_covariance(model))
     compensation = LogCompensation(model)
     variance: float | None = None
@@ -202,13 +198,8 @@ def _integrate_blocks(logs: Iterable[Log], model: GyroModel,
         yield CompensatedBlock(log, known, columns, integrator.intervals)
 
 
-def track_log(log: Log, model: GyroModel, hindsight: bool,
-              name: str) -> Iterator[CompensatedBlock]:
-    """Give the whole log as one piece, with heading and bias tracked as by the node."""
-    yield from _check_finite(iter([_track_block(log, model, hindsight, name)]), model, name)
-
-
-def _track_block(log: Log, model: GyroModel, hindsight: bool, name: str) -> CompensatedBlock:
+def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> CompensatedBlock:
+    """Return the whole log as one block, with heading and bias tracked as by the node."""
     known = np.abs(np.asarray(log.output)) <= model.rate_limit
     if log.time is None or known.sum() < 2:
         raise DataRefused(f'{name}: standstill detection needs two or more samples with a time; '
@@ -270,48 +261,18 @@ def _compensated_columns(model: GyroModel, compensation: LogCompensation,
         time = compensation.true_time(log.time) if model.moves_stamps else log.time
         (columns['rate_rad_s'], columns['heading_rad'],
          columns['heading_std_rad']) = integrator.add(time, result.rate, sensitivity)
-        if model.moves_stamps:
-            columns[_TRUE_TIME_COLUMN] = time
     columns['rate_std_rad_s'] = np.sqrt(
         variance + quadratic_form(uncertainty_covariance(model), sensitivity))
+    if model.moves_stamps and log.time is not None and len(log):
+        columns = {name: np.interp(log.time, time, values) for name, values in columns.items()}
     columns['temperature_clipped'] = result.temperature_clipped
     columns['beyond_range'] = result.beyond_range
     return columns
 
 
-#: Column of the true times of samples, where a model moves stamps, and the columns at these times,
-#: which are interpolated to the stamps of the rows.
-_TRUE_TIME_COLUMN = 'true_time'
-_MOVED_COLUMNS = ('rate_rad_s', 'heading_rad', 'heading_std_rad', 'rate_std_rad_s')
-
-
-def _interpolate_to_stamps(pieces: Iterator[CompensatedBlock]) -> Iterator[CompensatedBlock]:
-    """Interpolate columns at true times to the stamps of the rows, with neighbouring blocks."""
-    before: CompensatedBlock | None = None
-    here = next(pieces, None)
-    while here is not None:
-        after = next(pieces, None)
-        around = [each.columns for each in (before, here, after)
-                  if each is not None and _TRUE_TIME_COLUMN in each.columns]
-        yield _interpolate_block(here, around) if around else here
-        before, here = here, after
-
-
-def _interpolate_block(piece: CompensatedBlock,
-                       around: list[dict[str, Array]]) -> CompensatedBlock:
-    assert piece.log.time is not None
-    true = np.concatenate([columns[_TRUE_TIME_COLUMN] for columns in around])
-    stamps = piece.log.time[piece.is_plausible]
-    columns = {name: values for name, values in piece.columns.items() if name != _TRUE_TIME_COLUMN}
-    if len(true):
-        columns.update(
-            {name: np.interp(stamps, true, np.concatenate([each[name] for each in around]))
-             for name in _MOVED_COLUMNS})
-    return replace(piece, columns=columns)
-
-
 def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answer:
-    data: dict[str, Any] = {'out': given.out, **asdict(found)}
+    data: dict[str, Any] = {'out': given.out, **asdict(found),
+                            'temperature_known': 'temperature' not in found.unknown}
     heading, deviation, *_ = (
         data.pop(name) for name in ('heading', 'deviation', 'unknown', 'errors', 'first_error'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
@@ -329,9 +290,6 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answ
                      f'end {last[-1] / DEGREE:.3f} deg.')
         lines.append('Both headings start at 0 at the first row with a reference. The error that '
                      'fit states excludes the mean error and a delay of the reference.')
-    if not found.temperature_known and model.uses_channel('temperature'):
-        lines.append('The log has no temperature: '
-                     'the model was used at its reference temperature.')
     lines += [words for quantity, (channel, words) in _MISSING_INPUTS.items()
               if quantity in found.unknown and model.uses_channel(channel)]
     lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms

@@ -37,6 +37,7 @@ from gyro_calibration.calibration.selection import select_effects, Selection, TE
 from gyro_calibration.cli import plots, verb
 from gyro_calibration.cli.verb import Answer, show_progress, UsageError, wrap_line
 from gyro_calibration.diagnosis.gates import refuse_mismatch
+from gyro_calibration.diagnosis.words import display_unit
 from gyro_calibration.files import suggest_nearest
 from gyro_calibration.logs.log import DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
@@ -48,11 +49,6 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import POLYNOMIAL, write_model
 import numpy as np
-
-#: SI unit -> unit in tables for people, and the factor to it.
-_DISPLAY_UNITS = {'1': ('%', 100.0), '1/K': ('ppm/K', 1e6), 'rad/s': ('deg/s', 1 / DEGREE),
-                  'rad/s/K': ('deg/s/K', 1 / DEGREE), 'rad/s/K²': ('deg/s/K²', 1 / DEGREE),
-                  's/rad': ('s/deg', DEGREE), 's²/rad²': ('s²/deg²', DEGREE ** 2)}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -314,7 +310,8 @@ def _value_lines(model: GyroModel) -> Iterator[str]:
     """Give the table of fitted values."""
     yield f'{"value":38s} {"estimate":>12s} {"std. dev.":>10s}   {"95 % interval":27s} unit'
     for effect, parameter, value, deviation in model.estimates():
-        unit, factor = _DISPLAY_UNITS.get(parameter.unit, (parameter.unit, 1.0))
+        unit, factor = (('ppm/K', 1e6) if parameter.unit == '1/K'
+                        else display_unit(parameter.unit))
         name = effect if parameter.name == effect else f'{effect} {parameter.name}'
         low, high = ((value + sign * NORMAL_QUANTILE_975 * deviation) * factor for sign in (-1, 1))
         uncertainty = (f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}'

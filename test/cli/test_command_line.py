@@ -11,14 +11,18 @@
 """The program as people and other programs call it."""
 
 import hashlib
+import io
 import json
 import math
 import os
+import re
 import shlex
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
+from gyro_calibration.cli import verb
 from gyro_calibration.cli.main import find_verbs
 from gyro_calibration.driver.protocols import find_protocol
 from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
@@ -104,6 +108,7 @@ def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, t
     answer = json.loads(text)
     assert answer['rows'] == 2001 and abs(answer['heading_rad']) < 1e-9
     assert answer['mean_heading_error_rad'] < 1e-9 and 'errors' not in answer
+    assert answer['heading_std_rad'] is None  # the model has neither noise nor covariance
     compensated = read_log(tmp_path / 'out.csv')
     heading = np.array(compensated.others['heading_rad'], dtype=float)
     np.testing.assert_allclose(heading, compensated.reference_heading, atol=1e-9)
@@ -131,14 +136,6 @@ def test_compensate_says_how_sure_it_is(run, log, tmp_path):
     deviation = np.array(read_log(tmp_path / 'out.csv').others['heading_std_rad'], dtype=float)
     assert code == 0 and 'deg' in text
     assert deviation[-1] == pytest.approx(7.3e-4 * math.sqrt(20.0), rel=1e-6)
-
-
-def test_compensate_claims_no_deviation_where_the_model_has_none(run, model, log, tmp_path):
-    code, text, _ = run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv')
-    assert code == 0 and 'Heading at the end' in text and '+-' not in text
-    answer = json.loads(
-        run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv', '--json')[1])
-    assert answer['heading_std_rad'] is None
 
 
 def test_rows_of_others_between_the_samples_make_no_rate_noisier(run, tmp_path):
@@ -206,13 +203,13 @@ def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tol
 def test_a_new_model_names_its_log_and_a_given_one_keeps_its_origin(run, log, model, tmp_path):
     write_log(tmp_path / 'rest.csv',
               Log(output=np.random.default_rng(1).normal(size=2000), time=np.arange(2000) / 100.0))
-    for verb, given in (('self-calibrate', log), ('allan', tmp_path / 'rest.csv')):
-        assert run(verb, given, '--out', tmp_path / 'new.yaml')[0] == 0
+    for name, given in (('self-calibrate', log), ('allan', tmp_path / 'rest.csv')):
+        assert run(name, given, '--out', tmp_path / 'new.yaml')[0] == 0
         origin = read_model(tmp_path / 'new.yaml').origin
         assert origin['files'] == [{'name': given.name,
                                     'sha256': hashlib.sha256(given.read_bytes()).hexdigest()}]
         assert origin['date'] and origin['program'].startswith('gyro_calibration ')
-        assert run(verb, given, '--model', model, '--out', tmp_path / 'new.yaml')[0] == 0
+        assert run(name, given, '--model', model, '--out', tmp_path / 'new.yaml')[0] == 0
         assert read_model(tmp_path / 'new.yaml').origin == {}
 
 
@@ -386,3 +383,33 @@ def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
         code, _, error = run('fit', tmp_path / 'log.csv', '--out', tmp_path / 'model.yaml')
     assert (code == 0 and read_model(tmp_path / 'model.yaml').origin['files']
             == [{'name': 'log.csv'}]), error
+
+
+# progress, which is shown on a terminal, with the elapsed time, and nowhere else
+
+class Terminal(io.StringIO):
+    """Text that was written to a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_long_step_is_shown_with_share_and_time_and_cleared_after_it(monkeypatch):
+    terminal, until = Terminal(), time.monotonic() + 20.0
+    monkeypatch.setattr(sys, 'stderr', terminal)
+    monkeypatch.setattr(verb, 'PROGRESS_DELAY', 0.01)
+    with verb.show_progress('fit') as on_progress:
+        on_progress(0.5, 'search')
+        while 'search' not in terminal.getvalue() and time.monotonic() < until:
+            time.sleep(0.01)
+    assert re.search(r' 50 %  search \.\.\.  \d+ s', terminal.getvalue())
+    assert terminal.getvalue().endswith('\r\033[K')
+
+
+def test_a_short_step_and_a_file_show_nothing(monkeypatch):
+    for stream, delay in ((Terminal(), 20.0), (io.StringIO(), 0.0)):
+        monkeypatch.setattr(sys, 'stderr', stream)
+        monkeypatch.setattr(verb, 'PROGRESS_DELAY', delay)
+        with verb.show_progress('fit'):
+            pass
+        assert not stream.getvalue()

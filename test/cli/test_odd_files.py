@@ -29,8 +29,8 @@ import tracemalloc
 
 from gyro_calibration.files import (
     describe_error,
-    describe_os_error,
     InputError,
+    read_bytes,
     to_printable,
     write_atomically,
 )
@@ -185,11 +185,41 @@ def test_the_longest_name_that_there_may_be_is_written(folder):
     assert path.read_bytes() == b'newer' and len(os.listdir(folder)) == 3
 
 
-@pytest.mark.parametrize('number', [28, 30, 13, 36, 20, 2, 40, 122])
-def test_an_error_of_the_system_names_file_and_remedy(number):
-    said = describe_os_error(OSError(number, os.strerror(number), '/data/a\x1b[2Jb'))
-    assert (said.startswith('/data/a\\x1b[2Jb: ') and '; ' in said
-            and describe_error(OSError(number, 'X y')) == 'x y')
+# Failed writes
+
+
+@pytest.mark.parametrize('step', ['fsync', 'replace'])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, step):
+    path = tmp_path / 'model.yaml'
+    write_atomically(path, b'old')
+
+    def fail(*_):
+        raise OSError(28, 'No space left on device')
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(OSError, match='No space left'):
+        write_atomically(path, b'new')
+    assert path.read_bytes() == b'old' and os.listdir(tmp_path) == ['model.yaml']
+
+
+@pytest.mark.parametrize('kind', ['folder', 'pipe'])
+def test_what_is_no_regular_file_is_refused_and_not_left_open(tmp_path, kind):
+    (os.mkdir if kind == 'folder' else os.mkfifo)(tmp_path / 'a')
+    before = os.listdir('/proc/self/fd')
+    with pytest.raises(OSError) as raised:
+        read_bytes(tmp_path / 'a', 10)
+    assert describe_error(raised.value) == f'it is a {kind}, where a file is wanted'
+    assert len(os.listdir('/proc/self/fd')) == len(before)
+
+
+def test_the_folder_is_made(tmp_path):
+    write_atomically(tmp_path / 'a' / 'b' / 'model.yaml', b'x')
+    assert (tmp_path / 'a' / 'b' / 'model.yaml').read_bytes() == b'x'
+
+
+def test_a_folder_that_takes_no_file_is_reported_by_the_name_that_was_given():
+    with pytest.raises(FileNotFoundError) as refused:
+        write_atomically('/proc/model.yaml', b'new')
+    assert refused.value.filename == '/proc/model.yaml'
 
 
 # Links and modes

@@ -11,9 +11,9 @@
 """
 Calibrate a gyro on half of a drive against its course over ground, and correct the other half.
 
-    python benchmarks/courses.py drives FOLDER      recordings, as `wheeled_drives`, by `fit`
-    python benchmarks/courses.py diagnoses FOLDER   the same by `diagnose`
-    python benchmarks/courses.py simulated [DRIVES] drives of a simulator of its own, by `fit`
+    python benchmarks/wild.py [FOLDER]           recordings, by `diagnose`; default: `wheeled_drives`
+    python benchmarks/wild.py drives FOLDER      the same by `fit`
+    python benchmarks/wild.py simulated [DRIVES] drives of a simulator of its own, by `fit`
 
 A model is judged by the heading that it gives in the half that it was not fitted on: the output is
 corrected and integrated, and compared with the course within windows of 60 s, each less its mean,
@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import math
+import os
 from pathlib import Path
 import sys
 
@@ -229,19 +230,19 @@ def held(drives: int) -> Iterator[str]:
 
 def main(arguments: list[str]) -> None:
     """Print the table."""
-    if arguments[:1] in (['drives'], ['diagnoses']):
-        files = sorted(Path(arguments[1]).glob('*.csv.gz'))
-        logs = ((path.name.removesuffix('.csv.gz'), read_log(path)) for path in files
-                if 'as_recorded' not in path.name)
-    elif arguments[:1] == ['simulated']:
+    by_fit = arguments[:1] in (['drives'], ['simulated'])
+    if arguments[:1] == ['simulated']:
         drives = int(arguments[1]) if len(arguments) > 1 else 40
         print('\n'.join(held(drives)))
         logs = ((f'{"town" if town else "small car"} {seed}',
                  simulated(np.random.default_rng([seed, town]), town)[0]) for town in (False, True)
                 for seed in range(max(drives // 4, 1)))
     else:
-        raise SystemExit(__doc__)
-    calibrate = diagnosed if arguments[0] == 'diagnoses' else fitted
+        recordings = os.environ.get('GYRO_CALIBRATION_DATA', '.')
+        folder = Path(arguments[by_fit] if arguments[by_fit:] else f'{recordings}/wheeled_drives')
+        logs = ((path.name.removesuffix('.csv.gz'), read_log(path))
+                for path in sorted(folder.glob('*.csv.gz')) if 'as_recorded' not in path.name)
+    calibrate = fitted if by_fit else diagnosed
     print('\n'.join(summary([half for name, log in logs
                              for half in judged(f'{name:24s}', log, calibrate)])))
 
