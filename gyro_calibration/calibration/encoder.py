@@ -56,7 +56,11 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     TridiagonalMatrix,
 )
-from gyro_calibration.calibration.reference_noise import is_course, MAX_ROUNDING_STEP
+from gyro_calibration.calibration.reference_noise import (
+    encoder_step,
+    is_course,
+    MAX_ROUNDING_STEP,
+)
 from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import fit_rate, refuse_scale, RunLimits
 from gyro_calibration.heading.integration import integrate
@@ -215,14 +219,14 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
                           'turn further, faster, or more often')
     if method == 'rate':
         return replace(fit, angle_random_walk=drift.angle_random_walk), {}
-    # what repeats within a piece, as a wobble of the shaft does, is no random walk
-    if fit.angle_random_walk > drift.largest_walk:
-        return replace(fit, angle_random_walk=drift.largest_walk), {}
     # the steps of an encoder hide white noise
-    if quantization_step(motion.heading) >= MAX_ROUNDING_STEP:
-        return fit, {}
+    if encoder_step(motion.heading) >= MAX_ROUNDING_STEP:
+        return replace(fit, angle_random_walk=min(fit.angle_random_walk, drift.walk_bounds[1])), {}
     low, high = fit.angle_random_walk / np.sqrt(
         stats.chi2.ppf([0.975, 0.025], fit.dof) / fit.dof)
+    # what repeats within a piece, as a wobble of the shaft does, is no random walk
+    if fit.angle_random_walk > drift.walk_bounds[1]:
+        low, fit = drift.walk_bounds[0], replace(fit, angle_random_walk=drift.walk_bounds[1])
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
@@ -315,8 +319,8 @@ class _Drift:
     ----------
     bias, deviation : mean bias over the log and its standard deviation, rad/s
     wander_deviation : standard deviation of the mean bias less the bias at the beginning, rad/s
-    angle_random_walk, largest_walk : rad/√s, over times longer than a piece of the log, and its
-        upper limit (97.5 %) if nothing else moves the heading from piece to piece
+    angle_random_walk, walk_bounds : rad/√s, over times longer than a piece of the log, and its
+        95 % bounds if nothing else moves the heading from piece to piece
 
     """
 
@@ -324,7 +328,7 @@ class _Drift:
     deviation: float
     wander_deviation: float
     angle_random_walk: float
-    largest_walk: float
+    walk_bounds: tuple[float, float]
 
 
 def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) -> _Drift:
@@ -376,7 +380,8 @@ def _estimate_drift(motion: Motion, error: Array, bias: float, technology: str) 
     squares = white @ white - (white @ steady) ** 2 / (steady @ steady)
     return _Drift(bias + float(found.values[0]), float(found.deviations[0]),
                   math.sqrt(found.unobservable_variance), found.size('angle_random_walk'),
-                  math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1)))
+                  (math.sqrt(squares / stats.chi2.ppf(0.975, len(white) - 1)),
+                   math.sqrt(squares / stats.chi2.ppf(0.025, len(white) - 1))))
 
 
 def _apply_drift(fit: ScaleBiasFit, drift: _Drift) -> ScaleBiasFit:
