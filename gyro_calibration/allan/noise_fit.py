@@ -478,22 +478,18 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
                           f'rad/s; wanted {_MIN_OCTAVES} octaves, all above 0: record longer and '
                           'without losses')
     ranking = rank_combinations(OctaveVariances.from_chart(chart))
+    process = None
+    if ranking.best_process is not None and ranking.best_process.octaves.process is not None:
+        time = ranking.best_process.octaves.process.correlation_time * interval
+        process = GaussMarkov(
+            math.sqrt(2.0 / time * ranking.best_process.squares[_PROCESS]), time)
     figures = {part.symbol: _build_figure(ranking, place, interval)
                for place, part in enumerate(NOISE_TERMS)}
     return NoiseFit(figures, chart, float(chart.time[ranking.first_octave]), float(chart.time[-1]),
                     ranking.misfit,
                     tuple(sorted({''.join(NOISE_TERMS[place].symbol
                                           for place in each.active_terms if place != _FILTER_BEND)
-                                  for each in ranking.alternatives})),
-                    _select_process(ranking, interval))
-
-
-def _select_process(ranking: Ranking, interval: float) -> GaussMarkov | None:
-    """Return the process in SI, if the best fit has one."""
-    if ranking.best_process is None or ranking.best_process.octaves.process is None:
-        return None
-    time = ranking.best_process.octaves.process.correlation_time * interval
-    return GaussMarkov(math.sqrt(2.0 / time * ranking.best_process.squares[_PROCESS]), time)
+                                  for each in ranking.alternatives})), process)
 
 
 def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:

@@ -83,8 +83,15 @@ class Scatter:
     inliers: Mask
 
     def deviation(self, dwells: Dwells) -> Array:
-        """Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,)."""
-        return np.sqrt(_own_deviation(dwells) ** 2 + self.dwell_bias ** 2
+        """
+        Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,).
+
+        A deviation of its own that is not known is the rms of the others.
+
+        """
+        known = np.isfinite(dwells.deviation)
+        typical = rms(dwells.deviation[known]) if known.any() else 0.0
+        return np.sqrt(np.where(known, dwells.deviation, typical) ** 2 + self.dwell_bias ** 2
                        + (self.dwell_scale * dwells.rate) ** 2)
 
     def sweep_columns(self, dwells: Dwells) -> Array:
@@ -99,13 +106,6 @@ class Scatter:
             sign, len(dwells))[:, None], np.unique(dwells.sweep, return_inverse=True)[1])
         return math.sqrt(float(np.sum(self.deviation(dwells) ** 2) + np.sum(shared ** 2))) / len(
             dwells)
-
-
-def _own_deviation(dwells: Dwells) -> Array:
-    """Return the deviations of the dwells, rad/s; an unknown one is the rms of the others."""
-    known = np.isfinite(dwells.deviation)
-    typical = rms(dwells.deviation[known]) if known.any() else 0.0
-    return np.where(known, dwells.deviation, typical)
 
 
 def rms(values: Array) -> float:

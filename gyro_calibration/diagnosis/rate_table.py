@@ -491,7 +491,9 @@ def _test_curve(name: str, fit: Calibration, known: Array, columns: Array,
                 by_model: Array | None) -> tuple[Unexplained, float]:
     """Return share, p-value and reduction of the misfit of a curve given the known columns."""
     whitener, error = Whitener(fit.used, fit.scatter), fit.residual[fit.scatter.inliers]
-    known_basis = _orthonormal(whitener.whiten(known), 1e-6)
+    known = whitener.whiten(known)
+    left, sizes, _ = np.linalg.svd(known / np.linalg.norm(known, axis=0), full_matrices=False)
+    known_basis = left[:, sizes > 1e-6 * sizes[0]]
     white = whitener.whiten(error)
     white = white - known_basis @ (known_basis.T @ white)
     curve = whitener.whiten(columns)
@@ -516,11 +518,6 @@ def _test_curve(name: str, fit: Calibration, known: Array, columns: Array,
                         np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
     chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.dof))
     return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
-
-
-def _orthonormal(columns: Array, tolerance: float) -> Array:
-    left, sizes, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
-    return left[:, sizes > tolerance * sizes[0]]
 
 
 def _structure_curves(dwells: Dwells) -> dict[str, Array]:
