@@ -276,9 +276,9 @@ _TURN_LAG_DEVIATION = 0.02
 _MAX_TURN_GROUPS = 12
 #: A response of higher order, as of a robot that overshoots, as a sum of second differences of the
 #: heading: their times, s, and prior standard deviation, 1.
-_RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.15 * np.arange(1, 6), 0.3
+_RESPONSE_DELAYS, _RESPONSE_DEVIATION = 0.2 * np.arange(1, 5), 0.3
 #: Possible factors of the prior standard deviations of the response, and of slips.
-_PRIOR_FACTORS = np.geomspace(1e-3, 1.0, 4)
+_PRIOR_FACTORS = np.array([1e-3, 0.1, 1.0])
 
 
 def tracking_error_columns(motion: Motion, time: Array,

@@ -57,6 +57,7 @@ _LOG_EXPERIMENTS: Mapping[str, str] = {
     'scale_factor_error': 'make whole turns between marks, or use a second reference',
     'quadratic_nonlinearity': 'turn both ways at many speeds, slow ones too, with the sensor on '
                               'the axis of the table',
+    'bias_temperature': 'heat and cool the gyro within one log, and start it both cold and warm',
 }
 
 #: Name, sentence, unit, origin, required channels, variable along which it shows, experiment.

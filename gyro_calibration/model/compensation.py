@@ -91,7 +91,8 @@ def _compensate_at_once(model: GyroModel, output: Number, temperature: Number,
             else environment.with_rate(seen, seen))
         computed = abs(modelled) < _MAX_COMPUTABLE_RATE
         if computed is not True and not np.all(computed):
-            modelled = np.asarray(np.where(computed, modelled, seen))[()]
+            replaced: Number = np.where(computed, modelled, seen)
+            modelled = replaced[()]
             unexplained = unexplained | np.logical_not(computed)
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen is not output:

@@ -20,6 +20,7 @@ from typing import Any
 from gyro_calibration.files import (
     describe_error,
     InputError,
+    MAX_MAGNITUDE,
     suggest_nearest,
     write_atomically,
 )
@@ -107,7 +108,7 @@ def _parse_content(content: Any) -> GyroModel:
         else _parse_covariance('covariance', top['covariance'], size),
         _parse_range('valid.rate', valid.get('rate')), temperature_range,
         parse_number('reference_temperature', top.get('reference_temperature', middle)),
-        Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_nonnegative))),
+        Noise(**parse_section('noise', dict.fromkeys(_NOISE_NAMES, _parse_noise_figure))),
         {name: parse_text(f'gyro.{name}', value)
          for name, value in parse_section('gyro', None).items()},
         parse_section('origin', None), _parse_self_calibration(top.get('self_calibration')),
@@ -118,6 +119,14 @@ def _parse_content(content: Any) -> GyroModel:
 
 def _parse_nonnegative(key_path: str, value: Any) -> float:
     return parse_number(key_path, value, low=0.0)
+
+
+def _parse_noise_figure(key_path: str, value: Any) -> float:
+    """Read a noise figure: 0, or large enough that its square does not underflow."""
+    if 0.0 < (size := _parse_nonnegative(key_path, value)) < 1.0 / MAX_MAGNITUDE:
+        raise InvalidValue(key_path, value,
+                           f'0 where it is not known, or at least {1.0 / MAX_MAGNITUDE}')
+    return size
 
 
 def _parse_range(key_path: str, value: Any) -> tuple[float, float]:

@@ -73,6 +73,8 @@ BAD = {
     'a list': ('[1, 2]', 'the file is [1, 2]'),
     'no YAML': ('effects: {bias: {bias: 0.01}\nvalid: [', 'cannot be read as YAML (line 2: '),
     'binary': (b'\xff\xfe\x00\x01', 'cannot be read as YAML'),
+    'a noise that vanishes when it is squared': (
+        'effects: {}\nnoise: {angle_random_walk: 1.0e-300}', 'noise.angle_random_walk is 1e-300'),
     'other YAML': ('name: a robot\nwheels: 4\n', 'effects is empty'),
     'another format': ('format: a/b\neffects: {}\n', "format is 'a/b'"),
     'newer version': ('version: 2\neffects: {}',
