@@ -40,7 +40,7 @@ from scipy.special import chdtri, ndtri
 #: Length of a block of samples, and of the window whose energy is tested, s.
 BLOCK_DURATION, WINDOW_DURATION = 0.1, 0.5
 #: Durations, s, over which the mean of the rate is compared with the bias known before them.
-MEAN_LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+MEAN_LAGS = tuple((2.0 ** np.arange(7)).tolist())
 #: Least number of samples in a window.
 _MIN_WINDOW_SAMPLES = 8
 #: Windows in the memory of the noise, least number for its use, and largest ratio to the noise of
@@ -330,19 +330,12 @@ class EvenSamples:
 
     Attributes
     ----------
-    time, rate, intervals, half_intervals, angles : stamps, rates, the intervals before them, half
-        of them, and the integrals of the rates over them, shape (n,)
-    motion_sensitivity, rest_sensitivity : sensitivities, shape (n, m)
-    wheels, still : as in `HeadingTracker.follow`, n of them, or None
     used_sensitivity : the sensitivities used, first that of the sample before, shape (n + 1, m)
-    block_starts, block_stops, whole_blocks : first samples and ends of the blocks, and range of
-        complete blocks
+    whole_blocks : range of complete blocks
     block_sums : duration, integral, remaining share of a pending correction, and sums of the
         rates, their squares, and the squares of their steps, by block
     sensitivity_integrals : integrals of the sensitivities in motion and at rest, shape (k, m) each
     results : the result of `HeadingTracker.follow`
-    last_at_rest : whether the last sample was at rest
-    epochs : so far
 
     """
 

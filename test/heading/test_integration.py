@@ -108,35 +108,12 @@ def test_single_samples_pass_half_of_the_noise_at_rest_and_the_mean_of_0_2_s_lit
     assert passed[0.0] == pytest.approx(0.472, abs=0.02) and passed[0.2] < 0.01
 
 
-def test_the_mean_over_the_window_decides():
-    time = np.arange(100) * INTERVAL
-    rate = np.where(np.arange(100) < 50, 0.0, 1.0 * DEGREE)
-    kept = filtered_singly(Threshold(0.3 * DEGREE, 0.2), time, rate)
-    # Six of twenty samples at 1 deg/s have a mean of 0.3 deg/s.
-    assert np.flatnonzero(kept)[0] == 50 + 6 - 1
-
-
 def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
     time = np.arange(500) * INTERVAL
     rate = 5.0 * DEGREE * np.sin(2 * np.pi * 10.0 * time)  # two whole periods in the window
     assert (filtered_singly(Threshold(), time, rate)[20:] == 0.0).all()
     seen = filtered_singly(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate)
     assert np.array_equal(seen[20:], rate[20:])
-
-
-def test_the_rest_test_takes_noise_for_rest():
-    time = np.arange(20001) * INTERVAL
-    rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    assert (filter_rates(Threshold(angle_random_walk=XV3500.angle_random_walk), time,
-                         rate) != 0.0).mean() < 0.01
-
-
-def test_a_cleared_window_knows_nothing_of_before():
-    threshold = ThresholdFilter(Threshold(window=10.0))
-    for index in range(50):
-        threshold.apply(index * INTERVAL, 1.0)
-    threshold.clear()
-    assert threshold.apply(0.6, 0.001) == 0.0
 
 
 S, B = 0.02, 0.002
