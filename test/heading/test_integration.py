@@ -142,7 +142,8 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
 @pytest.mark.parametrize('offset', [0.0, 1.7e9], ids=['from zero', 'stamps since 1970'])
 def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
-    time, rate = (values[:3000] for values in noisy_robot())
+    time, rate = (np.delete(values[:3000], np.r_[900:905, 1300, 2000:2020])
+                  for values in noisy_robot())
     sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
     tracker = HeadingTracker(XV3500, uncertainty_covariance(model),
                              Settings(false_alarms=0.0, threshold=settings))
@@ -151,8 +152,9 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
         assert not tracker.add(float(time[index]) + offset, float(rate[index]),
                                sensitivity[:, index])
         headings.append(tracker.heading)
-    _, heading, deviation = BlockIntegrator(settings, XV3500, uncertainty_covariance(model)).add(
-        time, rate, sensitivity)
+    integrator = BlockIntegrator(settings, XV3500, uncertainty_covariance(model))
+    _, heading, deviation = integrator.add(time, rate, sensitivity)
+    assert integrator.intervals.lost_samples == tracker.intervals.lost_samples == 26
     # Stamps near 1e9 s have steps of 0.1 us.
     assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
     tracker.finish()
