@@ -106,8 +106,7 @@ class _RestStretch:
     Attributes
     ----------
     start_time : stamp of the first, s
-    sensitivity : sensitivity of the rate to each uncertain value, shape (m,), first at the begin,
-        finally the mean
+    sensitivity : of the rate to each uncertain value at the end, shape (m,)
     count, rate_sum, temperature_sum : number, and sums of rates after the model, rad/s, and of
         temperatures, degC
     has_ended : whether the rest has ended
@@ -387,8 +386,7 @@ class HeadingEstimator:
         elif self.temperature is None or self.is_temperature_lost:
             self._stretch = None
         else:
-            self._extend_stretch(time, time, 1, float(result.model_rate), self.temperature,
-                                 [self._rest_sensitivity])
+            self._extend_stretch(time, time, 1, float(result.model_rate), self.temperature)
         if tracker.is_resting:
             self._add_to_table(now, True)
         return message
@@ -543,7 +541,7 @@ class HeadingEstimator:
         if first < len(time) and temperature is not None:
             self._extend_stretch(float(time[first]), self._time, len(time) - first,
                                  float(np.sum(result.model_rate[first:])),
-                                 float(temperature[first:].sum()), (still[first], still[-1]))
+                                 float(temperature[first:].sum()))
 
     def _held_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
                             distance: Array) -> list[Array]:
@@ -566,25 +564,14 @@ class HeadingEstimator:
     # The bias at rest for the next run
 
     def _extend_stretch(self, begin: float, end: float, count: int, modelled: float,
-                        temperature: float, seen: Sequence[Array]) -> None:
-        """
-        Add samples at rest to a stretch.
-
-        Parameters
-        ----------
-        begin, end : stamps of the first and the last, s
-        count, modelled, temperature : their number, and sums as in `_RestStretch`
-        seen : sensitivities at rest, of which the first and the last count
-
-        """
-        if self._stretch is None:
-            self._stretch = _RestStretch(begin, seen[0])
-        stretch = self._stretch
+                        temperature: float) -> None:
+        """Add samples at rest: stamps of the first and the last, s, and as in `_RestStretch`."""
+        stretch = self._stretch = self._stretch or _RestStretch(begin, self._rest_sensitivity)
         stretch.count += count
         stretch.rate_sum += modelled
         stretch.temperature_sum += temperature
         if end - stretch.start_time >= REST_DURATION - TIME_TOLERANCE:
-            stretch.sensitivity = 0.5 * (stretch.sensitivity + seen[-1])
+            stretch.sensitivity = self._rest_sensitivity
             self._pending_stretches.append(stretch)
             self._stretch = None
 

@@ -141,6 +141,13 @@ class HeadingState:
         return HeadingState(self.noise, mean,
                             matrix @ self.covariance @ matrix.T + step.process_noise)
 
+    def heading_variance(self, rate_integral: RateIntegral) -> float:
+        """Return the variance of the heading after a time in motion, rad²."""
+        step = self.transition(rate_integral)
+        step.observation[HEADING_INDEX] -= 1.0
+        return float(step.observation @ self.covariance @ step.observation
+                     + step.process_noise[HEADING_INDEX, HEADING_INDEX])
+
     def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time at rest, with its measurement."""
         step = self.transition(rate_integral)

@@ -120,7 +120,7 @@ class EnergyDetector:
         """Begin with an empty window."""
         self.noise_factor = 1.0
         self._blocks = deque[Block]()
-        self._energies = deque[float](maxlen=_MAX_WINDOWS)
+        self._energies = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
         self.configure(noise, false_alarms)
         self._since_last_window, self._interval = 0.0, BLOCK_DURATION
         self._sudden_limit: float | None = None
@@ -184,10 +184,10 @@ class EnergyDetector:
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return
         self._since_last_window = 0.0
-        self._energies.append(min(energy, differences))
+        self._energies.append((energy, differences))
         if len(self._energies) >= _MIN_WINDOWS:
-            quietest = (sorted(self._energies)[len(self._energies) // 10] * (count - 1)
-                        / _chi_squared_quantile(count - 1, 0.9))
+            quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._energies))
+            quietest *= (count - 1) / _chi_squared_quantile(count - 1, 0.9)
             self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
     def sudden_limit(self) -> float:

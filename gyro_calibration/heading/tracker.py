@@ -35,7 +35,6 @@ from gyro_calibration.heading.integration import (
 )
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX,
-    heading_variances,
     HeadingState,
     initial_state,
     RateIntegral,
@@ -252,8 +251,7 @@ class HeadingTracker:
             return (float(self._state.covariance[HEADING_INDEX, HEADING_INDEX])
                     + self._pending_correction ** 2)
         if self._open_variance is None:
-            self._open_variance = float(heading_variances(
-                [self._state], [self._open_integral])[0])
+            self._open_variance = self._state.heading_variance(self._open_integral)
         part = self._block_integral
         return (self._open_variance + self._state.noise.angle_random_walk ** 2 * part.duration
                 + part.lost_variance + part.extra_noise_variance + self._pending_correction ** 2)
