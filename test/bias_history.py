@@ -13,7 +13,7 @@
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.heading.bias_table import BiasTable, Prior, propagate_calibration
+from gyro_calibration.heading.bias_table import BiasTable, Prior
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -168,8 +168,8 @@ def carried_answers(generator, curve, runs=4, rests=12, **given):
                           temperature=history.temperature[0, made])
     time, rows = history.time[run, 0], []
     for table in (BiasTable(MODEL), learned(history, run)):
-        now, _ = propagate_calibration(calibration, table, time - history.time[0, made], time,
-                                       history.temperature[run, 0])
+        now, _ = table.propagate_calibration(calibration, time - history.time[0, made], time,
+                                             history.temperature[run, 0])
         rows.append((now.bias - history.bias[run, 0], now.standard_deviations[1]))
     return np.array(rows)
 

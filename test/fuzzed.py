@@ -49,7 +49,6 @@ from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.heading.bias_table import (
     BiasTable,
-    propagate_calibration,
     read_bias_table,
     write_bias_table,
 )
@@ -364,9 +363,9 @@ def check_bias_table(data: bytes) -> bool:
     with np.errstate(all='ignore'):
         bias, variance = table.predict(25.0, 1.7e9)
         change, spread = table.bias_difference(10.0, 30.0, 1.7e9)
-        now, _ = propagate_calibration(
-            SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0), table,
-            3600.0, 1.7e9, 25.0)
+        now, _ = table.propagate_calibration(
+            SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0), 3600.0,
+            1.7e9, 25.0)
     assert (all(map(math.isfinite, (bias, change, spread, now.bias))) and variance > 0.0
             and spread >= 0.0)
     table.add(24.0, bias, 1e-8, 1.7e9)

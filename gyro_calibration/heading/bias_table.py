@@ -52,17 +52,18 @@ import numpy as np
 BIN_WIDTH = 1.5
 #: Largest number of entries.
 MAX_ENTRIES = 80
-#: Averaging time of a rest, s, for its variance by flicker.
+#: Averaging time of a rest, s.
 REST_DURATION = 10.0
 #: Standard deviations from which on an estimate is an outlier.
-_OUTLIER_SIGMAS = 4.5
+OUTLIER_SIGMAS = 4.5
 #: Consecutive outliers that agree with each other and are taken for a jump.
 _JUMP_ESTIMATES = 3
 #: Shortest time between two writes, s.
 MIN_WRITE_INTERVAL = 600.0
-_YEAR = 365.25 * 86400.0
-#: Largest time between a calibration and an entry of the same run, s.
-_SAME_RUN_DURATION = 3600.0
+YEAR = 365.25 * 86400.0
+#: Largest time between a calibration and an entry of the same run, and step of the clock after
+#: which the age of a calibration is computed again, s.
+AGE_TOLERANCE = 3600.0
 #: Least variance of a bias, (rad/s)².
 _MIN_VARIANCE = 1e-18
 #: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probabilities.
@@ -199,7 +200,7 @@ class BiasTable:
             return (f'a bias of {bias:g} rad/s at {temperature:g} degC with a variance of '
                     f'{variance:g} at {time:g} s is not used: it is not plausible for a gyro')
         before, known = self.predict(temperature, time)
-        if abs(bias - before) <= _OUTLIER_SIGMAS * math.sqrt(known + variance):
+        if abs(bias - before) <= OUTLIER_SIGMAS * math.sqrt(known + variance):
             self._held_entries.clear()
             self._add_entry(given)
             return ''
@@ -218,7 +219,7 @@ class BiasTable:
         variance = (held.variance + given.variance + self._wander_variance(given.time - held.time)
                     + self._prior.coefficient ** 2 * _mean_square_change(
                         given.temperature - held.temperature, self._prior.correlation_length))
-        return abs(given.bias - held.bias) <= _OUTLIER_SIGMAS * math.sqrt(variance)
+        return abs(given.bias - held.bias) <= OUTLIER_SIGMAS * math.sqrt(variance)
 
     def _add_jump(self, variance: float) -> None:
         """Add a jump at all temperatures, and the estimates held back for it."""
@@ -294,35 +295,67 @@ class BiasTable:
             np.maximum(own - explained + of_shared ** 2 / seen.information[:, None], 0.0))
         return np.reshape(change, shape), np.reshape(variance, shape)
 
-    def combine_with_calibration(self, calibration: SelfCalibration, age: float, time: float,
-                                 temperature: float | None,
-                                 this_run: bool) -> tuple[float, float, float]:
-        """Return bias and variance now, and the weight of the calibration in the bias."""
-        here = (self._model.reference_temperature if calibration.temperature is None
-                else calibration.temperature)
-        now = here if temperature is None else temperature
-        own = calibration.standard_deviations[1] ** 2
-        if calibration.temperature is None:
-            here, own = now, own + self._unknown_variance()
-        made = time - age
-        jumped = any(each.time > made for each in self.jumps)
-        entry = Entry(here, calibration.bias, own, made,
-                      self.run if this_run and not jumped else self._run_at(made))
-        bias, variance, weight = self._predict_with_weight([*self.entries, entry], now, time)
-        return bias, variance + (self._unknown_variance() if temperature is None else 0.0), weight
+    def propagate_calibration(self, calibration: SelfCalibration, age: float, time: float,
+                              temperature: float | None = None,
+                              this_run: bool = False) -> tuple[SelfCalibration, str]:
+        """
+        Return a stored calibration propagated to the present.
+
+        It is combined with the table as one more estimate of the bias, at its own temperature and
+        time. It is for the start of a run, or the restart of a tracker; within a run a
+        `TemperatureCorrection` continues from there. The result includes the age: it is to be used
+        as a calibration made at present.
+
+        Parameters
+        ----------
+        calibration : as it was stored, with a covariance
+        age : of the calibration, s
+        time : now, s since 1970
+        temperature : now, degC; None where it is not known
+        this_run : the calibration was made in this run
+
+        Returns
+        -------
+        the calibration with the present bias and covariance, to be used and not to be stored; and
+        a sentence for diagnostics if age or temperature matters, else ''
+
+        """
+        assert calibration.covariance is not None
+        (of_scale, shared), (_, own) = calibration.covariance
+        here, made = calibration.temperature, time - age
+        if here is None:
+            here = self._model.reference_temperature if temperature is None else temperature
+        why = ('at a temperature that is not known'
+               if calibration.temperature is None or temperature is None
+               else f'at {here:.1f} degC, and now it is {temperature:.1f} degC')
+        entry = Entry(
+            here, calibration.bias,
+            own + (self._unknown_variance() if calibration.temperature is None else 0.0), made,
+            self.run if this_run and not any(each.time > made for each in self.jumps)
+            else self._run_at(made))
+        bias, variance, weight = self._predict_with_weight(
+            [*self.entries, entry], here if temperature is None else temperature, time)
+        if temperature is None:
+            variance += self._unknown_variance()
+        message = '' if variance < 2.0 * own else (
+            f'the calibration was made {timedelta(seconds=round(age))} ago {why}: the standard '
+            f'deviation of its bias is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
+            f'{math.sqrt(own) / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
+        covariance = (of_scale, weight * shared), (weight * shared, variance)
+        return replace(calibration, bias=bias, covariance=covariance), message
 
     def _run_at(self, time: float) -> float:
         """Return the run of a time, or a number between the jumps before and after it."""
         after = max([-1, *(each.run for each in self.jumps if each.time <= time)])
         until = min([self.run, *(each.run for each in self.jumps if each.time > time)])
         near = {abs(each.time - time): each.run for each in self.entries
-                if after <= each.run < until and abs(each.time - time) < _SAME_RUN_DURATION}
+                if after <= each.run < until and abs(each.time - time) < AGE_TOLERANCE}
         return near[min(near)] if near else after + 0.5
 
     def _unknown_variance(self) -> float:
-        """Return the variance of the bias, (rad/s)², where the temperature is unknown."""
-        return (float(_SIZE_PROBABILITIES @ (self._prior_coefficient() ** 2 * _SIZES[:, 0] ** 2))
-                * self._prior.unknown_distance ** 2)
+        """Return the variance of the bias, (rad/s)², where the model has no temperature."""
+        return (float(_SIZE_PROBABILITIES @ _SIZES[:, 0] ** 2)
+                * (self._prior.coefficient * self._prior.unknown_distance) ** 2)
 
     def _prior_coefficient(self) -> float:
         """Return the prior temperature coefficient within the range of the model, rad/s/K."""
@@ -376,7 +409,7 @@ class BiasTable:
         wander = self._wander_variance(_pairwise_differences(times)) * (1.0 - np.eye(len(times)))
         alike = np.exp(
             -np.abs(_pairwise_differences(temperatures)) / self._prior.correlation_length)
-        ageing = self._prior.ageing ** 2 / _YEAR * alike * np.minimum(age[:, None], age)
+        ageing = self._prior.ageing ** 2 / YEAR * alike * np.minimum(age[:, None], age)
         fixed = (_covariance_of_differences(self._wander_variance(age), wander)
                  + np.diag(variances) + ageing + self._jump_covariance(runs))
         by_run = (self._prior.turn_on ** 2
@@ -500,56 +533,6 @@ def _is_possible(entry: Entry) -> bool:
 def _clip_to_range(temperature: float, time: float) -> tuple[float, float]:
     """Return temperature, degC, and time, s since 1970, limited to their possible ranges."""
     return min(max(temperature, -273.15), 1e4), min(max(time, 0.0), 1e11)
-
-
-def propagate_calibration(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
-                          temperature: float | None = None,
-                          this_run: bool = False) -> tuple[SelfCalibration, str]:
-    """
-    Return a stored calibration propagated to the present by the table.
-
-    It is combined with the table as one more estimate of the bias, at its own temperature and
-    time. It is for the start of a run, or the restart of a tracker; within a run an
-    `assumptions.TemperatureCorrection` continues from there. The result includes the age: it is to
-    be used as a calibration made at present.
-
-    Parameters
-    ----------
-    calibration : as it was stored, with a covariance
-    table : of the model in use; may be empty
-    age : of the calibration, s
-    time : now, s since 1970
-    temperature : now, degC; None where it is not known
-    this_run : the calibration was made in this run
-
-    Returns
-    -------
-    the calibration with the present bias and covariance, to be used and not to be stored; and a
-    sentence for diagnostics if age or temperature matters, else ''
-
-    """
-    assert calibration.covariance is not None
-    (a, c), _ = calibration.covariance
-    bias, variance, weight = table.combine_with_calibration(
-        calibration, age, time, temperature, this_run)
-    return (replace(calibration, bias=bias,
-                    covariance=((a, weight * c), (weight * c, variance))),
-            _propagation_message(calibration, table, age, temperature, variance))
-
-
-def _propagation_message(calibration: SelfCalibration, table: BiasTable, age: float,
-                         temperature: float | None, variance: float) -> str:
-    """Return a sentence if the bias of a calibration has become less certain; else ''."""
-    own = calibration.standard_deviations[1]
-    if variance < 2.0 * own ** 2:
-        return ''
-    if calibration.temperature is None or temperature is None:
-        why = 'at a temperature that is not known'
-    else:
-        why = f'at {calibration.temperature:.1f} degC, and now it is {temperature:.1f} degC'
-    return (f'the calibration was made {timedelta(seconds=round(age))} ago {why}: the standard '
-            f'deviation of its bias is now {math.sqrt(variance) / DEGREE:.4f} deg/s, then it was '
-            f'{own / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
 
 
 FORMAT = 'gyro_calibration/bias_table'

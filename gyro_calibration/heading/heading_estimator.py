@@ -27,9 +27,13 @@ import math
 from typing import Any
 
 from gyro_calibration.heading.bias_table import (
+    AGE_TOLERANCE,
     BiasTable,
-    propagate_calibration,
+    OUTLIER_SIGMAS,
+    Prior,
+    REST_DURATION,
     TemperatureCorrection,
+    YEAR,
 )
 from gyro_calibration.heading.integration import TIME_TOLERANCE
 from gyro_calibration.heading.stationary import BLOCK_DURATION
@@ -47,24 +51,15 @@ from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_s
 import numpy as np
 from scipy.linalg import block_diag
 
-#: Averaging time of an entry of the table at rest, s.
-STRETCH_DURATION = 10.0
-#: Standard deviations from the final bias of the tracker beyond which a mean was not at rest.
-_OUTLIER_SIGMAS = 4.5
 #: Distance from the temperature of the last start, K, at which the tracker is restarted at rest,
 #: with the new entries of the table.
 _RESTART_DISTANCE = 5.0
-#: Assumed drift of the temperature after its last message, K/s, and its limit, K.
-_LOST_TEMPERATURE_RATE, _MAX_LOST_DISTANCE = 1.0 / 60.0, 15.0
+#: Assumed drift of the temperature after its last message, K/s.
+_LOST_TEMPERATURE_RATE = 1.0 / 60.0
 #: Age of a temperature, s, from which on it is held with a growing uncertainty.
 TEMPERATURE_TIMEOUT = 10.0
-#: Step of the clock, s, after which the age of a calibration is computed again, and largest time
-#: that a calibration may be dated in the future.
-_AGE_TOLERANCE = 3600.0
 #: Largest plausible stamp, s, and specific force, m/s².
 _MAX_TIME, _MAX_SPECIFIC_FORCE = 1e12, 1e5
-#: Assumed age of a calibration without a date, s.
-_YEAR = 365.25 * 86400.0
 
 
 @dataclass(frozen=True)
@@ -103,33 +98,6 @@ def with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroM
     return with_self_calibration(model, replace(calibration, covariance=assumptions.covariance))
 
 
-def uncertain_covariance(model: GyroModel, assumptions: Assumptions) -> Array:
-    """
-    Return the covariance of the temperature coefficient and of a model's uncertain values, (m, m).
-
-    The model is that of `with_assumed_covariance`.
-
-    """
-    return np.asarray(block_diag(assumptions.bias_temperature_coefficient ** 2,
-                                 uncertainty_covariance(model)))
-
-
-def uncertain_sensitivity(sensitivity: Array, temperature_distance: Number) -> Array:
-    """
-    Return the sensitivity of the rate to each value of `uncertain_covariance`, shape (m, ...).
-
-    Parameters
-    ----------
-    sensitivity : `compensation.rate_sensitivity` of the same model, shape (m - 1, ...)
-    temperature_distance : of the temperature from that at which the bias is known, K, a number or
-        shape (...)
-
-    """
-    whole = np.empty((len(sensitivity) + 1, *sensitivity.shape[1:]))
-    whole[0], whole[1:] = -temperature_distance, sensitivity
-    return whole
-
-
 @dataclass
 class _RestStretch:
     """
@@ -138,8 +106,7 @@ class _RestStretch:
     Attributes
     ----------
     start_time : stamp of the first, s
-    sensitivity : sensitivity of the rate to each uncertain value, shape (m,), first at the begin,
-        finally the mean
+    sensitivity : of the rate to each uncertain value at the end, shape (m,)
     count, rate_sum, temperature_sum : number, and sums of rates after the model, rad/s, and of
         temperatures, degC
     has_ended : whether the rest has ended
@@ -162,6 +129,8 @@ class HeadingEstimator:
     ----------
     model : with the stored calibration
     current_model : the model with the present calibration, by which samples are compensated
+    covariance : of the temperature coefficient of the bias and of the uncertain values of the
+        current model, shape (m, m)
     tracker : of the heading
     table : of biases at rest
     is_calibrated_this_run : whether the calibration was made in this run
@@ -247,7 +216,7 @@ class HeadingEstimator:
         calibration = self.model.self_calibration
         old = (not self.is_calibrated_this_run
                and (calibration is not None or len(self.table.entries) > 0))
-        self._age_changed = self._age_changed or (old and abs(step) > _AGE_TOLERANCE)
+        self._age_changed = self._age_changed or (old and abs(step) > AGE_TOLERANCE)
         if self.is_calibrated_this_run and calibration is not None and calibration.time:
             then = datetime.fromisoformat(calibration.time) + timedelta(seconds=step)
             self.model = with_self_calibration(
@@ -260,52 +229,25 @@ class HeadingEstimator:
         self._calibration_message = ''
         self.current_model, age = ((with_assumed_covariance(self.model, self._assumptions), 0.0)
                                    if is_fresh else self._propagated_model(now))
-        self.covariance = uncertain_covariance(self.current_model, self._assumptions)
-        temperature = self.model.reference_temperature
-        sensitivity_slope = None if self.current_model.needs_history else np.subtract(
-            *(self._uncertain_sensitivity(rate, rate, temperature, None, 0.0)
-              for rate in (DEGREE, 0.0))) / DEGREE
+        self.covariance: Array = block_diag(self._assumptions.bias_temperature_coefficient ** 2,
+                                            uncertainty_covariance(self.current_model))
         if self._tracker is None:
             self._tracker = HeadingTracker(self.current_model.noise, self.covariance,
-                                           self._settings, age, self._keeps_steps,
-                                           sensitivity_slope)
+                                           self._settings, age, self._keeps_steps)
         else:
-            self._tracker.use_calibration(self.current_model.noise, self.covariance, age,
-                                          sensitivity_slope)
+            self._tracker.use_calibration(self.current_model.noise, self.covariance, age)
         self._start_time = now
-        self._start_correction(now)
-        self._unknown_since = (self._time if is_fresh and not self._follows_temperature
-                               else math.inf)
-        self._bias_shift, self._unobserved_distance, self._age_changed = 0.0, 0.0, False
+        here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
+        self._follows_temperature, self._age_changed = here is not None, False
+        self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
+                            if here is not None and coefficient else None)
+        self._unknown_since = self._time if is_fresh and here is None else math.inf
         self._sensitivity: Array = np.zeros(len(self.covariance))
         self._rest_sensitivity: Array = self._sensitivity
         self._sensitivity_time = -math.inf
         self._stretch = None
         self._pending_stretches.clear()
         self.restart_count += 1
-
-    def _start_correction(self, now: float) -> None:
-        """Start the temperature correction of the bias at the present temperature, if known."""
-        here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
-        self._follows_temperature = here is not None
-        self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
-                            if here is not None and coefficient else None)
-
-    def _resume_temperature(self, now: float, around: Channels | None) -> None:
-        """
-        Continue at the first temperature with a calibration of this run made without one.
-
-        It was made after the model at the temperature that was assumed up to the last sample. The
-        different output of the model at the present temperature is not a change of the rate.
-
-        """
-        here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
-        last = self.last_compensated.temperature
-        before = None if around is None else replace(around, temperature=last)
-        held = compensate(self.current_model, 0.0, last, before).model_rate
-        self._bias_shift = float(here) - float(held)
-        self._unobserved_distance = _lost_temperature_distance(self._time - self._unknown_since)
-        self._start_correction(now)
 
     def _propagated_model(self, now: float) -> tuple[GyroModel, float | None]:
         """Return the model to compensate with, and the age of its self-calibration, s, or None."""
@@ -321,10 +263,9 @@ class HeadingEstimator:
                 model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
-        calibration, self._calibration_message = propagate_calibration(
-            calibration, self.table, self.age(now), now, self._known_temperature,
-            self.is_calibrated_this_run)
-        if (self._dated_age(now) or 0.0) < -_AGE_TOLERANCE:
+        calibration, self._calibration_message = self.table.propagate_calibration(
+            calibration, self.age(now), now, self._known_temperature, self.is_calibrated_this_run)
+        if (self._dated_age(now) or 0.0) < -AGE_TOLERANCE:
             self._calibration_message = (
                 f'the calibration is dated {calibration.time}, which is later than the clock of '
                 'this computer: its age is not known and taken for a year; set the clock, or '
@@ -340,7 +281,7 @@ class HeadingEstimator:
     def age(self, now: float) -> float:
         """Return the age of the calibration of the bias, s; a year if it is unknown."""
         age = self._dated_age(now)
-        return _YEAR if age is None or age < -_AGE_TOLERANCE else max(age, 0.0)
+        return YEAR if age is None or age < -AGE_TOLERANCE else max(age, 0.0)
 
     def _dated_age(self, now: float) -> float | None:
         """Return the age, s, by date and clock; None without a date."""
@@ -423,13 +364,10 @@ class HeadingEstimator:
             return ''
         last, self._time = self._time, time
         known_again = not self._follows_temperature and self._known_temperature is not None
-        goes_on = self.is_calibrated_this_run and last > -math.inf
-        if self._age_changed or known_again and not goes_on:
+        if self._age_changed or known_again:
             self._restart(now)
         around = (self._follow_channels(time - last, force, supply)
                   if self.current_model.needs_history else None)
-        if known_again and goes_on:
-            self._resume_temperature(now, around)
         self.last_compensated = result = compensate(self.current_model, output, self.temperature,
                                                     around)
         change, distance = self._bias_change(time, self.temperature, self._temperature_lateness)
@@ -448,8 +386,7 @@ class HeadingEstimator:
         elif self.temperature is None or self.is_temperature_lost:
             self._stretch = None
         else:
-            self._extend_stretch(time, time, 1, float(result.model_rate), self.temperature,
-                                 [self._rest_sensitivity])
+            self._extend_stretch(time, time, 1, float(result.model_rate), self.temperature)
         if tracker.is_resting:
             self._add_to_table(now, True)
         return message
@@ -469,9 +406,9 @@ class HeadingEstimator:
 
     def _uncertain_sensitivity(self, output: Number, rate: Number, temperature: Number,
                                around: Channels | None, distance: Number) -> Array:
-        """Return the sensitivity of the rate to each uncertain value, shape (m, ...)."""
-        return uncertain_sensitivity(
-            rate_sensitivity(self.current_model, output, rate, temperature, around), distance)
+        """Return the sensitivity of the rate to each value of `covariance`, shape (m, ...)."""
+        known = rate_sensitivity(self.current_model, output, rate, temperature, around)
+        return np.concatenate([np.broadcast_to(-distance, known.shape[1:])[None], known])
 
     def _bias_change(self, time: float, temperature: Number | None,
                      late: float) -> tuple[Any, Any]:
@@ -479,10 +416,9 @@ class HeadingEstimator:
         if temperature is None:
             return 0.0, 0.0
         if self._correction is None:
-            return self._bias_shift, _lost_temperature_distance(time - self._unknown_since)
+            return 0.0, _lost_temperature_distance(time - self._unknown_since)
         change, distance = self._correction.change_at(temperature)
-        return (self._bias_shift + change, self._unobserved_distance + distance
-                + np.copysign(_lost_temperature_distance(late), distance))
+        return change, distance + np.copysign(_lost_temperature_distance(late), distance)
 
     @property
     def _temperature_lateness(self) -> float:
@@ -564,7 +500,7 @@ class HeadingEstimator:
             return place
         # a complete stretch of rest may restart the tracker
         begin = self._stretch.start_time if self._stretch else float(time[place])
-        end = int(np.searchsorted(time[place:], begin + STRETCH_DURATION - TIME_TOLERANCE)) + place
+        end = int(np.searchsorted(time[place:], begin + REST_DURATION - TIME_TOLERANCE)) + place
         end = min(end + (self._stretch is not None), len(time), place + CACHE_BLOCK_SAMPLES)
         rows, limit = slice(place, end), self.current_model.rate_limit
         known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= _MAX_TIME)
@@ -605,7 +541,7 @@ class HeadingEstimator:
         if first < len(time) and temperature is not None:
             self._extend_stretch(float(time[first]), self._time, len(time) - first,
                                  float(np.sum(result.model_rate[first:])),
-                                 float(temperature[first:].sum()), (still[first], still[-1]))
+                                 float(temperature[first:].sum()))
 
     def _held_sensitivities(self, time: Array, output: Array, result: CompensatedSamples,
                             distance: Array) -> list[Array]:
@@ -628,25 +564,14 @@ class HeadingEstimator:
     # The bias at rest for the next run
 
     def _extend_stretch(self, begin: float, end: float, count: int, modelled: float,
-                        temperature: float, seen: Sequence[Array]) -> None:
-        """
-        Add samples at rest to a stretch.
-
-        Parameters
-        ----------
-        begin, end : stamps of the first and the last, s
-        count, modelled, temperature : their number, and sums as in `_RestStretch`
-        seen : sensitivities at rest, of which the first and the last count
-
-        """
-        if self._stretch is None:
-            self._stretch = _RestStretch(begin, seen[0])
-        stretch = self._stretch
+                        temperature: float) -> None:
+        """Add samples at rest: stamps of the first and the last, s, and as in `_RestStretch`."""
+        stretch = self._stretch = self._stretch or _RestStretch(begin, self._rest_sensitivity)
         stretch.count += count
         stretch.rate_sum += modelled
         stretch.temperature_sum += temperature
-        if end - stretch.start_time >= STRETCH_DURATION - TIME_TOLERANCE:
-            stretch.sensitivity = 0.5 * (stretch.sensitivity + seen[-1])
+        if end - stretch.start_time >= REST_DURATION - TIME_TOLERANCE:
+            stretch.sensitivity = self._rest_sensitivity
             self._pending_stretches.append(stretch)
             self._stretch = None
 
@@ -680,9 +605,9 @@ class HeadingEstimator:
             stretch = self._pending_stretches.popleft()
             bias, temperature = (total / stretch.count
                                  for total in (stretch.rate_sum, stretch.temperature_sum))
-            variance = self.current_model.noise.angle_random_walk ** 2 / STRETCH_DURATION
+            variance = self.current_model.noise.angle_random_walk ** 2 / REST_DURATION
             expected, deviation = self._expected_bias(temperature, stretch.sensitivity)
-            if abs(bias - expected) > _OUTLIER_SIGMAS * math.sqrt(deviation ** 2 + variance):
+            if abs(bias - expected) > OUTLIER_SIGMAS * math.sqrt(deviation ** 2 + variance):
                 continue
             message = self.table.add(temperature, bias, variance, now)
             self._table_message = message or self._table_message
@@ -699,9 +624,8 @@ class HeadingEstimator:
 
         """
         calibration = self.current_model.self_calibration or SelfCalibration()
-        change = self._bias_shift
-        if self._correction is not None:
-            change += float(self._correction.change_at(temperature)[0])
+        change = (0.0 if self._correction is None
+                  else float(self._correction.change_at(temperature)[0]))
         off, deviation = self.tracker.bias_for(seen)
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 
@@ -713,4 +637,4 @@ class HeadingEstimator:
 
 def _lost_temperature_distance(delay: float) -> float:
     """Return the assumed drift of the temperature, K, some time, s, after its last message."""
-    return min(max(delay, 0.0) * _LOST_TEMPERATURE_RATE, _MAX_LOST_DISTANCE)
+    return min(max(delay, 0.0) * _LOST_TEMPERATURE_RATE, Prior.unknown_distance)

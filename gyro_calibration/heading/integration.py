@@ -37,8 +37,8 @@ import numpy as np
 
 #: Tolerance of durations, s: the resolution of stamps in seconds since 1970.
 TIME_TOLERANCE = 1e-6
-#: Largest rate, rad/s, and gap, s, so that the variance after a gap is finite.
-MAX_RATE, MAX_GAP = 1e4, 1e9
+#: Largest rate, rad/s, so that the variance after a gap is finite.
+MAX_RATE = 1e4
 #: Number of intervals in the memory, and least number for the detection of a gap.
 _MAX_INTERVALS, _MIN_INTERVALS = 256, 16
 #: Ratio to the usual interval of a short one, as in a burst or after a late sample, and share of
@@ -283,10 +283,9 @@ class BlockIntegrator:
     def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
         """Begin at heading zero; `covariance` is that of the calibration, shape (m, m)."""
         self._settings, self._noise, self._covariance = settings, noise, covariance
-        self._window_samples: tuple[Array, Array] = np.zeros(0), np.zeros(0)
-        self._last_sample: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
+        self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
+        self._last_rows: Array = np.zeros((2 + len(covariance), 0))
         self._integrals: Array = np.zeros(2 + len(covariance))
-        self._last_rate: Array = np.zeros(0)
         self._gap_variance, self.intervals = 0.0, Intervals()
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
@@ -305,44 +304,30 @@ class BlockIntegrator:
         """
         if not len(time):
             return rate, rate, rate
-        filtered = self._filter_block(time, rate)
-        kept = (filtered == rate).astype(float)
-        unseen = self._gap_variances(time, rate, kept)
-        heading, moving_time, *grown = self._integrate_rows(
-            time, np.vstack([filtered, kept, kept * sensitivity]))
-        calibration = quadratic_form(self._covariance,
-                                     np.reshape(grown, (len(self._covariance), len(time))))
-        return (filtered, heading,
-                np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen))
-
-    def _gap_variances(self, time: Array, rate: Array, kept: Array) -> Array:
-        """Return the variance by the gaps so far, rad², shape (n,)."""
-        last_time, last_rows = self._last_sample
-        interval = np.diff(np.concatenate([last_time, time]))
-        step = np.diff(np.concatenate([self._last_rate, rate]))
-        known = np.concatenate([last_rows[1], kept])
-        usual, lost = self.intervals.add_many(interval)
-        gaps = np.flatnonzero((lost > 0) & ((known[1:] > 0.0) | (known[:-1] > 0.0)))
-        unseen: Array = np.zeros(len(known))
-        unseen[gaps + 1] = sum(gap_variances(self._noise, usual[gaps], lost[gaps], interval[gaps],
-                                             step[gaps]))
-        unseen = self._gap_variance + np.cumsum(unseen)[len(last_time):]
-        self._gap_variance, self._last_rate = float(unseen[-1]), rate[-1:]
-        return unseen
-
-    def _filter_block(self, time: Array, rate: Array) -> Array:
-        carried = len(self._window_samples[0])
-        time = np.concatenate([self._window_samples[0], time])
-        rate = np.concatenate([self._window_samples[1], rate])
+        carried = len(self._window[0])
+        time, rate = (np.concatenate(pair) for pair in zip(self._window, (time, rate)))
+        filtered = filter_rates(self._settings, time, rate)[carried:]
+        kept = (filtered == rate[carried:]).astype(float)
         begin = np.searchsorted(time, time[-1] - self._settings.window, side='right')
-        self._window_samples = time[begin:], rate[begin:]
-        return filter_rates(self._settings, time, rate)[carried:]
+        begin = min(int(begin), len(time) - 1)
+        self._window = time[begin:], rate[begin:]
 
-    def _integrate_rows(self, time: Array, rows: Array) -> Array:
-        carried = len(self._last_sample[0])
-        time = np.concatenate([self._last_sample[0], time])
-        rows = np.hstack([self._last_sample[1], rows])
+        # from the last sample of the block before on
+        before = min(carried, 1)
+        time, rate = time[carried - before:], rate[carried - before:]
+        rows = np.hstack([self._last_rows, np.vstack([filtered, kept, kept * sensitivity])])
         grown = np.array(
             [integrate(time, row, begin) for row, begin in zip(rows, self._integrals)])
-        self._last_sample, self._integrals = (time[-1:], rows[:, -1:]), grown[:, -1]
-        return grown[:, carried:]
+        interval, step, used = np.diff(time), np.diff(rate), rows[1] > 0.0
+        usual, lost = self.intervals.add_many(interval)
+        gaps = np.flatnonzero((lost > 0) & (used[1:] | used[:-1]))
+        unseen: Array = np.zeros(len(time))
+        unseen[0] = self._gap_variance
+        unseen[gaps + 1] = sum(gap_variances(self._noise, usual[gaps], lost[gaps], interval[gaps],
+                                             step[gaps]))
+        unseen = np.cumsum(unseen)
+        self._last_rows, self._integrals = rows[:, -1:], grown[:, -1]
+        self._gap_variance = float(unseen[-1])
+        variance = (quadratic_form(self._covariance, grown[2:])
+                    + self._noise.heading_variance(grown[1]) + unseen)
+        return filtered, grown[0, before:], np.sqrt(variance[before:])

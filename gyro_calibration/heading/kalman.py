@@ -119,25 +119,17 @@ class HeadingState:
 
     def transition(self, rate_integral: RateIntegral) -> Transition:
         """Return the transition of the state over an integral of rates."""
-        seen, variance = self._observation_row(rate_integral)
-        _, kept, grown = self._padded_transition(rate_integral)
-        grown = grown.copy()
-        grown[HEADING_INDEX, HEADING_INDEX] = variance
+        seen, kept, grown = _padded_transition(
+            self.noise, round(rate_integral.duration, 6), rate_integral.is_unobserved,
+            len(rate_integral.sensitivity))
+        seen, grown = seen.copy(), grown.copy()
+        seen[self.first_value_index:] = -rate_integral.sensitivity
+        grown[HEADING_INDEX, HEADING_INDEX] += (
+            rate_integral.lost_variance + rate_integral.extra_noise_variance)
+        if not rate_integral.is_unobserved:
+            grown[HEADING_INDEX, HEADING_INDEX] += (
+                self.noise.angle_random_walk ** 2 * rate_integral.duration)
         return Transition(seen, kept, grown)
-
-    def _padded_transition(self, rate_integral: RateIntegral) -> tuple[Array, Array, Array]:
-        return _padded_transition(self.noise, round(rate_integral.duration, 6),
-                                  rate_integral.is_unobserved, len(rate_integral.sensitivity))
-
-    def _observation_row(self, rate_integral: RateIntegral) -> tuple[Array, float]:
-        """Return `Transition.observation`, and the variance of the noise of the integral, rad²."""
-        seen, _, grown = self._padded_transition(rate_integral)
-        seen = seen.copy()
-        seen[len(seen) - len(rate_integral.sensitivity):] = -rate_integral.sensitivity
-        white = (0.0 if rate_integral.is_unobserved
-                 else self.noise.angle_random_walk ** 2 * rate_integral.duration)
-        return (seen, float(grown[HEADING_INDEX, HEADING_INDEX]) + white
-                + rate_integral.lost_variance + rate_integral.extra_noise_variance)
 
     def propagate(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time in motion."""
@@ -151,17 +143,17 @@ class HeadingState:
 
     def heading_variance(self, rate_integral: RateIntegral) -> float:
         """Return the variance of the heading after a time in motion, rad²."""
-        row, variance = self._observation_row(rate_integral)
-        row[HEADING_INDEX] -= 1.0
-        return float(row @ self.covariance @ row) + variance
+        step = self.transition(rate_integral)
+        step.observation[HEADING_INDEX] -= 1.0
+        return float(step.observation @ self.covariance @ step.observation
+                     + step.process_noise[HEADING_INDEX, HEADING_INDEX])
 
     def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
         """Return the state after a time at rest, with its measurement."""
         step = self.transition(rate_integral)
         return self.update_at_rest(rate_integral, step).propagate_at_rest(rate_integral, step)
 
-    def update_at_rest(self, rate_integral: RateIntegral,
-                       step: Transition | None = None) -> HeadingState:
+    def update_at_rest(self, rate_integral: RateIntegral, step: Transition) -> HeadingState:
         """
         Return the state at the begin of a time at rest, updated by its measurement.
 
@@ -169,7 +161,6 @@ class HeadingState:
         heading, which is then the heading at the end.
 
         """
-        step = step or self.transition(rate_integral)
         gain_direction = self.covariance @ step.observation
         noise = step.process_noise[HEADING_INDEX, HEADING_INDEX]
         variance = float(step.observation @ gain_direction + noise) + rate_integral.wander_variance
@@ -182,10 +173,8 @@ class HeadingState:
         return HeadingState(self.noise, self.mean + gain_direction * (innovation / variance),
                             covariance - gain_direction[:, None] * gain_direction / variance)
 
-    def propagate_at_rest(self, rate_integral: RateIntegral,
-                          step: Transition | None = None) -> HeadingState:
+    def propagate_at_rest(self, rate_integral: RateIntegral, step: Transition) -> HeadingState:
         """Return the state after a time of constant heading without a measurement."""
-        step = step or self.transition(rate_integral)
         grown = step.process_noise.copy()
         grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
         grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance
@@ -194,8 +183,10 @@ class HeadingState:
 
     def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
-        seen, variance = self._observation_row(rate_integral)
-        return float(seen @ self.mean), float(seen @ self.covariance @ seen) + variance
+        step = self.transition(rate_integral)
+        return (float(step.observation @ self.mean),
+                float(step.observation @ self.covariance @ step.observation
+                      + step.process_noise[HEADING_INDEX, HEADING_INDEX]))
 
     @cached_property
     def wander_rate(self) -> tuple[float, float]:
@@ -346,7 +337,7 @@ def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: 
     """Return a state updated by the smoothed state after it."""
     step, start = state.transition(rate_integral), state
     if is_resting:
-        after = state.update_at_rest(rate_integral).propagate_at_rest(rate_integral)
+        after = state.advance_at_rest(rate_integral)
         expected, variance = state.expected_rest_angle(rate_integral)
         gain_direction = state.covariance @ step.observation
         variance += rate_integral.wander_variance

@@ -17,7 +17,6 @@ A model with history is evaluated over blocks of the log.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -31,11 +30,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from numpy.typing import NDArray
 
-#: Length of the parts for which the heading of effects is iterated without a reference, s; longer
-#: parts need more passes.
-_PART_DURATION = 60.0
-#: Longest gap of a reference heading that is interpolated, s.
-_MAX_INTERPOLATED_GAP = 1.0
 #: Change of the heading at which the iteration ends, rad, and largest number of passes.
 _HEADING_TOLERANCE, _MAX_PASSES = 1e-10, 50
 
@@ -44,13 +38,10 @@ class LogCompensation:
     """
     Compensate a log block by block, with the same result as in one piece.
 
-    The heading of effects is that of the reference. Without one it is the integral of the
-    compensated rates from 0 on.
-
-    In a gap of the reference, the heading is its last value plus the integral of the compensated
-    rates. Gaps up to `_MAX_INTERPOLATED_GAP` s inside a block are interpolated instead; across the
-    border of blocks the next value is not known, and the result differs slightly. Before the first
-    value of a reference the heading is that value; in earlier blocks it is integrated from 0 on.
+    The heading of effects is the integral of the compensated rates, from 0 on, plus its deviation
+    from the reference, interpolated between the values of the reference: before its first value
+    the deviation is that at this value. Across the border of blocks the next value is not known,
+    and the result differs slightly.
 
     """
 
@@ -58,19 +49,23 @@ class LogCompensation:
         """Begin with an empty history."""
         self._model, self._history = model, model.start_history()
         self._start_time: float | None = None
-        self._has_had_reference = False
         self._last_integration: tuple[Array, Array, float] = np.zeros(0), np.zeros(0), 0.0
 
     def add(self, log: Log) -> tuple[CompensatedSamples, Array]:
         """Take the next rows, with known outputs; return them with their `rate_sensitivity`."""
-        if not self._model.needs_history or not len(log):
-            return self._compensate(log, None)
-        compensated, sensitivities = zip(*(self._compensate_part(part)
-                                           for part in self._split_by_reference(log)))
-        columns = zip(*([np.broadcast_to(each, part.rate.shape) for each in vars(part).values()]
-                        for part in compensated))
-        joined = CompensatedSamples(*(np.concatenate(parts) for parts in columns))
-        return joined, np.concatenate(sensitivities, axis=1)
+        assert log.output is not None
+        channels = None
+        if self._model.needs_history and len(log):
+            channels = self._history.update(
+                np.zeros(len(log)) if log.time is None else log.time, log.temperature,
+                log.specific_force, log.supply, 0.0)
+            if self._model.uses_channel('heading') and log.time is not None:
+                channels = self._iterate_heading(log, channels)
+        result = compensate(self._model, log.output, log.temperature, channels)
+        sensitivity = rate_sensitivity(self._model, log.output, result.rate, result.temperature,
+                                       channels)
+        return CompensatedSamples(*(np.broadcast_to(each, np.shape(log.output))
+                                    for each in vars(result).values())), sensitivity
 
     def true_time(self, time: Array) -> Array:
         """Return when the samples with the next stamps, s, were taken."""
@@ -79,62 +74,26 @@ class LogCompensation:
         begin = self._start_time or 0.0
         return np.asarray(begin + self._model.true_time(time - begin))
 
-    def _compensate(self, log: Log, channels: Channels | None) -> tuple[CompensatedSamples, Array]:
-        assert log.output is not None
-        result = compensate(self._model, log.output, log.temperature, channels)
-        return result, rate_sensitivity(self._model, log.output, result.rate, result.temperature,
-                                        channels)
-
-    def _split_by_reference(self, log: Log) -> Iterator[Log]:
-        """Give the rows in parts with a reference, and in short parts without one."""
-        if log.time is None or not self._model.uses_channel('heading'):
-            yield log
-            return
-        part = np.where(self._referenced_rows(log.time, log.reference_heading), -1,
-                        (log.time - log.time[0]) // _PART_DURATION)
-        for rows in np.split(np.arange(len(log)), np.flatnonzero(np.diff(part)) + 1):
-            yield rows_of(log, rows)
-
-    def _referenced_rows(self, time: Array, heading: Array | None) -> Mask:
-        """Return which rows have a reference heading, or one to interpolate, shape (n,)."""
-        known = np.flatnonzero(np.isfinite(heading)) if heading is not None else np.zeros(0, int)
-        if not len(known):
-            return np.zeros(len(time), bool)
-        rows, earlier = np.arange(len(time)), self._has_had_reference
-        before = np.searchsorted(known, rows, 'right') - 1
-        after = np.searchsorted(known, rows, 'left')
-        self._has_had_reference, inside = True, (before >= 0) & (after < len(known))
-        lost = time[known[np.minimum(after, len(known) - 1)]] - time[known[np.maximum(before, 0)]]
-        return (inside & (lost <= _MAX_INTERPOLATED_GAP)) | ((before < 0) & (not earlier))
-
-    def _compensate_part(self, log: Log) -> tuple[CompensatedSamples, Array]:
-        time = np.zeros(len(log)) if log.time is None else log.time
-        channels = self._history.update(time, log.temperature, log.specific_force, log.supply,
-                                        _interpolate_heading(time, log.reference_heading))
-        if not self._model.uses_channel('heading') or log.time is None:
-            return self._compensate(log, channels)
-        if log.reference_heading is None or not np.isfinite(log.reference_heading).any():
-            return self._compensate(log, self._iterate_heading(log, channels))
-        result, sensitivity = self._compensate(log, channels)
-        self._last_integration = (self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:],
-                                  float(np.asarray(channels.heading)[-1]))
-        return result, sensitivity
-
     def _iterate_heading(self, log: Log, channels: Channels) -> Channels:
         """Iterate: compensate with a heading, and integrate the rates to the next heading."""
         assert log.time is not None
         last_time, last_rate, begin = self._last_integration
         carried, time = len(last_time), np.concatenate([last_time, self.true_time(log.time)])
-        heading = np.full(len(log), begin)
+        reference = np.append(np.full(carried, begin), np.full(len(log), np.nan)
+                              if log.reference_heading is None else log.reference_heading)
+        known = np.isfinite(reference)
+        heading = np.full(len(time), begin)
         for _ in range(_MAX_PASSES):
-            channels = replace(channels, heading=heading)
+            channels = replace(channels, heading=heading[carried:])
             rate = np.concatenate([last_rate, compensate(
                 self._model, np.asarray(log.output), log.temperature, channels).rate])
-            before, heading = heading, integrate(time, rate, begin)[carried:]
+            before, heading = heading, integrate(time, rate, begin)
+            if known.any():
+                heading += np.interp(time, time[known], (reference - heading)[known])
             if np.abs(heading - before).max() < _HEADING_TOLERANCE:
                 break
         self._last_integration = time[-1:], rate[-1:], float(heading[-1])
-        return replace(channels, heading=heading)
+        return replace(channels, heading=heading[carried:])
 
 
 def plausible_rows(model: GyroModel, log: Log) -> Mask:
@@ -165,13 +124,6 @@ def compensate_log(model: GyroModel, log: Log) -> Array:
 def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
     """Return some rows of a log, by their numbers or by a mask, without unknown columns."""
     return select_rows(replace(log, others={}), rows)
-
-
-def _interpolate_heading(time: Array, heading: Array | None) -> Array | float:
-    """Return a heading with its gaps interpolated."""
-    if heading is None or not (known := np.isfinite(heading)).any():
-        return 0.0
-    return heading if known.all() else np.interp(time, time[known], heading[known])
 
 
 def _remove_spikes(time: Array, rate: Array) -> Array:

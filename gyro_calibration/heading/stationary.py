@@ -40,7 +40,7 @@ from scipy.special import chdtri, ndtri
 #: Length of a block of samples, and of the window whose energy is tested, s.
 BLOCK_DURATION, WINDOW_DURATION = 0.1, 0.5
 #: Durations, s, over which the mean of the rate is compared with the bias known before them.
-MEAN_LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+MEAN_LAGS = tuple((2.0 ** np.arange(7)).tolist())
 #: Least number of samples in a window.
 _MIN_WINDOW_SAMPLES = 8
 #: Windows in the memory of the noise, least number for its use, and largest ratio to the noise of
@@ -120,7 +120,7 @@ class EnergyDetector:
         """Begin with an empty window."""
         self.noise_factor = 1.0
         self._blocks = deque[Block]()
-        self._energies = deque[float](maxlen=_MAX_WINDOWS)
+        self._energies = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
         self.configure(noise, false_alarms)
         self._since_last_window, self._interval = 0.0, BLOCK_DURATION
         self._sudden_limit: float | None = None
@@ -184,10 +184,10 @@ class EnergyDetector:
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return
         self._since_last_window = 0.0
-        self._energies.append(min(energy, differences))
+        self._energies.append((energy, differences))
         if len(self._energies) >= _MIN_WINDOWS:
-            quietest = (sorted(self._energies)[len(self._energies) // 10] * (count - 1)
-                        / _chi_squared_quantile(count - 1, 0.9))
+            quietest = min(sorted(each)[len(each) // 10] for each in zip(*self._energies))
+            quietest *= (count - 1) / _chi_squared_quantile(count - 1, 0.9)
             self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
     def sudden_limit(self) -> float:
@@ -330,19 +330,12 @@ class EvenSamples:
 
     Attributes
     ----------
-    time, rate, intervals, half_intervals, angles : stamps, rates, the intervals before them, half
-        of them, and the integrals of the rates over them, shape (n,)
-    motion_sensitivity, rest_sensitivity : sensitivities, shape (n, m)
-    wheels, still : as in `HeadingTracker.follow`, n of them, or None
     used_sensitivity : the sensitivities used, first that of the sample before, shape (n + 1, m)
-    block_starts, block_stops, whole_blocks : first samples and ends of the blocks, and range of
-        complete blocks
+    whole_blocks : range of complete blocks
     block_sums : duration, integral, remaining share of a pending correction, and sums of the
         rates, their squares, and the squares of their steps, by block
     sensitivity_integrals : integrals of the sensitivities in motion and at rest, shape (k, m) each
     results : the result of `HeadingTracker.follow`
-    last_at_rest : whether the last sample was at rest
-    epochs : so far
 
     """
 

@@ -28,7 +28,6 @@ import math
 from gyro_calibration.heading.integration import (
     gap_variances,
     Intervals,
-    MAX_GAP,
     MAX_RATE,
     Threshold,
     ThresholdFilter,
@@ -65,20 +64,23 @@ import numpy as np
 #: Largest change of the rate between samples, rad/s, plus that by this acceleration, rad/s²; a
 #: larger change that is reversed in the next sample is an outlier.
 MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
+#: Duration between two jumps, s, in which the rate may be erroneous.
+_JUMP_DURATION = 2.0
 #: Longest step of the state, s.
-_STEP_DURATION = 1.0
-#: Change of the bias that is assumed while the wheels stand, rad/s.
-_WHEEL_BIAS_CHANGE = 0.2 * DEGREE
+_STEP_DURATION = MEAN_LAGS[0]
+#: Change of the bias that is assumed while the wheels stand, rad/s; largest delay of odometry
+#: after the begin of a turn, s.
+_WHEEL_BIAS_CHANGE, _WHEEL_DELAY = 0.2 * DEGREE, 4.0
 #: Tolerance of the noise figures: factor of the noise of the samples to that of the model from
 #: which on it is used, and factor of the thresholds of means.
 _NOISE_TOLERANCE = 1.25
 #: A steady turn slower than so many times the slowest detectable one may be a change of the bias;
 #: it is attributed to the bias after this time, s.
-_SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, 2.0 * MEAN_LAGS[-1]
+_SLOW_TURN_FACTOR, _SLOW_TURN_DECISION_TIME = 1.5, sum(MEAN_LAGS)
 #: Last blocks of a rest in memory, among which its end is located.
 _MAX_REST_BLOCKS = round((2.0 * _STEP_DURATION + WINDOW_DURATION) / BLOCK_DURATION)
 #: States of a rest in memory.
-_MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 8
+_MAX_SNAPSHOTS = round(MEAN_LAGS[-1] / _STEP_DURATION) + 1
 #: Sigmas of a power of 95 %, for the slowest detectable turn.
 _POWER_SIGMAS = 1.645
 
@@ -133,8 +135,7 @@ class HeadingTracker:
     """
 
     def __init__(self, noise: Noise, covariance: Array, settings: Settings,
-                 age: float | None = 0.0, keeps_steps: bool = False,
-                 sensitivity_slope: Array | None = None):
+                 age: float | None = 0.0, keeps_steps: bool = False):
         """
         Begin at heading zero.
 
@@ -144,42 +145,48 @@ class HeadingTracker:
         covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
         age : of the self-calibration, whose s and b are the last values, s; None without one
         keeps_steps : the `steps`, for `log_compensation.smooth_track`
-        sensitivity_slope : change of the sensitivity with the rate, shape (m,): the rates include
-            the bias estimated at rest, on which a scale factor error does not act
 
         """
-        self._sensitivity_slope = sensitivity_slope
-        self.heading = self.rate = self.deleted_heading = 0.0
-        self.is_resting, self.steps, self._keeps_steps = False, list[TrackStep](), keeps_steps
-        self._interval = math.inf
+        self.steps, self._keeps_steps = list[TrackStep](), keeps_steps
         self.recalibrations = list[tuple[int, HeadingState]]()
-        self._quiet_duration = WINDOW_DURATION
-        self._held_integral, self._pending_correction = RateIntegral(0.0, 0.0, np.zeros(0)), 0.0
-        self._rest_blocks, self._wheels_stand = deque[RateIntegral](maxlen=_MAX_REST_BLOCKS), False
-        self._open_variance: float | None = None
-        self._suspected_turn: SlowTurn | None = None
+        self._interval, self._last_time, self.intervals = math.inf, 0.0, Intervals()
         self._last_sample: tuple[float, float, float, Array] | None = None
-        self._last_time = 0.0
-        self._rest_scatter, self.outlier_count, self._state_version = RestScatter(), 0, 0
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
-        self.refused_count, self.rebuild_count, self._rebuild_message = 0, 0, ''
-        self._last_finite_heading = 0.0, 0.0
+        # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump.
+        self._before_last_jump = -math.inf, 0.0
+        self._rest_scatter, self._state_version = RestScatter(), 0
+        self.refused_count = self.outlier_count = self.rebuild_count = 0
+        self._rebuild_message, self._settings = '', settings
+        self._initialize(noise, covariance, age)
+        self.configure(settings)
+
+    def _initialize(self, noise: Noise, covariance: Array, age: float | None, heading: float = 0.0,
+                    variance: float = 0.0) -> None:
+        """Begin with a heading, rad, and its variance, rad², and nothing else known."""
+        self.heading, self.rate, self.deleted_heading = heading, 0.0, 0.0
+        self.is_resting = self._wheels_stand = False
+        self._quiet_duration, self._pending_correction = WINDOW_DURATION, 0.0
+        self._held_integral = RateIntegral(0.0, 0.0, np.zeros(0))
+        self._rest_blocks = deque[RateIntegral](maxlen=_MAX_REST_BLOCKS)
+        self._suspected_turn: SlowTurn | None = None
+        self._last_finite_heading = heading, variance
         self._error_sensitivity: Array | None = None
         self._bias_sensitivity: Array | None = None
         self._cached_rate_error, self._cached_bias = 0.0, (0.0, 0.0)
-        self._still_sensitivity: Array | None = None
-        self.intervals = Intervals()
-        self._energy = EnergyDetector(noise, settings.false_alarms)
-        self._initialize_state(noise, covariance, 0.0, 0.0, age)
-        self.configure(settings)
+        self._energy = EnergyDetector(noise, self._settings.false_alarms)
+        self._use_state(noise, covariance, heading, variance, age)
 
-    def _initialize_state(self, noise: Noise, covariance: Array, heading: float, variance: float,
-                          age: float | None) -> None:
+    def _use_state(self, noise: Noise, covariance: Array, heading: float, variance: float,
+                   age: float | None) -> None:
         self._model_noise, self._calibration = noise, (covariance, age)
         self._state = initial_state(noise, covariance, heading, variance,
                                     age if len(covariance) else None)
+        self._still_sensitivity: Array | None = None
+        self._open_variance: float | None = None
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
         self._block_integral, self._open_integral = self._new_integral(), self._zero_integral
+        if self._last_sample is not None:
+            self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
 
     def _new_integral(self) -> RateIntegral:
         return RateIntegral(0.0, 0.0, self._zero_integral.sensitivity)
@@ -201,8 +208,7 @@ class HeadingTracker:
             self._enter_motion(WINDOW_DURATION)
         self._adopt_state()
 
-    def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0,
-                        sensitivity_slope: Array | None = None) -> None:
+    def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0) -> None:
         """
         Continue with other noise figures and another calibration.
 
@@ -218,11 +224,8 @@ class HeadingTracker:
                 self._with_still_sensitivity(turn) if self.is_resting else turn, self._last_time)
             self.recalibrations.append((len(self.steps), self._state))
             self._state = state
-        self._still_sensitivity, self._sensitivity_slope = None, sensitivity_slope
-        if self._last_sample is not None:
-            self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
         self._energy.clear()
-        self._initialize_state(noise, covariance, heading, variance, age)
+        self._use_state(noise, covariance, heading, variance, age)
         self.configure(self._settings)
 
     def reset(self) -> None:
@@ -248,8 +251,7 @@ class HeadingTracker:
             return (float(self._state.covariance[HEADING_INDEX, HEADING_INDEX])
                     + self._pending_correction ** 2)
         if self._open_variance is None:
-            self._open_variance = self._state.heading_variance(
-                self._with_unbiased_sensitivity(self._open_integral))
+            self._open_variance = self._state.heading_variance(self._open_integral)
         part = self._block_integral
         return (self._open_variance + self._state.noise.angle_random_walk ** 2 * part.duration
                 + part.lost_variance + part.extra_noise_variance + self._pending_correction ** 2)
@@ -288,6 +290,11 @@ class HeadingTracker:
             # the jump is permanent; its time between the samples is not known
             turned = 0.5 * (spike[1] - self._last_sample[1]) * (spike[0] - self._last_sample[0])
             self._block_integral.lost_variance += turned ** 2
+            begun, before = self._before_last_jump
+            if 0.0 < spike[0] - begun < _JUMP_DURATION:
+                turned = (self._last_sample[1] - before) * (spike[0] - begun)
+                self._block_integral.lost_variance += turned ** 2
+            self._before_last_jump = self._last_sample[:2]
             self._take_sample(*spike)
         elif spike is not None:
             self.outlier_count += 1
@@ -420,7 +427,7 @@ class HeadingTracker:
                     piece.epochs.append(self._new_epoch(until - 1))
                 elif not self.is_resting:
                     piece.epochs[-1].open_integrals.append(
-                        (until - 1, self._with_unbiased_sensitivity(self._open_integral)))
+                        (until - 1, self._open_integral))
                 continue
             piece.close_epoch(piece.block_starts[number])
             for place in range(piece.block_starts[number], until):
@@ -439,7 +446,7 @@ class HeadingTracker:
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
                      self._pending_correction,
-                     [(place, self._with_unbiased_sensitivity(self._open_integral))])
+                     [(place, self._open_integral)])
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
@@ -635,6 +642,8 @@ class HeadingTracker:
                              * before.state.noise.angle_random_walk ** 2)
             if abs(turn.angle - expected) > self._sigmas[lag] * math.sqrt(variance):
                 if wheels is False:
+                    if lag < _WHEEL_DELAY:
+                        continue
                     self._state = self._state.with_added_variance(
                         WALK_INDEX, ((turn.angle - expected) / turn.duration) ** 2)
                     self._enter_rest()
@@ -737,7 +746,7 @@ class HeadingTracker:
         """
         self._advance_to_last_sample()
         assert self._last_sample is not None
-        interval, self._last_time = min(max(interval, -MAX_GAP), MAX_GAP), self._last_sample[0]
+        self._last_time = self._last_sample[0]
         self._block, self._wheels_moved = Block(), False
         self._energy.clear()
         self._filter.clear()
@@ -800,20 +809,10 @@ class HeadingTracker:
 
     def _propagate_state(self, turn: RateIntegral, end: float) -> None:
         """Propagate the state over an integral that ends at a time, s."""
-        turn = turn if self.is_resting else self._with_unbiased_sensitivity(turn)
         if self._keeps_steps:
             self.steps.append(TrackStep(self._state, turn, self.is_resting, end))
         self._state = (self._state.advance_at_rest(turn) if self.is_resting
                        else self._state.propagate(turn))
-
-    def _with_unbiased_sensitivity(self, turn: RateIntegral) -> RateIntegral:
-        """Return an integral with the sensitivity for the rates without their bias."""
-        if (self._sensitivity_slope is None or self._still_sensitivity is None
-                or turn.is_unobserved):
-            return turn
-        bias, _ = self._state.rate_error(self._still_sensitivity)
-        return replace(
-            turn, sensitivity=turn.sensitivity - turn.duration * bias * self._sensitivity_slope)
 
     def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
@@ -845,22 +844,12 @@ class HeadingTracker:
         """Initialize the state at the last finite heading, with an uncertainty of a full turn."""
         heading, variance = self._last_finite_heading
         covariance, age = self._calibration
-        self._initialize_state(self._model_noise, np.nan_to_num(covariance), heading,
-                               variance + math.tau ** 2, age)
-        self.heading, self.rate, self.deleted_heading = heading, 0.0, 0.0
-        self._still_sensitivity = self._suspected_turn = None
-        if self._last_sample is not None:
-            self._last_sample = (*self._last_sample[:3], np.zeros(len(covariance)))
-        self._energy, self._block = EnergyDetector(
-            self._model_noise, self._settings.false_alarms), Block()
-        self._wheels_moved = False
-        self._filter.clear()
-        self._enter_motion(WINDOW_DURATION)
-        self._open_variance, self._pending_correction = None, 0.0
+        self._initialize(self._model_noise, np.nan_to_num(covariance), age, heading,
+                         variance + math.tau ** 2)
         self.rebuild_count += 1
         self._rebuild_message = ('the state was not finite and was initialized again; '
                                  'the heading error may be up to a full turn')
-        self._adopt_state()
+        self.configure(self._settings)
 
     def _corrected_angle(self, part: RateIntegral) -> float:
         """Return the integral of the rates less their error as estimated at rest, rad."""

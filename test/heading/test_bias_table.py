@@ -30,14 +30,12 @@ from bias_history import (
 )
 from gyro_calibration.heading.bias_table import (
     BiasTable,
-    BIN_WIDTH,
     Entry,
     Jump,
     MAX_ENTRIES,
     MIN_WRITE_INTERVAL,
     model_digest,
     Prior,
-    propagate_calibration,
     read_bias_table,
     write_bias_table,
 )
@@ -68,12 +66,6 @@ def test_intervals_of_95_percent_hold_as_often(asked, place):
     assert 0.91 < coverage(asked[:, 1:, place], asked[:, 1:, place + 1]) < 0.99
 
 
-def test_a_difference_is_better_known_than_without_a_table(asked):
-    off, change = np.abs(asked[:, 2:, 4]), np.abs(asked[:, 2:, 6])
-    assert (np.median(off) < np.median(change) / 5.0
-            and np.mean(off ** 2) < np.mean(change ** 2) / 6.0)
-
-
 def test_outliers_are_held_back_and_reported():
     generator, found, held, wrong, kept = np.random.default_rng(5), 0, 0, 0, 0
     for _ in range(15):
@@ -85,15 +77,6 @@ def test_outliers_are_held_back_and_reported():
         found, held = found + outlier.sum(), held + refused[outlier].sum()
         wrong, kept = wrong + refused[~outlier].sum(), kept + (~outlier).sum()
     assert found >= 5 and held >= 0.8 * found and wrong <= 0.02 * kept
-
-
-def test_an_empty_table_knows_nothing():
-    table = BiasTable(MODEL)
-    assert table.predict(20.0, 0.0) == (0.0, math.inf)
-    changes = [table.bias_difference(20.0, 20.0 + distance, 0.0) for distance in (0.0, 5.0, 10.0)]
-    assert [change for change, _ in changes] == [0.0] * 3
-    assert (changes[0][1] == 0.0
-            and math.sqrt(changes[2][1]) == pytest.approx(10.0 * Prior().coefficient, rel=0.3))
 
 
 def test_a_single_run_at_one_temperature_determines_the_offset_alone():
@@ -181,26 +164,6 @@ def test_many_jumps_and_runs_leave_a_table_that_works():
         table.predict(generator.uniform(20.0, 27.0), DAY * (MAX_ENTRIES + 10))).all()
 
 
-def test_the_oldest_entry_of_the_fullest_bin_is_dropped():
-    table = BiasTable(MODEL)
-    table.add(-10.0, 0.0, WHITE, 0.0)
-    for run in range(MAX_ENTRIES + 20):
-        table.begin_run()
-        table.add(20.0, 0.0, WHITE, DAY * run)
-    assert (len(table.entries) == MAX_ENTRIES and table.entries[0].temperature == -10.0
-            and table.entries[1].time == 21 * DAY)
-
-
-def test_rests_of_a_run_in_a_bin_become_one_entry_that_knows_its_time():
-    table = BiasTable(MODEL)
-    for number, temperature in enumerate((20.9, 21.0, 21.1)):
-        table.add(temperature, 0.0, WHITE, 60.0 * number)
-    table.add(21.0 + BIN_WIDTH, 0.0, WHITE, 240.0)
-    first, second = table.entries
-    assert (first.time == 120.0 and 20.9 < first.temperature < 21.1
-            and WHITE / 3.0 < first.variance < WHITE and second.time == 240.0)
-
-
 @pytest.mark.parametrize(
     'given', [(math.nan, 0.0, WHITE, 0.0), (20.0, math.inf, WHITE, 0.0), (20.0, 0.0, 0.0, 0.0),
               (20.0, 0.0, WHITE, math.nan), (1e9, 0.0, WHITE, 0.0), (20.0, 0.0, WHITE, 1e300)])
@@ -217,16 +180,6 @@ def test_a_model_that_compensates_leaves_less_inside_its_range_and_as_much_outsi
     assert (math.sqrt(inside / of_plain) == pytest.approx(Prior().compensated_share, rel=1e-6)
             and 1.0 < outside / of_plain < 2.5)
     assert known.bias_difference(-10.0, 5.0, 0.0)[1] > 10.0 * inside
-
-
-def test_what_is_known_as_well_as_can_be_still_can_be_read(tmp_path):
-    table = BiasTable(GyroModel())
-    for number in range(100):
-        assert not table.add(20.24 + 0.0002 * number, 1e-3, 1e-18, float(number))
-    write_bias_table(tmp_path / 'table.yaml', table, 0.0)
-    again, message = read_bias_table(tmp_path / 'table.yaml', GyroModel())
-    assert (message == '' and len(again.entries) == 2
-            and again.predict(20.25, 100.0)[0] == pytest.approx(1e-3))
 
 
 # A stored calibration
@@ -251,17 +204,18 @@ def test_a_table_makes_a_carried_calibration_better(carried):
     assert with_table < 0.8 * without
 
 
-def growth(calibration, *given):
+def growth(calibration, table, *given):
     """Return by how much the variance of its bias grows, (rad/s)²."""
-    now, _ = propagate_calibration(calibration, *given)
+    now, _ = table.propagate_calibration(calibration, *given)
     return now.covariance[1][1] - calibration.covariance[1][1]
 
 
 def test_a_fresh_calibration_is_used_as_it_is():
-    given = CALIBRATION, BiasTable(MODEL), 0.0, DAY, 20.0, True
-    now, message = propagate_calibration(*given)
+    given = CALIBRATION, 0.0, DAY, 20.0, True
+    now, message = BiasTable(MODEL).propagate_calibration(*given)
     assert now.bias == CALIBRATION.bias and not message
-    assert growth(*given) == pytest.approx(NOISE.mean_change_variance(10.0, 10.0), rel=1e-6)
+    assert now.covariance[1][1] - OWN ** 2 == pytest.approx(
+        NOISE.mean_change_variance(10.0, 10.0), rel=1e-6)
     assert now.covariance[0] == pytest.approx(CALIBRATION.covariance[0])
 
 
@@ -270,22 +224,9 @@ def test_a_fresh_calibration_is_used_as_it_is():
     (60.0, 45.0, '0:01:00 ago at 20.0 degC, and now it is 45.0'),
     (7 * 3600.0, None, '7:00:00 ago at a temperature that is not known')])
 def test_age_and_distance_are_reported_where_they_matter(age, temperature, words):
-    given = CALIBRATION, BiasTable(MODEL), age, 500 * DAY, temperature
-    now, message = propagate_calibration(*given)
-    assert words in message and growth(*given) > OWN ** 2 and now.bias == CALIBRATION.bias
-
-
-def test_a_table_moves_a_calibration_to_the_temperature_of_now_and_keeps_its_covariance_one():
-    history = simulate(
-        np.random.default_rng(3), lambda temperature: 0.05 * DEGREE * (temperature - 20.0),
-        outliers=0.0)
-    table = learned(history, 6)
-    high = max(each.temperature for each in table.entries)
-    now, _ = propagate_calibration(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0,
-                                   6 * DAY, high, this_run=True)
-    expected = 0.05 * DEGREE * (high - 20.0)
-    assert now.bias - CALIBRATION.bias == pytest.approx(expected, rel=0.1)
-    assert np.linalg.eigvalsh(now.covariance).min() > 0.0
+    now, message = BiasTable(MODEL).propagate_calibration(CALIBRATION, age, 500 * DAY, temperature)
+    assert (words in message and now.covariance[1][1] > 2.0 * OWN ** 2
+            and now.bias == CALIBRATION.bias)
 
 
 def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():

@@ -22,7 +22,6 @@ from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
 from heading_oracle import DRIVES, GYROS, score
-from heading_track import track
 import numpy as np
 from operations import operations
 import pytest
@@ -172,15 +171,6 @@ def test_a_single_absurd_sample_is_no_turn(interval):
     error = tracker.heading - 0.3 * 999 * interval
     assert abs(error) < 3.0 * math.sqrt(tracker.variance) and abs(error) < 0.01
     assert tracker.outlier_count == tracker.intervals.lost_samples == 1
-
-
-def test_a_single_absurd_sample_is_no_turn_in_hindsight():
-    time, generator = np.arange(1000) * INTERVAL, np.random.default_rng(6)
-    rate = 0.3 + NOISE.angle_random_walk / math.sqrt(INTERVAL) * generator.standard_normal(1000)
-    rate[500] = 30.0
-    found = track(time, rate, np.zeros((0, 1000)), NOISE, np.zeros((0, 0)), Settings(),
-                  hindsight=True)
-    assert np.abs(found.heading - 0.3 * time).max() < 0.01
 
 
 def test_a_rate_that_jumps_and_stays_is_followed_and_less_sure():

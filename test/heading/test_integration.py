@@ -108,35 +108,12 @@ def test_single_samples_pass_half_of_the_noise_at_rest_and_the_mean_of_0_2_s_lit
     assert passed[0.0] == pytest.approx(0.472, abs=0.02) and passed[0.2] < 0.01
 
 
-def test_the_mean_over_the_window_decides():
-    time = np.arange(100) * INTERVAL
-    rate = np.where(np.arange(100) < 50, 0.0, 1.0 * DEGREE)
-    kept = filtered_singly(Threshold(0.3 * DEGREE, 0.2), time, rate)
-    # Six of twenty samples at 1 deg/s have a mean of 0.3 deg/s.
-    assert np.flatnonzero(kept)[0] == 50 + 6 - 1
-
-
 def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
     time = np.arange(500) * INTERVAL
     rate = 5.0 * DEGREE * np.sin(2 * np.pi * 10.0 * time)  # two whole periods in the window
     assert (filtered_singly(Threshold(), time, rate)[20:] == 0.0).all()
     seen = filtered_singly(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate)
     assert np.array_equal(seen[20:], rate[20:])
-
-
-def test_the_rest_test_takes_noise_for_rest():
-    time = np.arange(20001) * INTERVAL
-    rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    assert (filter_rates(Threshold(angle_random_walk=XV3500.angle_random_walk), time,
-                         rate) != 0.0).mean() < 0.01
-
-
-def test_a_cleared_window_knows_nothing_of_before():
-    threshold = ThresholdFilter(Threshold(window=10.0))
-    for index in range(50):
-        threshold.apply(index * INTERVAL, 1.0)
-    threshold.clear()
-    assert threshold.apply(0.6, 0.001) == 0.0
 
 
 S, B = 0.02, 0.002
@@ -165,7 +142,8 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
 @pytest.mark.parametrize('offset', [0.0, 1.7e9], ids=['from zero', 'stamps since 1970'])
 def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
-    time, rate = (values[:3000] for values in noisy_robot())
+    time, rate = (np.delete(values[:3000], np.r_[900:905, 1300, 2000:2020])
+                  for values in noisy_robot())
     sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
     tracker = HeadingTracker(XV3500, uncertainty_covariance(model),
                              Settings(false_alarms=0.0, threshold=settings))
@@ -174,8 +152,9 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
         assert not tracker.add(float(time[index]) + offset, float(rate[index]),
                                sensitivity[:, index])
         headings.append(tracker.heading)
-    _, heading, deviation = BlockIntegrator(settings, XV3500, uncertainty_covariance(model)).add(
-        time, rate, sensitivity)
+    integrator = BlockIntegrator(settings, XV3500, uncertainty_covariance(model))
+    _, heading, deviation = integrator.add(time, rate, sensitivity)
+    assert integrator.intervals.lost_samples == tracker.intervals.lost_samples == 26
     # Stamps near 1e9 s have steps of 0.1 us.
     assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
     tracker.finish()

@@ -127,17 +127,6 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
             for state in later] == pytest.approx(variance, rel=1e-4, abs=1e-12)
 
 
-def test_one_long_turn_is_as_many_short_ones():
-    start = initial_state(XV3500, np.diag([1e-6, 1e-8]), age=100.0)
-    part = RateIntegral(0.7, 0.1, np.array([-0.1, -0.7]))
-    by_parts, whole = start, RateIntegral(0.0, 0.0, np.zeros(2))
-    for _ in range(30):
-        by_parts, whole = by_parts.propagate(part), whole + part
-    assert by_parts.mean == pytest.approx(start.propagate(whole).mean, abs=1e-12)
-    assert (by_parts.covariance == pytest.approx(start.propagate(whole).covariance, rel=1e-6,
-                                                 abs=1e-18))
-
-
 def test_the_variance_after_a_calibration_is_that_of_the_noise():
     """What a log's integration is told by a formula and the filter by its steps is one thing."""
     state = initial_state(XV3500, np.diag([0.0, 0.0]), age=0.0)
@@ -148,13 +137,6 @@ def test_the_variance_after_a_calibration_is_that_of_the_noise():
 
 
 # rest and motion
-
-
-def test_what_was_no_rest_is_not_deleted():
-    tracker = HeadingTracker(XV3500, KNOWN, Settings())
-    for index, rate in enumerate([0.0] * 200 + [100.0 * DEGREE] * 20):
-        tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]))
-    assert not tracker.is_resting and abs(tracker.deleted_heading) < 0.01 * DEGREE
 
 
 def test_a_rest_determines_the_bias_as_well_as_stated():
