@@ -49,7 +49,7 @@ KEYS = {'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temper
      "protocol 'bogus' is not known: choose one of csv, .*, or auto to find it by listening"),
     ({'invert': 'maybe'}, "parameter invert is 'maybe', but must be default, always or never"),
     ({'increments': True}, 'parameter increments is True, but must be default, always or never'),
-    ({'columns': ['time_s'], 'protocol': 'csv'}, 'exactly one must be gyro_dps'),
+    ({'columns': ['time_s'], 'protocol': 'csv'}, 'exactly one must be gyro_rad_s'),
     ({'baud': -1}, 'parameter baud is -1, but must be from 0 to 4000000 bit/s'),
     ({'sample_rate': 'often'}, "parameter sample_rate is 'often', but must be a number"),
     ({'axis': 'w'}, "parameter axis is 'w', but must be x, y or z"),
