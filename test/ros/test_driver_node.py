@@ -278,23 +278,6 @@ def test_a_gyro_is_published_end_to_end(robot, ros):
         (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)}
 
 
-def test_a_port_that_is_missing_comes_goes_and_comes_again(robot, tmp_path):
-    driver = robot(tmp_path / 'gyro')
-    driver.reports('does not exist: plug the gyro in', DiagnosticStatus.ERROR)
-    for number in range(2):
-        driver.rates.clear()
-        with Emulator(find_protocol('csv'), counting(), link=tmp_path / 'gyro'):
-            driver.wait(lambda: len(driver.rates) > 20, 'samples')
-            driver.diagnostics.clear()
-            values = {pair.key: pair.value
-                      for pair in driver.reports('samples come', DiagnosticStatus.OK).values}
-            assert int(values['reopened']) >= number and int(values['samples']) > 20
-        driver.reports('the device was disconnected', DiagnosticStatus.ERROR)
-    interrupt_often(driver.node)
-    assert driver.node.output.count('the device was disconnected') == 2, (
-        'it is logged once, not at each attempt')
-
-
 def test_an_impossible_parameter_ends_it_with_one_sentence(start_node):
     node = start_node('driver_node', {'protocol': 'fizoptika'})
     assert node.wait() == 2
