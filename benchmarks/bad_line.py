@@ -27,12 +27,12 @@ import math
 from pathlib import Path
 import sys
 
-from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample
 from gyro_calibration.logs.log import DEGREE
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
-from serial_faults import damaged  # noqa: E402, I100, I202
+from serial_faults import damaged, SETTINGS  # noqa: E402, I100, I202
 
 SHARES = (0.001, 0.01, 0.1)
 FRAMES = 50_000
@@ -45,8 +45,7 @@ CHECKS = {'kvh_1750': 'CRC-32', 'fizoptika': 'sum, 16 bits', 'kvh_ecore': 'sum, 
 def arrived(name: str, share: float, full_scale: float | None) -> list[float]:
     """Return the rates that arrive, rad/s, and as the first one that which a good line gives."""
     protocol, generator = find_protocol(name), np.random.default_rng(1)
-    settings = replace(Settings(sensitivity=DEGREE / 27880.0 if name == 'fizoptika' else None),
-                       full_scale=full_scale)
+    settings = replace(SETTINGS[name], full_scale=full_scale)
     encode, decoder = protocol.encoder(settings), protocol.decoder(settings)
     good = protocol.preamble + b''.join(encode(Sample(SENT, 25.0, 1.0, number))
                                         for number in range(4))

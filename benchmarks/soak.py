@@ -70,7 +70,8 @@ LEADING = -0.5  # rad/s; of samples without a number, until the whole graph is c
 STRETCH = 2.0  # s, after which it turns the other way
 INTERVAL = 1.0  # s between looks at the processes
 LARGEST_RATE = 1000.0  # Hz; above it the driver is told to average
-SENSITIVITY = {'fizoptika': DEGREE / 27880.0}  # rad/s a count; what the wire format leaves open
+SENSITIVITY = {name: DEGREE / 27880.0 for name, protocol in PROTOCOLS.items()
+               if protocol.sensitivity is None}  # rad/s a count; what the wire format leaves open
 PROCESSES = ('gyro', 'driver_node', 'compensation_node', 'count')
 MODEL = GyroModel((Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))), 1e-10 * np.eye(2),
                   (-8.0, 8.0), (-10.0, 50.0),

@@ -70,6 +70,7 @@ from gyro_calibration.model.motion import CALIBRATION_MOTION, MotionError, read_
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from recordings import channel, chunk, database, MCAP, record, text
+from serial_faults import SETTINGS
 
 #: Longest message of an error, in characters without the path; s that an input may take; bytes
 #: that a decoder may hold back.
@@ -119,14 +120,6 @@ def _read(read: Callable[[Path], Any], error: type[Exception], path: Path) -> An
 
 # Decoders
 
-def settings_of(protocol: Protocol) -> Settings:
-    """Return settings that suffice for a protocol."""
-    try:
-        protocol.check_settings(Settings())
-    except ValueError:
-        return Settings(sensitivity=1e-5)
-    return Settings()
-
 
 @dataclass(frozen=True)
 class _Wire:
@@ -139,7 +132,7 @@ class _Wire:
 
 
 def _wire(protocol: Protocol) -> _Wire:
-    settings, decoder = settings_of(protocol), protocol.decoder(settings_of(protocol))
+    settings, decoder = SETTINGS[protocol.name], protocol.decoder(SETTINGS[protocol.name])
     encode = protocol.encoder(settings)
     frames = [encode(Sample(0.01 * number - 0.05, 20.0, 0.01 * number, number))
               for number in range(1, 5)]

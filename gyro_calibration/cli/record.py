@@ -97,11 +97,15 @@ def run(given: argparse.Namespace) -> Answer:
         raise UsageError(f'{given.out} is no recording file; give a name that ends in '
                          f'{", ".join(_FILE_SUFFIXES[:-1])} or {_FILE_SUFFIXES[-1]}')
     if os.path.exists(given.out):
-        raise UsageError(f'{given.out}: exists already, and recordings are never overwritten; '
-                         'give a new name')
+        raise _make_error_of_existing(given.out)
     with _stop_event(given.seconds) as stop:
         session = (_PortSession if given.port else _TopicSession)(given, stop)
         return session.run()
+
+
+def _make_error_of_existing(path: str) -> UsageError:
+    return UsageError(f'{path}: exists already, and recordings are never overwritten; give a new '
+                      'name')
 
 
 @contextmanager
@@ -147,7 +151,10 @@ class _Recorder:
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         """Create the file; `notes` is called with the first piece, when all are known."""
         self.path, self.size, self.is_full, self._notes = path, 0, False, notes
-        self._file = io.FileIO(path, 'xb')
+        try:
+            self._file = io.FileIO(path, 'xb')
+        except FileExistsError:
+            raise _make_error_of_existing(path) from None
 
     def append(self, piece: bytes) -> None:
         """Write a piece; on an error truncate the file to the pieces before, raise `DiskFull`."""

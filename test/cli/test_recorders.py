@@ -11,6 +11,7 @@
 """What is recorded is in the file, whole piece by whole piece: rows of a log, chunks of MCAP."""
 
 from gyro_calibration.cli.record import CsvRecorder, McapRecorder
+from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.logs.log import read_log
@@ -82,6 +83,13 @@ def test_rosbags_reads_what_is_recorded(tmp_path):
     for covariance, deviation in ((last.angular_velocity_covariance, ASSUMED_NOISE),
                                   (last.linear_acceleration_covariance, ASSUMED_FORCE_NOISE)):
         assert covariance.tolist() == [1e6, 0.0, 0.0, 0.0, 1e6, 0.0, 0.0, 0.0, deviation ** 2]
+
+
+def test_a_file_that_is_there_is_never_written_to(tmp_path):
+    (tmp_path / 'a.mcap').write_text('precious')
+    with pytest.raises(UsageError, match='exists already'):
+        recorders(tmp_path)
+    assert (tmp_path / 'a.mcap').read_text() == 'precious'
 
 
 def test_a_recording_of_nothing_leaves_no_file(tmp_path):

@@ -8,25 +8,19 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The state files of a robot: what is read, kept and reported, through kills and a full disk."""
+"""The state files of a robot: what is read, kept and reported, through kills and without room."""
 
 import itertools
 import os
-import resource
 import signal
-import subprocess
 import sys
-from types import SimpleNamespace
 
 from gyro_calibration import files
 from gyro_calibration.files import open_replacement, remove_leftovers, write_atomically
 from gyro_calibration.heading.bias_table import MIN_WRITE_INTERVAL, Prior
 from gyro_calibration.model.gyro_model import SelfCalibration
-from gyro_calibration.model.model_file import read_model
-from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.ros.state_store import StateStore
 import pytest
-from rig import rested
 
 NOW = 1.7e9
 
@@ -91,6 +85,11 @@ def test_a_folder_that_cannot_be_written_to_is_reported_and_not_tried_each_secon
     memory.store_table(NOW)
     assert 'cannot be written' in memory.table_hint and memory.table_written_time is None
     assert not memory.table.is_write_due(NOW + 1.0) and 'NOT STORED' not in memory.calibration_hint
+    memory = StateStore('', tmp_path / 'file' / 'calibration.yaml', tmp_path / 'biases.yaml',
+                        Prior())
+    assert memory.store_calibration(SelfCalibration(0.01)).startswith(
+        'the calibration is in use but NOT STORED')
+    assert memory.model.self_calibration == SelfCalibration(0.01)
 
 
 SEVEN, EIGHT = (f'gyro: {{serial_number: "{number}"}}' for number in '78')
@@ -161,74 +160,3 @@ def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_is_not(t
     assert path.read_bytes() == b'new'
     assert sorted(os.listdir(tmp_path)) == ['.model.yaml.swp', '.other.yaml.abcd1234',
                                             'model.yaml']
-
-
-class Disk:
-    """A small disk that can be filled, or, without one, a limit to the files of a process."""
-
-    def __init__(self, folder):
-        self.folder, self.process = folder, None
-        self.is_mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs',
-                                          folder], capture_output=True).returncode == 0
-
-    def fill(self):
-        if not self.is_mounted:
-            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
-            return
-        with open(self.folder / 'ballast', 'wb', buffering=0) as file:
-            try:
-                while True:
-                    file.write(bytes(256))
-            except OSError:
-                pass
-
-    def free(self):
-        if self.is_mounted:
-            (self.folder / 'ballast').unlink()
-        else:
-            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE,
-                             (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-
-
-@pytest.fixture
-def disk(tmp_path):
-    folder = tmp_path / 'disk'
-    folder.mkdir()
-    disk = Disk(folder)
-    if not disk.is_mounted and not hasattr(resource, 'prlimit'):
-        pytest.skip('a disk can be filled neither by mounting a small one (that takes root) nor '
-                    'by prlimit (Linux has it)')
-    yield disk
-    if disk.is_mounted:
-        subprocess.run(['umount', '-l', folder], check=True)
-
-
-def test_on_a_full_disk_the_calibration_is_used_and_written_when_there_is_room(disk, tmp_path):
-    """As the node does it, in this process."""
-    disk.process = SimpleNamespace(pid=os.getpid())
-    calibration, biases = disk.folder / 'calibration.yaml', disk.folder / 'calibration_biases.yaml'
-    rig = rested(tmp_path, calibration_file=calibration)
-
-    def calibrated(bias):
-        rig.robot.bias = bias
-        return rig.calibrate(REST)
-    assert calibrated(0.01)[0]
-    old = calibration.read_bytes()
-    disk.fill()
-    success, message = calibrated(0.02)
-    assert success and 'NOT STORED' in message and f'make room in {disk.folder}' in message
-    assert rig.pipeline.store.calibration_hint.startswith(
-        'the calibration is in use but NOT STORED')
-    for _ in range(3000):  # rests, with a temperature, teach the table of biases
-        rig.pipeline.add_temperature(max(rig.truth), 25.0)
-        rig.step()
-    rig.pipeline.run_periodic_tasks(is_final=True)
-    assert 'cannot be written' in rig.pipeline.store.table_hint
-    assert calibration.read_bytes() == old and not biases.exists()
-    left = ['calibration.yaml'] + ['ballast'] * disk.is_mounted
-    assert sorted(os.listdir(disk.folder)) == sorted(left)
-    disk.free()
-    assert calibrated(0.03)[0] and calibration.read_bytes() != old
-    assert read_model(calibration).self_calibration.bias == pytest.approx(0.03, abs=1e-4)
-    rig.pipeline.run_periodic_tasks(is_final=True)
-    assert biases.exists(), 'what could not be written is written at the end at the latest'

@@ -26,12 +26,15 @@ import math
 import re
 from typing import NamedTuple, TypeVar
 
+from gyro_calibration.logs.columns import COLUMNS
+
 OutputT = TypeVar('OutputT')
 
 STANDARD_GRAVITY = 9.80665  # m/s²; what devices call one g
 ROOM_TEMPERATURE = 25.0  # degC; default of an emulated device
 #: Columns of the log format that hold the output, with their unit in rad/s, or in counts.
-GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts': 1.0}
+GYRO_COLUMNS = {name: factor for name, (quantity, factor) in COLUMNS.items()
+                if quantity in ('output', 'counts')}
 #: Further columns of the log format.
 OPTIONAL_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
 #: Standard deviation of a sample of a gyro whose data sheet is not known, rad/s.
