@@ -38,7 +38,6 @@ from gyro_calibration_bench.hidden.effects import (
     UNIT_FACTORS,
 )
 from gyro_calibration_bench.hidden.log import ALL
-from gyro_calibration_bench.hidden.motion import lag
 from gyro_calibration_bench.hidden.noise import (
     divergence,
     draw_figures,
@@ -196,12 +195,6 @@ def test_a_gyro_that_is_late_or_slow_sees_the_rate_of_before(generator):
     assert np.std(lagged - truth.rate) < 0.2 * np.std(seen - truth.rate)
 
 
-def test_a_lag_is_exact_on_a_ramp():
-    time = np.arange(1000) * 0.02
-    expected = time - 3.0 * (1.0 - np.exp(-time / 3.0))
-    assert lag(time, 0.02, 3.0) == pytest.approx(expected, abs=1e-9)
-
-
 def test_shapes_of_the_output_are_what_they_are_called(generator):
     figures = NoiseFigures(1e-5)
     dead, = hide(['dead_zone'], 5.0, generator, figures=figures, **COARSE)
@@ -317,7 +310,6 @@ def test_what_is_outside_the_catalogue_is_mostly_not_explained_by_it(generator):
               for name in OUTSIDE_CATALOGUE]
     assert np.mean([cause.likeness < 0.3
                     for cause in causes]) > 0.6, [(cause.name, cause.likeness) for cause in causes]
-    assert all(cause.likeness <= cause.likeness_of_three + 0.02 for cause in causes)
 
 
 def test_a_gyro_is_recorded_again_under_conditions_that_others_plan(generator):
@@ -338,11 +330,3 @@ def test_runs_share_the_gyro_and_not_the_bias_or_the_motion(generator):
                          **COARSE)
     assert first.truth.gyro is second.truth.gyro and first.truth.bias != second.truth.bias
     assert not np.allclose(first.truth.rate, second.truth.rate)
-
-
-def test_a_seed_makes_the_same_log_again_and_another_seed_another(tmp_path):
-    texts = [hide(['warm_up'], 2.0, np.random.default_rng(seed), noise='mixed', **COARSE)[0].write(
-        tmp_path / f'{place}.csv').read_text() for place, seed in enumerate((1, 1, 2))]
-    assert texts[0] == texts[1] != texts[2]
-    table = np.loadtxt(tmp_path / '0.csv', delimiter=',', skiprows=1)
-    assert texts[0].startswith('time_s,gyro_rad_s,temperature_degc') and table.shape == (6000, 7)
