@@ -29,7 +29,6 @@ import tempfile
 import time
 from typing import Any
 
-from fleet_tasks import calibrate
 from gyro_calibration.calibration.self_calibration import ReferenceErrors, self_calibrate
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.fleet.logs import find_logs, fit_slow_effects, LogTask, process_log
@@ -56,6 +55,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import motion_from_rates
 import numpy as np
 from numpy.random import Generator
+from processes import calibrate
 from scipy.special import ndtri
 from scipy.stats import beta
 
@@ -359,7 +359,7 @@ def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
         alone = [_alone()]
         begin = time.process_time()
         done_, lost, memory, used = 0, 0, [], {}
-        with process_executors(2, preload=['fleet', 'fleet_tasks']) as create:
+        with process_executors(2, preload=['fleet', 'processes']) as create:
             for _, found in run_tasks(calibrate, iter(given), 2, create):
                 lost += isinstance(found, WorkerLost)
                 done_ += not isinstance(found, WorkerLost)

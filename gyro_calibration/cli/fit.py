@@ -115,7 +115,7 @@ def run(given: argparse.Namespace) -> Answer:
         raise UsageError(_HEADING_ALONE)
     if given.out:
         write_model(given.out, model)
-    lines, data = (_answer_dwells(given, logs, model, found) if isinstance(found, Selection)
+    lines, data = (_answer_dwells(given, model, found) if isinstance(found, Selection)
                    else _answer_heading(given, logs, model, found))
     return Answer(lines, {'out': given.out, **_model_data(model), **data},
                   (given.picture, given.surface, given.out))
@@ -155,11 +155,11 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
                          'give one log, or use --method dwells')
     if others:
         raise UsageError(_HEADING_ALONE)
-    log, = logs.values()
-    return calibrate_encoder(log, method, technology or 'mems')
+    (log,) = logs.values()
+    return calibrate_encoder(log, method, technology=technology or 'mems')
 
 
-def _answer_dwells(given: argparse.Namespace, logs: Mapping[str, Log], model: GyroModel,
+def _answer_dwells(given: argparse.Namespace, model: GyroModel,
                    found: Selection) -> tuple[list[str], dict[str, Any]]:
     """Draw the dwells, and return lines for people and data."""
     fit = found.calibration

@@ -79,7 +79,6 @@ class Cause:
     multiple : of the minimum detectable effect, that is hidden
     apart : the multiple that is independent of the other hidden effects
     likeness : of an effect outside the catalogue, the share that the best effect in it explains
-    likeness_of_three : the same for the best three
 
     """
 
@@ -91,22 +90,11 @@ class Cause:
     multiple: float
     apart: float = math.nan
     likeness: float = math.nan
-    likeness_of_three: float = math.nan
-
-    @property
-    def left(self) -> float:
-        """Return what is left of an outside effect beside the best three of the catalogue."""
-        return self.multiple * math.sqrt(1.0 - self.likeness_of_three)
 
     @property
     def standard_deviation(self) -> float:
         """Least standard deviation of an estimate of the size, if the effect is linear in it."""
         return self.minimum_detectable / DETECTION_SIGMAS
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Return the size under the effect's name, and the shapes."""
-        return {self.name: self.size, **self.shapes}
 
 
 @dataclass(frozen=True)
@@ -326,18 +314,17 @@ def _draw_outside(name: str, multiple: float, generator: np.random.Generator,
                   sizing: _Sizing) -> Cause:
     """Draw shapes until no catalogued effect explains much of it, or keep the least explained."""
     form, likeness = OUTSIDE_CATALOGUE[name], Likeness(sizing.sessions, sizing.gyro.figures)
-    drawn: list[tuple[float, int, Shapes, list[np.ndarray]]] = []
+    drawn: list[tuple[float, int, Shapes]] = []
     for _ in range(MAX_DRAWS):
         shapes = form.shapes(sizing.sessions, generator)
         column = effect_errors(form, 1.0, shapes, sizing.sessions)
-        drawn.append((max(likeness.explained_shares(column).values()), len(drawn), shapes, column))
+        drawn.append((likeness.explained_share(column), len(drawn), shapes))
         if drawn[-1][0] < MAX_LIKENESS:
             break
-    share, _, shapes, column = min(drawn, key=lambda each: each[:2])
+    share, _, shapes = min(drawn, key=lambda each: each[:2])
     least = DETECTION_SIGMAS / sizing.norm(name, 1.0, shapes)
     size = float(generator.choice([-1.0, 1.0])) * multiple * least
-    return Cause(name, size, shapes, form.unit, least, multiple, likeness=share,
-                 likeness_of_three=likeness.joint_explained_share(column))
+    return Cause(name, size, shapes, form.unit, least, multiple, likeness=share)
 
 
 def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:

@@ -189,12 +189,12 @@ class Likeness:
 
     def __init__(self, sessions: list[Session], figures: NoiseFigures):
         self._metric = InformationMetric(sessions, figures, thin=THINNING_FACTOR)
-        self._groups: list[tuple[str, list[int]]] = []
+        self._groups: list[list[int]] = []
         columns = list(self._metric.nuisances.values())
         for name in FORMS:
             for group in () if name in WITHOUT_COLUMN | UNIVERSAL_EFFECTS else _candidate_columns(
                     name, sessions):
-                self._groups.append((name, list(range(len(columns), len(columns) + len(group)))))
+                self._groups.append(list(range(len(columns), len(columns) + len(group))))
                 columns += [block_averages(each, THINNING_FACTOR) for each in group]
         joined = np.column_stack([np.concatenate(each) for each in columns])
         self._whitened = np.column_stack([np.concatenate(self._metric.solve(each))
@@ -204,32 +204,15 @@ class Likeness:
         self._whitened, self._gram = self._whitened / scale, gram / np.outer(scale, scale)
         self._nuisance_indices = list(range(len(self._metric.nuisances)))
 
-    def explained_shares(self, hidden: Columns, excluded: str = '') -> dict[str, float]:
-        """Return the share of a column that each effect explains in addition to bias and scale."""
-        total, along = self._measure(hidden)
-        start = self._explained_energy(along, self._nuisance_indices)
-        best: dict[str, float] = {}
-        for name, group in self._groups:
-            share = (self._explained_energy(along, self._nuisance_indices + group) - start) / max(
-                total - start, 1e-300)
-            best[name] = max(best.get(name, 0.0), min(1.0, share))
-        best.pop(excluded, None)
-        return best
-
-    def joint_explained_share(self, hidden: Columns, count: int = 3) -> float:
-        """Return the share that some effects explain together, chosen greedily one by one."""
-        total, along = self._measure(hidden)
-        start, chosen = (self._explained_energy(along,
-                                                self._nuisance_indices), self._nuisance_indices)
-        for _ in range(count):
-            chosen = max((chosen + group for _, group in self._groups),
-                         key=lambda places: self._explained_energy(along, places))
-        return (self._explained_energy(along, chosen) - start) / max(total - start, 1e-300)
-
-    def _measure(self, hidden: Columns) -> tuple[float, np.ndarray]:
+    def explained_share(self, hidden: Columns) -> float:
+        """Return the share of a column that the best effect explains beside bias and scale."""
         signal = block_averages(hidden, THINNING_FACTOR)
         total = sum(float(x @ y) for x, y in zip(signal, self._metric.solve(signal)))
-        return total, self._whitened.T @ np.concatenate(signal)
+        along = self._whitened.T @ np.concatenate(signal)
+        start = self._explained_energy(along, self._nuisance_indices)
+        best = max(self._explained_energy(along, self._nuisance_indices + group)
+                   for group in self._groups)
+        return min(1.0, (best - start) / max(total - start, 1e-300))
 
     def _explained_energy(self, along: np.ndarray, places: list[int]) -> float:
         inverse = np.linalg.pinv(self._gram[np.ix_(places, places)], rcond=1e-10, hermitian=True)

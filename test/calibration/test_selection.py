@@ -12,7 +12,6 @@
 
 from dataclasses import replace
 
-from campaigns import judge, least_squares_error, simulated
 from gyro_calibration.calibration.dwells import dwells_from_table, join_dwells, select_dwells
 from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE,
@@ -31,6 +30,7 @@ from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 import pytest
 import rate_table
+from rate_table import judge, least_squares_error, simulated
 from recovery import CUBIC, LINEAR, SINE, Table, TRUTH
 from scipy.stats import binom
 

@@ -454,10 +454,15 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
 ODD = {
     'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n',
     'header': b'time_s,gyro_dps\n',
-    'two rows': b'time_s,gyro_dps\n0,1\n1,1\n', 'all zero': rb'0,0', 'all equal': rb'0,5',
-    'huge': rb'0,1e19', 'tiny': rb'0,1e-300', 'one huge': rb'0,0', 'signs': rb'0,-1e19',
-    'nan': rb'0,nan',
-    'half nan': rb'0,nan', 'fast': rb'0,1', 'slow': rb'0,1',
+    'two rows': b'time_s,gyro_dps\n0,1\n1,1\n',
+    **{name: ('time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc\n' + ''.join(
+        f'{k * step!r},{rate(k)},{rate(k)},{k % 60}\n' for k in range(600))).encode()
+       for name, step, rate in (
+           ('all zero', 0.01, lambda k: 0), ('all equal', 0.01, lambda k: 5),
+           ('huge', 0.01, lambda k: 1e19), ('tiny', 0.01, lambda k: 1e-300),
+           ('one huge', 0.01, lambda k: 1e19 if k == 300 else 0), ('signs', 0.01, lambda k: -1e19),
+           ('nan', 0.01, lambda k: 'nan'), ('half nan', 0.01, lambda k: 1 if k % 2 else 'nan'),
+           ('fast', 1e-9, lambda k: 1), ('slow', 1e17, lambda k: 1))},
     'semicolons': b'time_s;gyro_dps\n0;1\n1;1\n',
     'commas as points': b'time_s;gyro_dps\n0,0;1,5\n0,1;1,5\n',
     'utf-16': 'time_s,gyro_dps\n0,1\n1,1\n'.encode('utf-16'),
@@ -485,19 +490,6 @@ ODD = {
          lambda k: f'{k},{k},{(k % 3) * 1e19}\n'))},
     'two samples': b'time_s,gyro_dps\n1e10,1\n2e10,-1e20\n',
 }
-
-
-def odd_log(name):
-    """Return the bytes of an odd log; of one given by a row, of 600 of them."""
-    if b'\n' in ODD[name] or b'\r' in ODD[name] or name in ('empty', 'not packed'):
-        return ODD[name]
-    value = ODD[name].partition(b',')[2].decode()
-    step = {'fast': 1e-9, 'slow': 1e17}.get(name, 0.01)
-    rows = [(f'{row * step!r}', '1e19' if name == 'one huge' and row == 300 else '1'
-             if name == 'half nan' and row % 2 else value, row % 60) for row in range(600)]
-    columns = 'time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc'
-    return '\n'.join([columns,
-                      *(f'{time},{rate},{rate},{warm}' for time, rate, warm in rows), '']).encode()
 
 
 VERBS = {'compensate': 'compensate {log} --model {model} --out {out}',
@@ -531,7 +523,7 @@ def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
         'noise: {angle_random_walk: 1.0e-4}\n')
     for name in ODD:
         log, out = tmp_path / 'log.csv', tmp_path / 'out.csv'
-        log.write_bytes(odd_log(name))
+        log.write_bytes(ODD[name])
         words = [word.format(log=log, out=out, model=model, folder=tmp_path / 'found')
                  for word in VERBS[verb].split()]
         with np.errstate(all='ignore'):
