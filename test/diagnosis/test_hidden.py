@@ -248,11 +248,3 @@ def test_what_is_outside_the_catalogue_is_mostly_not_explained_by_it(generator):
     assert np.mean([cause.likeness < 0.3
                     for cause in causes]) > 0.6, [(cause.name, cause.likeness) for cause in causes]
     assert all(cause.likeness <= cause.likeness_of_three + 0.02 for cause in causes)
-
-
-def test_a_seed_makes_the_same_log_again_and_another_seed_another(tmp_path):
-    texts = [hide(['warm_up'], 2.0, np.random.default_rng(seed), noise='mixed', **COARSE)[0].write(
-        tmp_path / f'{place}.csv').read_text() for place, seed in enumerate((1, 1, 2))]
-    assert texts[0] == texts[1] != texts[2]
-    table = np.loadtxt(tmp_path / '0.csv', delimiter=',', skiprows=1)
-    assert texts[0].startswith('time_s,gyro_rad_s,temperature_degc') and table.shape == (6000, 7)
