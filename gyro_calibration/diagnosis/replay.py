@@ -25,7 +25,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 import math
 
-from gyro_calibration.diagnosis.gates import MIN_SAMPLES, resample_reference, select_reference
+from gyro_calibration.diagnosis.gates import (
+    MIN_SAMPLES,
+    MIN_VALID_SHARE,
+    resample_reference,
+    select_reference,
+)
 from gyro_calibration.heading.integration import integrate as integrate_trapezoidal
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
 from gyro_calibration.logs.quality import white_noise_deviation
@@ -133,8 +138,6 @@ _GAP_MARGIN_SAMPLES = 4
 #: Least bend of the rate at a corner as a share of the white noise: a thousand of them with one
 #: sign are 3 sigma. Largest share of corners.
 _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
-#: Largest number of grid points per sample: most of a log must not be interpolated.
-_MAX_POINTS_PER_SAMPLE = 5
 
 
 @dataclass(frozen=True)
@@ -254,11 +257,11 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
 def _refuse_gaps(time: Array, grid_index: NDArray[np.intp]) -> None:
     """Refuse a log of which most is missing, as after a jump of the clock."""
     points = int(grid_index[-1]) + 1
-    if points <= _MAX_POINTS_PER_SAMPLE * len(grid_index):
+    if len(grid_index) >= MIN_VALID_SHARE * points:
         return
     gaps = np.diff(time)
     longest = int(np.argmax(gaps))
-    raise DataRefused(f'{len(grid_index)} of {points} samples can be used, at least a fifth is '
+    raise DataRefused(f'{len(grid_index)} of {points} samples can be used, at least a tenth is '
                       f'needed; the longest gap, of {gaps[longest]:.6g} s, begins at '
                       f'{time[longest]:.3f} s: cut the log there, and give both parts, or give '
                       '--rate if the stamps are wrong')

@@ -300,14 +300,6 @@ def test_lost_samples_are_counted_through_jitter(jitter, generator):
     assert value(found(thinned)['dropped_samples']) == np.count_nonzero(~kept)
 
 
-@pytest.mark.parametrize('step', [0.088 * DEGREE, 0.01 * DEGREE])
-def test_the_step_of_an_encoder_is_found_in_print_and_out_of_it(step, generator):
-    heading = np.cumsum(swing(generator).reference_rate) * INTERVAL
-    read = np.round(heading / step) * step
-    assert (encoder_step(read) == pytest.approx(step, rel=1e-9)
-            and encoder_step(printed(read, 3)) == pytest.approx(step, rel=1e-3))
-
-
 def test_a_calculated_motion_has_no_encoder():
     """Stretches of constant rate and ramps have headings on a lattice, and rests one value."""
     time = np.arange(6000) * INTERVAL
