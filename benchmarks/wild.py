@@ -11,7 +11,7 @@
 """
 Calibrate a gyro on half of a drive against its course over ground, and correct the other half.
 
-    python benchmarks/wild.py [FOLDER]           recordings, by `diagnose`; default: `wheeled_drives`
+    python benchmarks/wild.py [FOLDER]           recordings, as `wheeled_drives`, by `diagnose`
     python benchmarks/wild.py drives FOLDER      the same by `fit`
     python benchmarks/wild.py simulated [DRIVES] drives of a simulator of its own, by `fit`
 
