@@ -152,10 +152,10 @@ class _SampleCounter:
             self.ambiguity = self._modulus
             if last is None:
                 return 1, 0
-            if sample.sequence == last:  # it stands still
+            advance = (sample.sequence - last) % self._modulus
+            if not advance:  # it stands still
                 self.ambiguity = 1
                 return 1 + missing, missing
-            advance = (sample.sequence - last) % self._modulus
             # The number of missing samples by damaged bytes gives the number of wraps.
             advance += self._modulus * max(0, round((1 + missing - advance) / self._modulus))
             return advance, advance - 1
