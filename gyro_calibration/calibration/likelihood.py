@@ -49,7 +49,7 @@ class GoodnessOfFit:
     def __str__(self) -> str:
         """Return a sentence for people."""
         amount = ('what the noise explains' if self.probability > MIN_FIT_PROBABILITY else
-                  'more than the noise explains: the robot follows the profile less well than the '
+                  'more than the noise explains: the robot follows the motion less well than the '
                   'gyro measures, or shakes')
         return (f'The residual is {amount} (chi-square {self.chi_square:.1f} with '
                 f'{self.dof:.0f} degrees of freedom, probability {self.probability:.2g}; '
@@ -195,7 +195,7 @@ class _RunAlignment:
         """Return the increments, or refuse a run with hardly any."""
         data = self.increments_at(offset, lag)
         if len(data.gyro_increments) < 10:
-            raise DataRefused('the samples cover less than ten blocks of the profile: '
+            raise DataRefused('the samples cover less than ten blocks of the motion: '
                               'record the whole motion')
         return data
 

@@ -37,19 +37,27 @@ MAX_UNEXPLAINED_SHARE = 0.1
 #: Factor by which a motion with a deviating stretch must leave less than one without.
 _SLIP_PENALTY = 1.5
 
-#: Units that are confused, in rad/s.
-_RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'mrad/s': 1e-3, 'mdeg/s': 1e-3 * DEGREE,
-               'deg/h': DEGREE / 3600.0, 'revolutions/s': 2.0 * math.pi,
-               'revolutions/min': math.pi / 30.0}
-#: Reported over true rate -> the cause in the gyro, and the one in the profile; likely ones last.
+#: Units that are confused, in rad/s: the usual ones, and all, the usual ones last.
+_USUAL_UNITS = {'mdeg/s': 1e-3 * DEGREE, 'mrad/s': 1e-3, 'deg/s': DEGREE, 'rad/s': 1.0}
+_RATE_UNITS = {'revolutions/min': math.pi / 30.0, 'revolutions/s': 2.0 * math.pi,
+               'deg/h': DEGREE / 3600.0, **_USUAL_UNITS}
+
+
+def _name_confusions(units: dict[str, float]) -> dict[float, tuple[str, str]]:
+    """Return the causes by reported over true rate; of equal ones, that of the later units."""
+    return {float(f'{taken / size:.6g}'): (
+        f'the gyro is in {unit} and read as {other}',
+        f'the profile in {other} and read as {unit}' if '/s' not in unit or '/s' not in other
+        else f'the profile in {other[:-2]} and read as {unit[:-2]}')
+        for (unit, size), (other, taken) in permutations(units.items(), 2)}
+
+
+#: Reported over true rate -> the cause in the gyro, and the one in the profile.
 _UNIT_CONFUSIONS = {
     **{factor: (f'the gyro is read with {factor:g} times its sensitivity',
                 f'the profile was driven at {factor:g} times its rate')
        for base in (2.0, 4.0, 8.0, 10.0, 100.0) for factor in (base, 1.0 / base)},
-    **{float(f'{taken / size:.6g}'): (
-        f'the gyro is in {unit} and read as {other}',
-        f'the profile in {other.removesuffix("/s")} and read as {unit.removesuffix("/s")}')
-       for (unit, size), (other, taken) in permutations(reversed(_RATE_UNITS.items()), 2)},
+    **_name_confusions(_RATE_UNITS),
     1e3: ('the gyro is in thousandths (mdeg/s, mrad/s) and read as whole units',
           'the profile in thousands'),
     1e-3: ('the gyro is in thousands',
@@ -70,12 +78,14 @@ def refuse_unit_error(scale: float, reference: str = 'profile') -> None:
 
     """
     size = max(abs(scale), 1e-300)
-    found = [causes for factor, causes in reversed(_UNIT_CONFUSIONS.items())
+    found = [factor for factor in _UNIT_CONFUSIONS
              if 1.0 / _UNIT_TOLERANCE < size / factor < _UNIT_TOLERANCE]
     if not found or 1.0 / _UNIT_TOLERANCE < size < _UNIT_TOLERANCE:
         return
+    usual = _name_confusions(_USUAL_UNITS)
+    gyro, profile = _UNIT_CONFUSIONS[min(
+        found, key=lambda factor: (factor not in usual, abs(math.log(size / factor))))]
     sign_note = ', and turns the other way' if scale < 0.0 else ''
-    gyro, profile = (', or '.join(texts) for texts in zip(*found))
     cause = f'either {gyro}, or {profile.replace("profile", reference)}' if reference else gyro
     raise DataRefused(f'the gyro reports {size:.4g} times what was turned{sign_note}: '
                       f'{cause}; correct the unit')
@@ -128,17 +138,20 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
     DataRefused : with the cause that explains it best
 
     """
-    trials = [*_try_motions(run, motion, largest_offset),
-              *((_SLIP_PENALTY * unexplained, slip or message)
+    trials = [*((unexplained, unexplained, message) for unexplained, message
+                in _try_motions(run, motion, largest_offset)),
+              *((_SLIP_PENALTY * unexplained, unexplained, slip or message)
                 for unexplained, message in _try_slips(run, motion, largest_offset))]
-    unexplained, message = min(trials)
+    _, unexplained, message = min(trials)
     if _SLIP_PENALTY * unexplained > fit_profile(
             run, motion, largest_offset)[0] <= MAX_UNEXPLAINED_SHARE:
         return
     if unexplained > MAX_UNEXPLAINED_SHARE:
-        raise DataRefused('the robot turned otherwise than the profile (the best that can be made '
-                          f'of it explains {100 * max(1 - unexplained, 0.0):.0f} % of the run): '
-                          'was another profile driven?')
+        who, remedy = (('robot', 'was another profile driven?') if motion.name == 'profile' else
+                       ('gyro', 'check that both belong to one run'))
+        raise DataRefused(f'the {who} turned otherwise than the {motion.name} (the best that can '
+                          'be made of it explains '
+                          f'{100 * max(1 - unexplained, 0.0):.0f} % of the run): {remedy}')
     raise DataRefused(message)
 
 
@@ -156,23 +169,29 @@ def _trial_offsets(largest_offset: float) -> Array:
 def _try_motions(run: RunPieces, motion: Motion,
                  largest_offset: float) -> Iterator[tuple[float, str]]:
     """Give the unexplained part of a run by ends, speeds and starts, and the cause."""
-    duration = motion.duration
+    duration, is_profile = motion.duration, motion.name == 'profile'
     for offset in _trial_offsets(largest_offset)[::2]:
         for end in np.arange(0.05, 0.97, 0.0125) * duration:
             yield (run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
                    f"the robot stopped at about {end:.1f} s of the profile's {duration:.1f} s: "
-                   'drive the whole profile')
+                   'drive the whole profile' if is_profile else
+                   f'the gyro follows the reference until about {end:.1f} s of {duration:.1f} s '
+                   'only: repair the line that stopped, and record again')
         for speed in (2.0 ** (each / 16.0) for each in range(-32, 33)):
             if max(speed, 1.0 / speed) > _UNIT_TOLERANCE:
                 yield (run.fit_scale(run.reference_angle(motion, offset, speed))[0],
                        f'the robot drove the profile {speed:.2f} times as fast as given, in '
                        f'{duration / speed:.1f} s instead of {duration:.1f} s: drive it at its '
-                       'own speed, or give the profile that was driven')
+                       'own speed, or give the profile that was driven' if is_profile else
+                       f'the gyro follows the reference at {speed:.2f} times its speed: correct '
+                       'the time of the reference')
     for offset in _trial_offsets(0.6 * duration):
         if abs(offset) > largest_offset:
             yield (run.fit_scale(run.reference_angle(motion, offset))[0],
                    f'the robot began {abs(offset):.1f} s {"after" if offset > 0 else "before"} '
-                   'the profile: begin with it, or allow a larger time offset')
+                   'the profile: begin with it, or allow a larger time offset' if is_profile else
+                   f'the gyro is {abs(offset):.1f} s {"behind" if offset > 0 else "ahead of"} the '
+                   'reference: correct the time of the reference')
 
 
 def _try_slips(run: RunPieces, motion: Motion,
@@ -188,12 +207,13 @@ def _try_slips(run: RunPieces, motion: Motion,
             np.column_stack([reference, np.full(len(reference), interval)]), steps, run.gyro_angle)
         turned = found.excess_rate * float(edges[found.last] - edges[found.first]) * interval
         yield (run.fit_scale(reference)[0] - found.explained_squares / whole,
-               format_slip(abs(turned), float(run.edges[edges[found.first]])))
+               format_slip(motion, abs(turned), float(run.edges[edges[found.first]])))
 
 
-def format_slip(angle: float, time: float, sigmas: float = math.nan) -> str:
-    """Say that the robot slipped or was bumped."""
+def format_slip(motion: Motion, angle: float, time: float, sigmas: float = math.nan) -> str:
+    """Say that the robot slipped or was bumped, or that a mount or a reference slipped."""
     significance = '' if math.isnan(sigmas) else f' ({sigmas:.0f} standard deviations)'
+    cause = ('a slip or a bump; run again on free ground' if motion.name == 'profile' else
+             'a slip of the mount or an error of the reference; mend it and run again')
     return (f'a stretch of the run turned {angle / DEGREE:.1f} deg otherwise than the '
-            f'profile{significance}, at about {time:.1f} s: a slip or a bump; run again on free '
-            'ground')
+            f'{motion.name}{significance}, at about {time:.1f} s: {cause}')

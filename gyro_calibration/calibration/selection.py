@@ -321,11 +321,13 @@ def _explain_choice(fit: Calibration, effect: Effect, significance: float,
     except DataRefused as error:
         return EffectChoice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
-    reason = 'no better than chance'
+    reason = 'does not predict left-out sweeps better'
     if not larger.dof:
         reason = 'as many values as dwells: no significance can be stated; add dwells'
     elif taken:
         reason = ('predicts left-out sweeps better'
                   if _is_supported(smaller, larger, significance) else 'belongs to every model')
+    elif larger.p_value(effect) >= significance:
+        reason = f'the chance is above {significance:.2g}, the level of each effect'
     return EffectChoice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
                         larger.p_value(effect), reason)

@@ -264,25 +264,26 @@ def refuse_scale(scale_factor_error: float, reference: str, remedy: str) -> None
 def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) -> None:
     """Refuse a run that is not the whole profile, another unit or sign, or one speed alone."""
     if not np.isfinite(motion.heading).all():
-        raise DataRefused('the reference was lost somewhere in the profile: '
+        raise DataRefused('the reference was lost somewhere: '
                           'leave those points out, or run again')
     covered = float(time[-1] - time[0])
     if covered < 0.9 * motion.duration - 2.0 * limits.max_time_offset:
-        raise DataRefused(f"the samples cover {covered:.1f} s of the profile's "
+        raise DataRefused(f"the samples cover {covered:.1f} s of the {motion.name}'s "
                           f'{motion.duration:.1f} s: record the whole motion')
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     unexplained, scale = fit_profile(run, motion, largest_offset)
     if unexplained <= MAX_UNEXPLAINED_SHARE:
-        refuse_unit_error(scale)
-        refuse_scale(scale - 1.0, 'profile', "set the driver's parameter invert")
+        refuse_unit_error(scale, motion.name)
+        refuse_scale(scale - 1.0, motion.name,
+                     "give or omit --invert, or set the driver's parameter invert")
     rate_spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
     if rate_spread < limits.min_rate_spread:
-        raise DataRefused('the profile turns at one speed (its rate varies by '
+        raise DataRefused(f'the {motion.name} turns at one speed (its rate varies by '
                           f'{rate_spread / DEGREE:.2f} deg/s): scale and bias cannot be '
                           'separated; turn both ways, with stops')
     if unexplained > MAX_UNEXPLAINED_SHARE:
         if np.std(run.gyro_angle) < 0.1 * np.std(run.reference_angle(motion)):
-            refuse_scale(scale - 1.0, 'profile', '')
+            refuse_scale(scale - 1.0, motion.name, '')
         refuse_other_motion(run, motion, largest_offset)
 
 
@@ -292,7 +293,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     excess_angle, sigmas = fit.stretch_residual
     s, b = fit.scale_factor_error, fit.bias
     deviation = float(np.nan_to_num(math.sqrt(fit.covariance[0, 0])))
-    slip = format_slip(excess_angle, fit.stretch_interval[0], sigmas)
+    slip = format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas)
     has_slipped = excess_angle > limits.max_stretch_residual and sigmas > MIN_SLIP_SIGMAS
     if (has_slipped or abs(fit.time_offset) > largest_offset
             or deviation > limits.max_scale_deviation):
@@ -302,14 +303,16 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     if abs(s) > limits.max_scale_factor_error + 3.0 * deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: check the sensitivity '
-                          "and at the profile's unit")
+                          f'and the unit of the {motion.name}')
     if abs(b) > limits.max_bias:
         raise DataRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond '
                           f'{limits.max_bias / DEGREE:g} deg/s: do not turn the robot by hand')
     if deviation > limits.max_scale_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
                           f'wanted {100 * limits.max_scale_deviation:g} %: turn further, faster, '
-                          'or more often, and check that the profile is the one that was driven')
+                          'or more often'
+                          + (', and check that the profile is the one that was driven'
+                             if motion.name == 'profile' else ''))
     # against measured headings the deviations include the noise of mount and encoder
     unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
     if (motion.rate is not None and fit.goodness is not None and unexplained_angle

@@ -143,7 +143,8 @@ class _Parser(argparse.ArgumentParser):
 
 def find_verbs() -> dict[str, str]:
     """Return the docstring of each verb, which are the files with a function ``run``."""
-    texts = {path.stem: path.read_text() for path in sorted(Path(__file__).parent.glob('*.py'))}
+    texts = {path.stem: path.read_text('utf-8')
+             for path in sorted(Path(__file__).parent.glob('*.py'))}
     return {name.replace('_', '-'): ast.get_docstring(ast.parse(text)) or name
             for name, text in texts.items() if '\ndef run(' in text}
 

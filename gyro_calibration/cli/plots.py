@@ -44,9 +44,9 @@ _DIVERGING_COLORMAP, _SEQUENTIAL_COLORMAP = 'RdBu_r', 'cividis'
 
 def draw_headings(path: str | Path | None, time: Array, true: Array,
                   headings: Mapping[str, Array]) -> Any:
-    """Draw headings, rad, against the truth, and their errors (figure 10 of Hong and Park)."""
+    """Draw headings, rad, against a reference, and their errors (figure 10 of Hong and Park)."""
     figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1.3))
-    above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='truth')
+    above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='reference')
     for (name, heading), style in zip(headings.items(), _LINE_STYLES * len(headings)):
         above.plot(time, heading / DEGREE, linestyle=style, linewidth=1)
         below.plot(time, (heading - true) / DEGREE, linestyle=style, label=name)
@@ -92,13 +92,14 @@ def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array
     figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1))
     above.plot(time, rate / DEGREE, color='0.6', linewidth=0.8, label='gyro')
     above.plot(time, motion.rate_at(time) / DEGREE, color='black', linewidth=1.5,
-               linestyle='--', label='motion that was to be driven')
+               linestyle='--', label=motion.name)
     above.set(ylabel='rate [deg/s]', title='Run of self-calibration')
     above.legend(loc='best')
     true = motion.heading_at(time) - motion.heading_at(time[:1])
-    for values, style, name in ((rate, '--', 'before'), (corrected, '-', 'after')):
-        below.plot(time, (integrate(time, values) - true) / DEGREE, color='black',
-                   linestyle=style, label=f'{name} self-calibration')
+    for values, colour, style, name in ((rate, 'tab:orange', '--', 'before'),
+                                        (corrected, 'tab:blue', '-', 'after')):
+        below.plot(time, (integrate(time, values) - true) / DEGREE, color=colour, linestyle=style,
+                   label=f'{name} self-calibration')
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')

@@ -104,7 +104,7 @@ def run(given: argparse.Namespace) -> Answer:
         raise UsageError('--turns and --profile were both given; '
                          'give one of them as the reference')
     if given.turns is not None and given.picture:
-        raise UsageError('--picture draws a run against a profile, which --turns does not have; '
+        raise UsageError('--picture draws a run against a motion, which --turns does not have; '
                          'omit one of the two')
     if given.turns is None and given.marking is not None:
         raise UsageError('--marking needs --turns, whose mark it is the error of; '
@@ -127,7 +127,7 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
         run.draw(given.picture)
     return _store_and_answer(given, model, log, run.fit, run.is_used, given.method,
                              _fit_data(run.fit, run.rest_check),
-                             list(_fit_lines(run.fit, run.rest_check, given.method)))
+                             list(_fit_lines(run.fit, run.rest_check, given.method, motion.name)))
 
 
 @dataclass(frozen=True)
@@ -252,9 +252,10 @@ def _fit_data(fit: ScaleBiasFit, check: RestCheck | None) -> dict[str, Any]:
             'rest_limit_rad_s': check.limit if check else math.nan}
 
 
-def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str) -> Iterator[str]:
+def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str,
+               reference: str) -> Iterator[str]:
     if method == 'likelihood':
-        yield (f'Delay of the gyro behind the profile: {fit.time_offset:.4f} '
+        yield (f'Delay of the gyro behind the {reference}: {fit.time_offset:.4f} '
                f'+- {fit.time_offset_deviation:.4f} s.')
     if not math.isnan(fit.start_heading):
         yield (f'The run began {fit.start_heading / DEGREE:.3f} '

@@ -38,7 +38,7 @@ from gyro_calibration.calibration.rate_table import (
     summarize_errors,
     TurnErrors,
 )
-from gyro_calibration.calibration.scatter import find_inliers
+from gyro_calibration.calibration.scatter import cross_validation_parts, find_inliers
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
@@ -103,10 +103,13 @@ def _predict_by_fit(found: Dwells,
                     technology: str | None) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     """Return rates by models not fitted to the sweep, the dwells not outlying, and remarks."""
     calibration = select_effects(found, technology).calibration
-    names = [effect.name for effect in calibration.effects]
+    names, used = [effect.name for effect in calibration.effects], calibration.used
+    parts = int(cross_validation_parts(used).max()) + 1
+    left_out = ('sweep to the other sweeps' if parts == len(np.unique(used.sweep))
+                else f'{"turn" if parts == len(used) else f"of {parts} parts of the log"} to the '
+                'others, as there are fewer than four sweeps')
     remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted '
-              'for each sweep to the other sweeps (each turn to the other turns, of fewer than '
-              'four sweeps), so no turn is in the data of its model')
+              f'for each {left_out}, so no turn is in the data of its model')
     return (calibration.left_out_rate, calibration.scatter.inliers, [remark],
             {'effects': names, 'left_out': True})
 

@@ -488,7 +488,7 @@ def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
             refuse_wrapped(log)
             yield Gate('wrapped_heading', True, 'the reference heading is continuous')
         except DataRefused as refusal:
-            yield Gate('wrapped_heading', False, str(refusal).partition(';')[0],
+            yield Gate('wrapped_heading', False, str(refusal).rpartition(':')[0],
                        'unwrap the reference heading (--unwrap)')
     reference = reference_angle(log)
     by_length = compare_headings(log, reference)

@@ -587,10 +587,10 @@ def refuse_wrapped(log: Log) -> None:
     if len(jumps) and not (log.output is not None and _is_in_degrees(
             time, log.reference_heading[known], log.time, np.nan_to_num(log.output))):
         first, last = known[jumps[0]], known[jumps[0] + 1]
-        where = ('from one sample to the next, the first time at' if last == first + 1 else
-                 'that the gyro does not show, first in the gap that ends at')
-        raise DataRefused(f'the reference heading jumps by a full turn {where} '
-                          f'{log.time[last]:.3f} s; it must be continuous: use --unwrap')
+        where = (', first at' if last == first + 1 else
+                 ' that the gyro does not show, first in the gap that ends at')
+        raise DataRefused(f'the reference heading jumps by a full turn{where} '
+                          f'{log.time[last]:.3f} s: use --unwrap, or unwrap_heading in Python')
 
 
 def _turns_without_gyro(log: Log, known: NDArray[np.intp]) -> Mask:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import io
 import math
 from pathlib import Path
@@ -57,6 +57,7 @@ class Motion:
     time: Array  # s, increasing, shape (n,), beginning at 0
     heading: Array  # rad, continuous, shape (n,), beginning at 0
     rate: Array | None = None  # rad/s, shape (n,); None where the motion was given by its heading
+    name: str = 'profile'  # in messages
 
     @property
     def duration(self) -> float:
@@ -107,7 +108,8 @@ def motion_from_log(log: Log) -> tuple[Motion, float]:
             if known.sum() < 2:
                 raise DataRefused(f'the reference has {known.sum()} values; at least 2 are '
                                   'needed: give the motion')
-            return motion(log.time[known], values[known]), float(log.time[known][0])
+            return (replace(motion(log.time[known], values[known]), name='reference'),
+                    float(log.time[known][0]))
     raise InputError('no reference over time; give the motion')
 
 

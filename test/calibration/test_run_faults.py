@@ -35,13 +35,14 @@ from gyro_calibration.calibration.self_calibration import (
     self_calibrate,
 )
 from gyro_calibration.calibration.whole_turns import calibrate_turns
-from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.motion import (
     CALIBRATION_MOTION,
     constant_rate_motion,
     motion_from_headings,
+    motion_from_log,
     motion_from_rates,
 )
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -133,6 +134,25 @@ def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_len
     assert work[1] < 4.0 * work[0]
     assert np.diff(split_run(time[:6000], rate[:6000]).edges) == pytest.approx(0.1), (
         'a minute keeps its short pieces')
+
+
+@pytest.mark.parametrize('factor, words', [
+    (60.0, 'either the gyro is in deg/s and read as rad/s, or the profile in rad and read as deg;'),
+    (0.159, 'either the gyro is in revolutions/s and read as rad/s, or the profile in rad and '),
+    (9.55, 'is in revolutions/min and read as rad/s, or the profile in rad/s and read as rev'),
+    (1000.0, r'either the gyro is in thousandths \(mdeg/s, mrad/s\) and read as whole units, or '),
+])
+def test_one_confusion_of_units_is_named_the_usual_one_first(factor, words):
+    with pytest.raises(DataRefused, match=words):
+        self_calibrate(TIME, factor * CALIBRATION_MOTION.rate_at(TIME), CALIBRATION_MOTION)
+
+
+def test_a_slip_against_a_reference_is_not_blamed_on_a_profile():
+    rate = output() + 0.3 * ((TIME > 9.0) & (TIME < 9.7))
+    measured, _ = motion_from_log(Log(time=TIME, reference_heading=CALIBRATION_MOTION.heading_at(
+        TIME)))
+    with pytest.raises(DataRefused, match='otherwise than the reference .* a slip of the mount'):
+        self_calibrate(TIME, rate, measured)
 
 
 def test_a_limit_hidden_by_the_model_is_seen_in_the_output():

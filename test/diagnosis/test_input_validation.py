@@ -135,7 +135,7 @@ def test_samples_without_time_are_not_taken_for_a_rate_table():
 def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
     heading = np.where(TIME % 7.0 < 0.1, np.nan, (TURNED - first) % (2.0 * np.pi) + first)
     with pytest.raises(DataRefused,
-                       match='reference heading jumps by a full turn .*must be continuous'):
+                       match='heading jumps by a full turn, first at .* s: use --unwrap'):
         use(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=heading))
 
 
