@@ -29,6 +29,7 @@ import math
 from gyro_calibration.calibration.noise_grid import TridiagonalMatrix
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,25 @@ MAX_NOISE_SIGMAS = 7.0
 
 
 @dataclass(frozen=True)
+class _ReferencePoints:
+    """
+    Where the reference is known: times, s, headings, rad, and variances, shape (n,) each.
+
+    The variances are known up to one factor. Errors that several points share have columns, shape
+    (n, k), and prior standard deviations, shape (k,), times one row of the factors
+    `prior_factors`, shape (m, k).
+
+    """
+
+    time: Array
+    heading: Array
+    variance: Array
+    shared: Array
+    shared_deviation: Array = field(default_factory=lambda: np.empty(0))
+    prior_factors: Array = field(default_factory=lambda: np.ones((1, 0)))
+
+
+@dataclass(frozen=True)
 class _Increments:
     """Increments of headings of gyro and reference between blocks, each a mean over points."""
 
@@ -117,7 +137,7 @@ class _Increments:
     # shape (n,)
     walk_variance: Array
     walk_covariance: Array
-    # variance of the reference in each block, relative to that of a point, shape (n + 1,)
+    # variance of the reference in each block, up to one factor, shape (n + 1,)
     reference_variance: Array
     time: Array  # of the blocks, s, shape (n + 1,)
     # from the first point to the first block: its heading, the time, the shared errors in that
@@ -148,15 +168,7 @@ class _RunAlignment:
         self._smoothing_time = max(float(np.median(np.diff(time))), _MIN_SMOOTHING_TIME)
         self.is_measured = motion.rate is None
         self._block_duration = block_duration(motion)
-        if motion.rate is None:
-            self._point_time, self._heading = motion.time, motion.heading
-            self._shared, self._shared_deviation, self._prior_factors = _no_shared_errors(
-                len(motion.time))
-        else:
-            self._point_time = np.arange(0.0, motion.duration + 1e-9, 0.01)
-            self._heading = motion.heading_at(self._point_time)
-            self._shared, self._shared_deviation, self._prior_factors = tracking_error_columns(
-                motion, self._point_time, slip_deviation)
+        self._points = _select_reference_points(motion, self._block_duration, slip_deviation)
 
     def increments_at(self, offset: float, lag: float = 0.0) -> _Increments:
         """
@@ -166,30 +178,30 @@ class _RunAlignment:
         times the constant is the input, but for a delay.
 
         """
-        constant = math.sqrt(2.0 * lag)
-        gyro_time = self._point_time + offset - constant
+        points, constant = self._points, math.sqrt(2.0 * lag)
+        gyro_time = points.time + offset - constant
         is_covered = (gyro_time >= self._time[0]) & (gyro_time <= self._time[-1])
-        time = self._point_time[is_covered]
+        time, weight = points.time[is_covered], 1.0 / points.variance[is_covered]
         if len(time) < 2:
             return _Increments(np.empty((0, 4)), *np.empty((9, 0)))
         begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block_duration + 1e-6),
                                         prepend=-1.0))
-        counts = np.diff(begins, append=len(time))
-        weight = np.repeat(1.0 / counts, counts)
-        known = np.column_stack([self._heading[is_covered], time,
+        precision = np.add.reduceat(weight, begins)
+        weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
+        known = np.column_stack([points.heading[is_covered], time,
                                  *self._rate_and_integral(gyro_time[is_covered], constant),
-                                 self._shared[is_covered]])
+                                 points.shared[is_covered]])
         means = np.add.reduceat(weight[:, None] * known, begins)
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
-        prior = np.append(self._prior_deviation, self._shared_deviation)
-        prior_factors = np.insert(self._prior_factors, [0] * 4, 1.0, axis=1)
+        prior = np.append(self._prior_deviation, points.shared_deviation)
+        prior_factors = np.insert(points.prior_factors, [0] * 4, 1.0, axis=1)
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
         start_offsets = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
                                         [means[0, 4] - known[0, 4]]])
         return _Increments(columns, prior, prior_factors, expected, np.diff(means[:, 4]), *walk,
-                           1.0 / counts, means[:, 1], start_offsets)
+                           1.0 / precision, means[:, 1], start_offsets)
 
     def require_increments(self, offset: float, lag: float) -> _Increments:
         """Return the increments, or refuse a run with hardly any."""
@@ -263,9 +275,25 @@ def block_duration(motion: Motion) -> float:
     return block / 2.0 ** halvings
 
 
-def _no_shared_errors(count: int) -> tuple[Array, Array, Array]:
-    """Return no columns of a number of points, as `tracking_error_columns` does."""
-    return np.empty((count, 0)), np.empty(0), np.ones((1, 0))
+def _select_reference_points(motion: Motion, block: float,
+                             slip_deviation: float) -> _ReferencePoints:
+    """Return where a motion is known: at its samples, or for an encoder where it steps."""
+    if motion.rate is not None:
+        time = np.arange(0.0, motion.duration + 1e-9, 0.01)
+        return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
+                                *tracking_error_columns(motion, time, slip_deviation))
+    step = quantization_step(motion.heading)
+    if not step:
+        return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
+                                np.empty((len(motion.time), 0)))
+    step_crossings = _find_step_crossings(motion, step)
+    constant_readings = _find_constant_readings(motion, step, block)
+    order = np.argsort(np.append(step_crossings.time, constant_readings.time), kind='stable')
+    time, heading, variance, shared = (np.concatenate(
+        [getattr(points, name) for points in (step_crossings, constant_readings)])[order]
+                                       for name in ('time', 'heading', 'variance', 'shared'))
+    return _ReferencePoints(time, heading, variance, shared, np.full(2, step / math.sqrt(12.0)),
+                            np.ones((1, 2)))
 
 
 #: Standard deviation of the scale factor error by which the two senses of turning may differ.
@@ -307,7 +335,7 @@ def tracking_error_columns(motion: Motion, time: Array,
     turn = np.where(sense, np.cumsum((sense != 0.0) & (np.diff(sense, prepend=0.0) != 0.0)), 0)
     count = min(int(turn.max()), _MAX_TURN_GROUPS)
     if count < 2:
-        return _no_shared_errors(len(time))
+        return np.empty((len(time), 0)), np.empty(0), np.ones((1, 0))
     inside = (-(-turn * count // turn.max()))[:, None] == np.arange(1, count + 1)
     # the mean over the turns is delay, lag and scale
     contrasts = helmert(count).T
@@ -334,6 +362,63 @@ def tracking_error_columns(motion: Motion, time: Array,
         deviations.append(np.array([ASYMMETRY_DEVIATION]))
         prior_factors = np.append(prior_factors, np.ones((len(prior_factors), 1)), axis=1)
     return np.hstack(columns), np.concatenate(deviations), prior_factors
+
+
+def _find_step_crossings(motion: Motion, step: float) -> _ReferencePoints:
+    """
+    Return the middles between lasting readings one step apart, with variances in units of theirs.
+
+    A constant reading has a constant error of up to half a step; where it changes by one step, the
+    heading is the edge between the two, but for the turn between the samples.
+
+    """
+    change = np.abs(np.diff(motion.heading))
+    index = np.flatnonzero(change > 0.5 * step)
+    time, heading = (0.5 * (values[index] + values[index + 1])
+                     for values in (motion.time, motion.heading))
+    speed = np.abs(np.diff(heading) / np.diff(time))
+    relative_deviation = (np.maximum(np.append(speed, 0.0), np.append(0.0, speed)[:len(time)])
+                          if len(time) else time)
+    relative_deviation = np.where(change[index] > 1.5 * step, 1.0,
+                                  np.clip(relative_deviation * np.diff(motion.time)[index] / step,
+                                          _MIN_CROSSING_DEVIATION, 1.0))
+    # none has more weight than the median one: the accuracy of a reference is seldom that of its
+    # slowest steps
+    relative_deviation = (np.maximum(relative_deviation, np.median(relative_deviation))
+                          if len(time) else relative_deviation)
+    alone = np.diff(index, prepend=-1, append=len(change)) == 1
+    edges = (change[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
+    return _ReferencePoints(time[edges], heading[edges], relative_deviation[edges] ** 2,
+                            np.zeros((int(edges.sum()), 2)))
+
+
+#: Least standard deviation of a heading where an encoder steps, in units of that of a reading.
+_MIN_CROSSING_DEVIATION = 0.05
+
+
+def _find_constant_readings(motion: Motion, step: float, block: float) -> _ReferencePoints:
+    """
+    Return the readings that are constant for longer than a block, single ones, the first and last.
+
+    All samples of a constant reading count as one. At the first and the last the gyro rests if
+    they last much longer than the readings next to them; then their samples share one error.
+
+    """
+    run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)
+    begins = np.flatnonzero(np.diff(run, prepend=-1))
+    ends = np.append(begins[1:], len(run)) - 1
+    durations = motion.time[ends] - motion.time[begins]
+    is_used = (durations > block) | (ends == begins)
+    is_used[[0, -1]] = True
+    rest_columns = np.zeros((len(begins), 2))
+    if len(begins) > 2:
+        rest_columns[0, 0], rest_columns[-1, 1] = (
+            durations[end] > max(block, 2.0 * durations[next_to])
+            for end, next_to in ((0, 1), (-1, -2)))
+    variance = np.where(rest_columns.any(axis=1), 1.0, np.bincount(run))
+    kept = is_used[run]
+    return _ReferencePoints(motion.time[kept], motion.heading[kept], variance[run[kept]],
+                            rest_columns[run[kept]])
 
 
 def _random_walk_covariance(time: Array, weight: Array,

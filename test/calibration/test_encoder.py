@@ -74,7 +74,8 @@ def test_a_wobble_that_repeats_itself_is_no_angle_random_walk():
     wobble = 0.5 * DEGREE * 0.8 * np.pi * np.cos(0.8 * np.pi * log.time)
     model = calibrate_encoder(replace(log, output=log.output + wobble)).model
     assert 0.7 * true < model.noise.angle_random_walk < 2.0 * true
-    assert not model.noise_bounds
+    low, high = model.noise_bounds['angle_random_walk']
+    assert low < true < high
 
 
 def test_the_model_holds_what_was_found():
