@@ -54,7 +54,9 @@ _INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
 _MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
-_HEADER_WAIT = 1.5  # s; for which the header of a log waits for values that come once a second
+#: Time, s, for which the header of a log waits for values that come seldom: with and without a
+#: temperature so far.
+_HEADER_WAITS = 1.0, 3.0
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -265,8 +267,9 @@ class CsvRecorder(_Recorder):
 
     def flush(self, is_due: bool = False) -> None:
         """Write the rows so far; the first ones after some seconds, when the columns are known."""
+        wait = _HEADER_WAITS['temperature_degc' not in self._held_values]
         if not self._rows or not (self._columns or is_due or self._rows[-1][0]
-                                  - self._rows[0][0] > _HEADER_WAIT * NSEC_PER_SEC):
+                                  - self._rows[0][0] > wait * NSEC_PER_SEC):
             return
         text = io.StringIO()
         writer = csv.writer(text, lineterminator='\n')
@@ -487,6 +490,7 @@ class _TopicSession(_Session):
         self._received: set[str] = set()  # topics
         self._unknown_topics: dict[str, str] = {}
         self._previous, self._intervals = (0, 0), Intervals()
+        self._damaged, self._clock_steps, self._misfits = 0, 0, dict[str, str]()
         super().__init__(given, stop, McapRecorder(
             given.out if self._is_mcap else f'{given.out}.mcap',
             lambda: recording_notes(
@@ -505,20 +509,28 @@ class _TopicSession(_Session):
         assert isinstance(self._recorder, McapRecorder)
         role = self._roles.get(message.topic)
         if role and (wrong := topic_type_fault(role, message.topic, message.kind)):
-            raise LogError(wrong)
+            if not self._is_mcap:
+                raise LogError(wrong)
+            self._misfits[message.topic], role = wrong, None
         self._messages += 1
         self._recorder.add_message(message, definition)
         if role:
             self._received.add(message.topic)
         if role == 'gyro':
-            with suppress(cdr.MessageError):
+            try:
                 stamp = cdr.parse(message.data, cdr.LAYOUTS[message.kind])[0] or message.received
-                self._samples += 1
-                interval = stamp - self._previous[0]
-                # else the clock of the stamps was set; a recording may be played faster
-                if 0 < interval < message.received - self._previous[1] + 10 * NSEC_PER_SEC:
-                    self._intervals.add(interval / NSEC_PER_SEC)
-                self._previous = stamp, message.received
+            except cdr.MessageError:
+                self._damaged += 1
+                return
+            self._samples += 1
+            before, self._previous = self._previous, (stamp, message.received)
+            interval = stamp - before[0]
+            # a message may be late, and a recording may be played faster
+            was_set = not (-NSEC_PER_SEC < interval
+                           < message.received - before[1] + 10 * NSEC_PER_SEC)
+            self._clock_steps += was_set and before[0] > 0
+            if interval > 0 and not was_set:
+                self._intervals.add(interval / NSEC_PER_SEC)
 
     def _tick(self, node: Any, bar: Any) -> None:
         self._flush_if_due(bar)
@@ -541,9 +553,14 @@ class _TopicSession(_Session):
             except (InputError, OSError) as error:
                 raise DataRefused(f'{error}; what was recorded is in {recording}') from None
             os.unlink(recording)
-        return {'messages': self._messages}, [
-            f'{topic}: {reason}; it was not recorded.'
-            for topic, reason in self._unknown_topics.items()]
+        remarks = [f'{topic}: {reason}; it was not recorded.'
+                   for topic, reason in self._unknown_topics.items()]
+        remarks += [f'{wrong}; it was recorded as it is.' for wrong in self._misfits.values()]
+        if self._damaged:
+            remarks.append(f'{self._damaged} messages of the gyro could not be read.')
+        if self._clock_steps:
+            remarks.append(f'The clock of the stamps was set {self._clock_steps} times.')
+        return {'messages': self._messages}, remarks
 
 
 @contextmanager

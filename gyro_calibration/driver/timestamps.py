@@ -47,6 +47,7 @@ _WINDOW_BLOCKS = 64  # number of blocks in the window
 _SETTLING_DURATION = 2.0
 _SLEW_TIME_CONSTANT = 1.0  # s; of stamps to the line
 _LATE_DURATION = 0.3  # s; of lateness that proves a loss: a stalled host catches up
+_LONG_LATE_DURATION = 1.5  # s; after which the lateness itself is tested, not only its change
 #: Averaging time of the jitter, and time for which older stamps may come after a clock was set, s.
 _RECENT_DURATION = 10.0
 _MIN_LATENESS = 0.5e-3  # s; that proves a loss: the host may wake up later than before
@@ -184,25 +185,39 @@ class _SampleCounter:
 
 
 class _LatenessTest:
-    """Test whether samples have been late for so long that some must be lost."""
+    """
+    Test whether samples have been late for so long that some must be lost.
+
+    Where the rate of bursts is near a multiple of the sample rate, the lateness grows slowly to a
+    period and falls to zero. So the step of the least lateness is tested; the lateness itself is
+    tested only after a longer time.
+
+    """
 
     def __init__(self) -> None:
         self.late_since: float | None = None
-        self.least = math.inf
+        self.step, self._least = 0.0, math.inf
+        # least lateness of arrivals that were not late, since the start of a window
+        self._least_on_time, self._window_start = math.inf, -math.inf
         self._first_number = self._last_arrival = 0.0
 
     def is_loss_proven(self, lateness: float, bound: float, number: float, arrival: float,
                        period: float) -> bool:
-        """Add an arrival; tell whether all since `late_since` have been late, by `least`, s."""
+        """Add an arrival; tell whether all since `late_since` have been late, by `step`, s."""
         if lateness <= bound:
             self.late_since = None
+            if arrival - self._window_start > _LONG_LATE_DURATION:
+                self._window_start, self._least_on_time = arrival, math.inf
+            self._least_on_time = min(self._least_on_time, lateness)
             return False
         silence, self._last_arrival = arrival - self._last_arrival, arrival
         # Lateness before a silence does not show losses in the silence.
         if self.late_since is None or silence > max(0.5 * _LATE_DURATION, 3.0 * period):
-            self.late_since, self._first_number, self.least = arrival, number, math.inf
-        self.least = min(self.least, lateness)
-        return arrival - self.late_since >= max(_LATE_DURATION, 3.0 * period)
+            self.late_since, self._first_number, self._least = arrival, number, math.inf
+        self._least, lasts = min(self._least, lateness), arrival - self.late_since
+        self.step = self._least - (0.0 if lasts > _LONG_LATE_DURATION
+                                   else max(0.0, self._least_on_time))
+        return lasts >= max(_LATE_DURATION, 3.0 * period) and self.step > bound
 
     def has_slowed(self, number: float, arrival: float, slope: float) -> bool:
         """Tell whether the samples are late since their rate fell."""
@@ -306,7 +321,7 @@ class SampleClock:
                 self._restart_line()
         elif unit and self._lateness.is_loss_proven(lateness, 0.75 * bound, number, arrival,
                                                     period):
-            lost = unit * math.floor(self._lateness.least / (unit * period) + 0.25)
+            lost = unit * math.floor(self._lateness.step / (unit * period) + 0.25)
             if not lost or self._lateness.has_slowed(number, arrival, self._line.slope):
                 self._restart_line()
             else:
@@ -440,20 +455,20 @@ class HostTimeConverter:
     def __init__(self) -> None:
         self.steps = ClockStepDetector()
         self._offset = 0.0
-        self._recent_steps: list[tuple[float, float]] = []  # size and time on the steady clock, s
+        # size and time on the steady clock, s; of all, and of those that no sample has shown
+        self._recent_steps: list[tuple[float, float]] = []
+        self._unshown_steps: list[tuple[float, float]] = []
 
     def update(self, steady_time: float, date: float) -> float:
         """Take the times of both clocks, s; return the step of the date."""
-        self._recent_steps = [each for each in self._recent_steps
-                              if steady_time - each[1] <= _RECENT_DURATION]
+        self._recent_steps, self._unshown_steps = (
+            [each for each in steps if steady_time - each[1] <= _RECENT_DURATION]
+            for steps in (self._recent_steps, self._unshown_steps))
         step = self.steps.update(steady_time, date)
         if step:
             self._recent_steps.append((step, steady_time))
+            self._unshown_steps.append((step, steady_time))
         return step
-
-    def _shifts(self) -> list[float]:
-        """Return by how much a stamp may be off: from after a step, or from before one."""
-        return [0.0, *(sign * size for size, _ in self._recent_steps for sign in (1.0, -1.0))]
 
     def convert_sample(self, stamp: float, previous_time: float, usual_interval: float,
                        arrival_interval: float = 0.0) -> float:
@@ -466,13 +481,16 @@ class HostTimeConverter:
 
         """
         if previous_time == -math.inf:
-            self._recent_steps.clear()
+            self._unshown_steps.clear()
         interval = stamp - self._offset - previous_time
         # late arrivals of samples whose interval is the usual one are no step of the clock
         if abs(interval - usual_interval) < 0.5 * usual_interval:
             return stamp - self._offset
-        shift = min(self._shifts(), key=lambda each: abs(interval - each - arrival_interval))
-        if shift:
+        # each step once: a later gap whose arrivals are late is none
+        found = min([(0.0, 0.0), *self._unshown_steps],
+                    key=lambda each: abs(interval - each[0] - arrival_interval))
+        if shift := found[0]:
+            self._unshown_steps.remove(found)
             least = usual_interval if usual_interval < math.inf else 0.0
             bridged = interval - shift if interval - shift > 0.5 * least else least
             self._offset += interval - bridged
@@ -480,5 +498,7 @@ class HostTimeConverter:
 
     def convert_message(self, stamp: float, sample_time: float) -> float:
         """Return the time of another message, s, with a stamp from before or after a step."""
-        return min((stamp - self._offset - shift for shift in self._shifts()),
+        there = stamp - self._offset
+        return min((there, *(there + sign * size for size, _ in self._recent_steps
+                             for sign in (1.0, -1.0))),
                    key=lambda each: abs(each - sample_time))

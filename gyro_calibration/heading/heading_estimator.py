@@ -231,23 +231,49 @@ class HeadingEstimator:
                                    if is_fresh else self._propagated_model(now))
         self.covariance: Array = block_diag(self._assumptions.bias_temperature_coefficient ** 2,
                                             uncertainty_covariance(self.current_model))
+        temperature = self.model.reference_temperature
+        slope = None if self.current_model.needs_history else np.subtract(
+            *(self._uncertain_sensitivity(rate, rate, temperature, None, 0.0)
+              for rate in (DEGREE, 0.0))) / DEGREE
         if self._tracker is None:
             self._tracker = HeadingTracker(self.current_model.noise, self.covariance,
-                                           self._settings, age, self._keeps_steps)
+                                           self._settings, age, self._keeps_steps, slope)
         else:
-            self._tracker.use_calibration(self.current_model.noise, self.covariance, age)
+            self._tracker.use_calibration(self.current_model.noise, self.covariance, age, slope)
         self._start_time = now
-        here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
-        self._follows_temperature, self._age_changed = here is not None, False
-        self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
-                            if here is not None and coefficient else None)
-        self._unknown_since = self._time if is_fresh and here is None else math.inf
+        self._start_correction(now)
+        self._unknown_since = (self._time if is_fresh and not self._follows_temperature
+                               else math.inf)
+        self._bias_shift, self._unobserved_distance, self._age_changed = 0.0, 0.0, False
         self._sensitivity: Array = np.zeros(len(self.covariance))
         self._rest_sensitivity: Array = self._sensitivity
         self._sensitivity_time = -math.inf
         self._stretch = None
         self._pending_stretches.clear()
         self.restart_count += 1
+
+    def _start_correction(self, now: float) -> None:
+        """Start the temperature correction of the bias at the present temperature, if known."""
+        here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
+        self._follows_temperature = here is not None
+        self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
+                            if here is not None and coefficient else None)
+
+    def _resume_temperature(self, now: float, around: Channels | None) -> None:
+        """
+        Continue at the first temperature with a calibration of this run made without one.
+
+        It was made after the model at the temperature that was assumed up to the last sample. The
+        different output of the model at the present temperature is not a change of the rate.
+
+        """
+        here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
+        last = self.last_compensated.temperature
+        before = None if around is None else replace(around, temperature=last)
+        held = compensate(self.current_model, 0.0, last, before).model_rate
+        self._bias_shift = float(here) - float(held)
+        self._unobserved_distance = _lost_temperature_distance(self._time - self._unknown_since)
+        self._start_correction(now)
 
     def _propagated_model(self, now: float) -> tuple[GyroModel, float | None]:
         """Return the model to compensate with, and the age of its self-calibration, s, or None."""
@@ -364,10 +390,13 @@ class HeadingEstimator:
             return ''
         last, self._time = self._time, time
         known_again = not self._follows_temperature and self._known_temperature is not None
-        if self._age_changed or known_again:
+        goes_on = self.is_calibrated_this_run and last > -math.inf
+        if self._age_changed or known_again and not goes_on:
             self._restart(now)
         around = (self._follow_channels(time - last, force, supply)
                   if self.current_model.needs_history else None)
+        if known_again and goes_on:
+            self._resume_temperature(now, around)
         self.last_compensated = result = compensate(self.current_model, output, self.temperature,
                                                     around)
         change, distance = self._bias_change(time, self.temperature, self._temperature_lateness)
@@ -416,9 +445,10 @@ class HeadingEstimator:
         if temperature is None:
             return 0.0, 0.0
         if self._correction is None:
-            return 0.0, _lost_temperature_distance(time - self._unknown_since)
+            return self._bias_shift, _lost_temperature_distance(time - self._unknown_since)
         change, distance = self._correction.change_at(temperature)
-        return change, distance + np.copysign(_lost_temperature_distance(late), distance)
+        return (self._bias_shift + change, self._unobserved_distance + distance
+                + np.copysign(_lost_temperature_distance(late), distance))
 
     @property
     def _temperature_lateness(self) -> float:
@@ -624,8 +654,9 @@ class HeadingEstimator:
 
         """
         calibration = self.current_model.self_calibration or SelfCalibration()
-        change = (0.0 if self._correction is None
-                  else float(self._correction.change_at(temperature)[0]))
+        change = self._bias_shift
+        if self._correction is not None:
+            change += float(self._correction.change_at(temperature)[0])
         off, deviation = self.tracker.bias_for(seen)
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 

@@ -19,7 +19,8 @@ a scale factor error.
 Over a gap with lost samples the rate is interpolated linearly. If it differs at the ends by a step
 d, it may have changed at any time in the gap of T, so that the integral has the variance
 T² d² / 12. It depends on the two samples at the ends alone, each with the noise N² / dt, so that
-the variance by noise is T² N² / (2 dt) instead of N² T.
+the variance by noise is T² N² / (2 dt) instead of N² T. A vibration does not show at the ends: its
+variance is that of the rates of the last seconds, see `varied_variance`.
 
 """
 
@@ -166,6 +167,29 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
     surplus = np.minimum(lost * usual, interval)
     return (interval ** 2 * np.maximum(step ** 2 - 2.0 * ends, 0.0) / 12.0,
             ends * surplus * (0.5 * surplus + usual))
+
+
+def varied_variance(noise: Noise, usual: float, time: Array, rate: Array,
+                    interval: float) -> float:
+    """
+    Return the variance of an integral over a gap, rad², where the rate varies as before it.
+
+    The ends of a gap do not show a vibration. It is the mean square of the same error over all
+    intervals of this length without the gap, less that by noise.
+
+    Parameters
+    ----------
+    usual, interval : usual interval, and that between the samples around the gap, s
+    time, rate : before the gap, s and rad/s, shape (n,)
+
+    """
+    ends = time[time >= time[0] + interval]
+    if not len(ends):
+        return 0.0
+    angle = integrate(time, rate)
+    turned, rates = (np.interp([ends - interval, ends], time, values) for values in (angle, rate))
+    square = float(np.mean((turned[1] - turned[0] - 0.5 * interval * rates.sum(axis=0)) ** 2))
+    return max(square - 0.5 * (noise.angle_random_walk * interval) ** 2 / usual, 0.0)
 
 
 @dataclass(frozen=True)

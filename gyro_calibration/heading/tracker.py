@@ -32,6 +32,7 @@ from gyro_calibration.heading.integration import (
     Threshold,
     ThresholdFilter,
     TIME_TOLERANCE,
+    varied_variance,
 )
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX,
@@ -66,8 +67,12 @@ import numpy as np
 MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
 #: Duration between two jumps, s, in which the rate may be erroneous.
 _JUMP_DURATION = 2.0
+#: Duration, s, of the rates that show how the robot moves in a gap.
+_RECENT_DURATION = 2.0
 #: Longest step of the state, s.
 _STEP_DURATION = MEAN_LAGS[0]
+#: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
+_BIAS_MARGIN_SIGMAS = 4.0
 #: Change of the bias that is assumed while the wheels stand, rad/s; largest delay of odometry
 #: after the begin of a turn, s.
 _WHEEL_BIAS_CHANGE, _WHEEL_DELAY = 0.2 * DEGREE, 4.0
@@ -135,7 +140,8 @@ class HeadingTracker:
     """
 
     def __init__(self, noise: Noise, covariance: Array, settings: Settings,
-                 age: float | None = 0.0, keeps_steps: bool = False):
+                 age: float | None = 0.0, keeps_steps: bool = False,
+                 sensitivity_slope: Array | None = None):
         """
         Begin at heading zero.
 
@@ -145,8 +151,11 @@ class HeadingTracker:
         covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
         age : of the self-calibration, whose s and b are the last values, s; None without one
         keeps_steps : the `steps`, for `log_compensation.smooth_track`
+        sensitivity_slope : change of the sensitivity with the rate, shape (m,): the rates include
+            the bias estimated at rest, on which a scale factor error does not act
 
         """
+        self._sensitivity_slope = sensitivity_slope
         self.steps, self._keeps_steps = list[TrackStep](), keeps_steps
         self.recalibrations = list[tuple[int, HeadingState]]()
         self._interval, self._last_time, self.intervals = math.inf, 0.0, Intervals()
@@ -154,6 +163,7 @@ class HeadingTracker:
         self._held_jump: tuple[float, float, Array, bool | None, Array | None] | None = None
         # Stamp, s, and rate, rad/s, of the last sample before the last accepted jump.
         self._before_last_jump = -math.inf, 0.0
+        self._recent_rates = deque[tuple[float, float]]()  # stamps, s, and rates, rad/s
         self._rest_scatter, self._state_version = RestScatter(), 0
         self.refused_count = self.outlier_count = self.rebuild_count = 0
         self._rebuild_message, self._settings = '', settings
@@ -208,7 +218,8 @@ class HeadingTracker:
             self._enter_motion(WINDOW_DURATION)
         self._adopt_state()
 
-    def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0) -> None:
+    def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0,
+                        sensitivity_slope: Array | None = None) -> None:
         """
         Continue with other noise figures and another calibration.
 
@@ -225,6 +236,7 @@ class HeadingTracker:
             self.recalibrations.append((len(self.steps), self._state))
             self._state = state
         self._energy.clear()
+        self._sensitivity_slope = sensitivity_slope
         self._use_state(noise, covariance, heading, variance, age)
         self.configure(self._settings)
 
@@ -251,7 +263,8 @@ class HeadingTracker:
             return (float(self._state.covariance[HEADING_INDEX, HEADING_INDEX])
                     + self._pending_correction ** 2)
         if self._open_variance is None:
-            self._open_variance = self._state.heading_variance(self._open_integral)
+            self._open_variance = self._state.heading_variance(
+                self._with_unbiased_sensitivity(self._open_integral))
         part = self._block_integral
         return (self._open_variance + self._state.noise.angle_random_walk ** 2 * part.duration
                 + part.lost_variance + part.extra_noise_variance + self._pending_correction ** 2)
@@ -317,12 +330,14 @@ class HeadingTracker:
         filtered = self._filter.apply(time, rate)
         last, self._last_sample = self._last_sample, (time, rate, filtered, sensitivity)
         if last is None:
+            self._remember([time], [rate])
             self._last_time, self.rate = time, rate - self._rate_error(sensitivity)
             return ''
         interval = time - last[0]
         if interval < 0.0 or interval > self._settings.maximum_gap:
             message = self._restart_after_gap(interval, max(abs(rate), abs(last[1])),
                                               wheels is not False)
+            self._remember([time], [rate])
             self.rate = rate - self._rate_error(sensitivity)
             return message
         self._interval, self._last_time = interval, time
@@ -332,9 +347,13 @@ class HeadingTracker:
             if filtered == rate or last[2] == last[1]:
                 motion, noise = gap_variances(self._state.noise, usual, lost, interval,
                                               rate - last[1])
-                self._block_integral.lost_variance += float(motion)
+                times, rates = np.array(self._recent_rates).T
+                varied = varied_variance(self._state.noise, usual, times, rates, interval)
+                self._block_integral.lost_variance += max(float(motion), varied)
                 self._block_integral.extra_noise_variance += float(noise)
             interval -= min(lost * usual, interval)
+        if gap is None or lost:  # `_follow_piece` remembers the others
+            self._remember([time], [rate])
         if self._detects_rest:
             self._detect_motion(interval, last[1], wheels)
         elif self._block_integral.duration >= BLOCK_DURATION - TIME_TOLERANCE:
@@ -348,6 +367,11 @@ class HeadingTracker:
             self._rebuild_state()
         message, self._rebuild_message = self._rebuild_message, ''
         return message
+
+    def _remember(self, time: Sequence[float], rate: Sequence[float]) -> None:
+        self._recent_rates.extend(zip(time, rate))
+        while self._recent_rates[-1][0] - self._recent_rates[0][0] > _RECENT_DURATION:
+            self._recent_rates.popleft()
 
     # Many samples at once
 
@@ -427,7 +451,7 @@ class HeadingTracker:
                     piece.epochs.append(self._new_epoch(until - 1))
                 elif not self.is_resting:
                     piece.epochs[-1].open_integrals.append(
-                        (until - 1, self._open_integral))
+                        (until - 1, self._with_unbiased_sensitivity(self._open_integral)))
                 continue
             piece.close_epoch(piece.block_starts[number])
             for place in range(piece.block_starts[number], until):
@@ -440,13 +464,15 @@ class HeadingTracker:
                 piece.epochs.append(self._new_epoch(until - 1))
         if not self._block.duration:
             piece.close_epoch(end - begin)
+        first = int(np.searchsorted(piece.time, piece.time[-1] - _RECENT_DURATION))
+        self._remember(piece.time[first:].tolist(), piece.rate[first:].tolist())
         piece.fill_results(usual)
         self.rate = float(piece.results[-1, 2])
 
     def _new_epoch(self, place: int) -> Epoch:
         return Epoch(place, self._state_version, self._state, self.is_resting, self.heading,
                      self._pending_correction,
-                     [(place, self._open_integral)])
+                     [(place, self._with_unbiased_sensitivity(self._open_integral))])
 
     def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, if a rest ends within it."""
@@ -457,7 +483,7 @@ class HeadingTracker:
         if self.is_resting:
             rates = (piece.rate[begin:end] - self._wander_rate
                      + rows[begin:end] @ self._calibration_errors)
-            limit = self._energy.sudden_limit()
+            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
             if driven or rates.max() > limit or rates.min() < -limit:
                 return False
         part, block, sums = self._block_integral, self._block, piece.block_sums[number]
@@ -525,8 +551,8 @@ class HeadingTracker:
         _, rate, _, sensitivity = self._last_sample
         self._block.add(duration, rate, before)
         if self.is_resting:
-            sudden = abs(rate - self._rate_error(sensitivity)) > self._energy.sudden_limit()
-            if wheels or sudden:
+            limit = math.hypot(self._energy.sudden_limit(), self._bias_margin)
+            if wheels or abs(rate - self._rate_error(sensitivity)) > limit:
                 self._revert_to_motion(0.0)
         self._wheels_moved = self._wheels_moved or bool(wheels)
         if self._block.duration >= BLOCK_DURATION - TIME_TOLERANCE:
@@ -750,6 +776,7 @@ class HeadingTracker:
         self._block, self._wheels_moved = Block(), False
         self._energy.clear()
         self._filter.clear()
+        self._recent_rates.clear()
         self._enter_motion(WINDOW_DURATION)
         duration = max(interval, 0.0)
         if interval > 0.0:
@@ -809,10 +836,20 @@ class HeadingTracker:
 
     def _propagate_state(self, turn: RateIntegral, end: float) -> None:
         """Propagate the state over an integral that ends at a time, s."""
+        turn = turn if self.is_resting else self._with_unbiased_sensitivity(turn)
         if self._keeps_steps:
             self.steps.append(TrackStep(self._state, turn, self.is_resting, end))
         self._state = (self._state.advance_at_rest(turn) if self.is_resting
                        else self._state.propagate(turn))
+
+    def _with_unbiased_sensitivity(self, turn: RateIntegral) -> RateIntegral:
+        """Return an integral with the sensitivity for the rates without their bias."""
+        if (self._sensitivity_slope is None or self._still_sensitivity is None
+                or turn.is_unobserved):
+            return turn
+        bias, _ = self._state.rate_error(self._still_sensitivity)
+        return replace(
+            turn, sensitivity=turn.sensitivity - turn.duration * bias * self._sensitivity_slope)
 
     def _with_still_sensitivity(self, turn: RateIntegral) -> RateIntegral:
         """Return an integral with the sensitivity of a rest, free of the noise of the rates."""
@@ -832,6 +869,7 @@ class HeadingTracker:
         self._wander_rate = self._state.wander_rate[0]
         self._calibration_errors = self._state.calibration_errors[0]
         self._error_sensitivity = self._bias_sensitivity = None
+        self._bias_margin = _BIAS_MARGIN_SIGMAS * self.bias[1]
         self._open_variance, self._state_version = None, self._state_version + 1
         estimate = (float(self._state.mean[HEADING_INDEX])
                     + (0.0 if self.is_resting

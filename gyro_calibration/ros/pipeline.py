@@ -548,6 +548,7 @@ class Pipeline:
         if event := self.estimator.update_table(date, is_final):
             self.journal.event = event
         self.store.store_table(date, is_final)
+        self.store.poll()
 
     def reset_heading(self) -> str:
         """Set the heading to zero; return the answer of the service."""

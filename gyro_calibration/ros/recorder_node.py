@@ -13,7 +13,7 @@ A node that receives serialized messages from topics, for the verb record.
 
 Types come from the graph, so that any message whose package is installed can be recorded. A
 subscription requests the offered QoS: best effort publishers are received, and reliable ones lose
-nothing. Publishers may start late.
+nothing. Publishers may start late, stop, and start again with another QoS.
 
 """
 
@@ -37,6 +37,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 
 _TYPE_ALIASES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
 
@@ -62,7 +63,7 @@ class RecorderNode(Node):
         self.unknown_topics: dict[str, str] = {}
         self.message_count = 0
         self._all_topics, self._on_message = all_topics, on_message
-        self._taken: set[str] = set()  # topics
+        self._taken: dict[str, Subscription | None] = {}  # topics; None for an unknown type
         self._clock_offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         self.poll()
         call_every(self, 0.3, self.poll)
@@ -79,18 +80,22 @@ class RecorderNode(Node):
     def poll(self) -> None:
         """Subscribe to new topics in the graph."""
         for topic, kinds in self.get_topic_names_and_types():
-            if topic not in self._taken and (topic in self.topics or self._all_topics):
-                offered = [each.qos_profile for each in self.get_publishers_info_by_topic(topic)]
-                if offered:
-                    self._taken.add(topic)
-                    self._subscribe(topic, kinds[0], offered)
+            if ((topic in self.topics or self._all_topics)
+                    and topic not in self.unknown_topics
+                    and (publishers := self.get_publishers_info_by_topic(topic))):
+                quality = _compatible_quality([each.qos_profile for each in publishers])
+                before = self._taken.get(topic)
+                if before is None or _wants_more(before.qos_profile, quality):
+                    if before is not None:
+                        self.destroy_subscription(before)
+                    self._taken[topic] = self._subscribe(topic, kinds[0], quality)
 
-    def _subscribe(self, topic: str, kind: str, offered: Sequence[QoSProfile]) -> None:
+    def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> Subscription | None:
         try:
             definition = _build_definition(kind)
         except (ImportError, AttributeError) as error:
             self.unknown_topics[topic] = f'{kind} is not installed here ({error})'
-            return
+            return None
 
         # By the steady clock, so that times of receipt do not jump when the clock is set.
         def take(data: bytes) -> None:
@@ -98,16 +103,23 @@ class RecorderNode(Node):
             self._on_message(Message(topic, kind, self._clock_offset
                                      + round(read_steady_clock() * NSEC_PER_SEC), bytes(data)),
                              definition)
+        return self.create_subscription(load_message_class(kind), topic, take, quality, raw=True)
 
-        best_effort = any(each.reliability == ReliabilityPolicy.BEST_EFFORT for each in offered)
-        latched = all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in offered)
-        quality = QoSProfile(  # compatible with all publishers
-            depth=SENSOR_QOS.depth,
-            reliability=(ReliabilityPolicy.BEST_EFFORT if best_effort
-                         else ReliabilityPolicy.RELIABLE),
-            durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched
-                        else DurabilityPolicy.VOLATILE))
-        self.create_subscription(load_message_class(kind), topic, take, quality, raw=True)
+
+def _compatible_quality(offered: Sequence[QoSProfile]) -> QoSProfile:
+    """Return a QoS compatible with all publishers; transient local only if all offer it."""
+    best_effort = any(each.reliability == ReliabilityPolicy.BEST_EFFORT for each in offered)
+    latched = all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in offered)
+    return QoSProfile(
+        depth=SENSOR_QOS.depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+
+
+def _wants_more(requested: QoSProfile, offered: QoSProfile) -> bool:
+    """Tell whether a subscription does not receive a publisher with this offer."""
+    return (requested.reliability == ReliabilityPolicy.RELIABLE != offered.reliability
+            or requested.durability == DurabilityPolicy.TRANSIENT_LOCAL != offered.durability)
 
 
 def _describe_error(error: Exception) -> str:

@@ -23,6 +23,7 @@ from pathlib import Path
 
 from gyro_calibration.files import (
     describe_error,
+    file_version,
     remedy,
     remove_leftovers,
     to_printable,
@@ -47,6 +48,7 @@ class StateStore:
     table : biases at rest
     problem : why the rates are uncalibrated, in a sentence; ''
     calibration_hint, table_hint : fault of the calibration file and of the bias table; ''
+    shared_hint : that another process has written to a file; ''
     table_written_time : time when the bias table was last written, s since 1970; None before
 
     """
@@ -62,6 +64,19 @@ class StateStore:
         self.table, self.table_hint = BiasTable(self.model, prior), ''
         if not self.problem:
             self.table, self.table_hint = read_bias_table(bias_file, self.model, prior)
+        self.shared_hint = ''
+        self._file_versions = {file: _existing_version(file)
+                               for file in (calibration_file, bias_file)}
+
+    def poll(self) -> None:
+        """Check whether another process has written to the files; to be called periodically."""
+        for file, seen in self._file_versions.items():
+            found = _existing_version(file)
+            if found is not None and found != seen:
+                self.shared_hint = to_printable(
+                    f'{file} was written by another process, and the next writer replaces it: '
+                    'give each node a calibration_file of its own, or restart this one to use '
+                    'that file')
 
     def _load_model(self, model_file: str) -> GyroModel:
         model = GyroModel()
@@ -89,7 +104,9 @@ class StateStore:
         """Use and store a calibration; return the fault of the storage, '' without one."""
         self.model, self.calibration_hint = with_self_calibration(self.model, calibration), ''
         try:
-            write_model(self._calibration_file, self.model)
+            self._file_versions[self._calibration_file] = write_model(self._calibration_file,
+                                                                      self.model)
+            self.shared_hint = ''
         except (OSError, ArithmeticError) as error:
             wanted = (remedy(error, self._calibration_file) if isinstance(error, OSError)
                       else 'check the rates')
@@ -103,8 +120,9 @@ class StateStore:
         if self.problem or not self.table.is_write_due(now, is_final):
             return
         try:
-            self.table_hint, _ = write_bias_table(self._bias_file, self.table, now)
-            self.table_written_time = now
+            self.table_hint, written = write_bias_table(self._bias_file, self.table, now)
+            self.table_written_time, self.shared_hint = now, ''
+            self._file_versions[self._bias_file] = written
         except OSError as error:
             self.table.mark_write_failed(now)
             self.table_hint = to_printable('the bias table cannot be written '
@@ -124,3 +142,11 @@ def _describe_mismatch(stored: GyroModel, model: GyroModel) -> str:
     of = (f'the gyro with the serial number {theirs}' if theirs
           else 'a gyro without a serial number')
     return f'it belongs to {of}, and the model to {ours or "one without"}'
+
+
+def _existing_version(file: Path) -> tuple[int, int] | None:
+    """Return the version of a file; None where there is none."""
+    try:
+        return file_version(file)
+    except OSError:
+        return None

@@ -491,6 +491,32 @@ def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(
     assert not (tmp_path / 'a.csv').exists()
 
 
+def test_a_publisher_that_starts_again_with_another_quality_is_received(ros_domain, wait_until):
+    from gyro_calibration.ros.recorder_node import RecorderNode
+    from gyro_calibration.ros.runner import SENSOR_QOS
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from std_msgs.msg import String
+    context, found = rclpy.Context(), []
+    rclpy.init(args=[], context=context)
+    node = RecorderNode(['note'], False, lambda message, _: found.append(message), context)
+    robot, executor = rclpy.create_node('robot', context=context), SingleThreadedExecutor(
+        context=context)
+    executor.add_node(node)
+    for quality in (reliable(), SENSOR_QOS, reliable()):
+        publisher, count = robot.create_publisher(String, 'note', quality), len(found)
+
+        def is_received(publisher=publisher, count=count):
+            publisher.publish(String(data='said'))
+            executor.spin_once(0.05)
+            return len(found) > count
+        wait_until(is_received, what='a message')
+        robot.destroy_publisher(publisher)
+    robot.destroy_node()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
 def test_topics_without_a_publisher_are_reported(ros_domain, record, tmp_path):
     code, out, error = record('record', '--out', tmp_path / 'a.csv', '--seconds', 2).end()
     assert (code, out) == (1, '')

@@ -191,6 +191,18 @@ def test_what_was_counted_too_often_is_taken_back(rate, generator):
     assert run.error() < 0.003
 
 
+@pytest.mark.parametrize(('rate', 'burst'), [(125.3, 0.016), (62.9, 0.016), (100.3, 0.01)])
+def test_bursts_that_beat_with_the_samples_lose_none(rate, burst):
+    """Their lateness grows to a period and falls to zero, about once a second."""
+    times = np.arange(0.0, 60.0, 1.0 / rate)
+    arrivals = np.ceil(times / burst) * burst
+    clock, stamps = SampleClock(round(rate)), []
+    for arrival, group in itertools.groupby(arrivals.tolist()):
+        stamps += clock.stamp_samples([Sample(0.0)] * len([*group]), arrival)
+    assert clock.lost_count == 0
+    assert np.ptp((stamps - times)[times > 20.0]) < 0.001
+
+
 def test_the_time_of_the_device_is_fitted_like_a_number(generator):
     """Here it tells of lost samples, too, and of the uneven loop of a microcontroller."""
     times = true_times(100, 0.0, 30.0) + generator.uniform(-5e-4, 5e-4, 3000)
@@ -341,6 +353,19 @@ def test_late_arrivals_are_no_step_of_the_clock():
     for number, waited in enumerate([0.01, 0.25, 0.0, 0.0, 0.01], 1):
         times.append(stamps.convert_sample(5.0 + INTERVAL * number, times[-1], INTERVAL, waited))
     assert np.diff(times) == pytest.approx(np.full(5, INTERVAL))
+
+
+@pytest.mark.parametrize('step', [0.12, -0.12, 0.2, -1.0])
+@pytest.mark.parametrize('gap, waited', [(0.15, 0.0005), (0.05, 0.15), (0.2, 0.33), (0.3, 0.18)])
+def test_a_gap_with_late_arrivals_after_a_step_keeps_its_length(step, gap, waited):
+    stamps, before = HostTimeConverter(), -np.inf
+    for number in range(200):
+        now = INTERVAL * number
+        stamps.update(now, 1e9 + now + step * (number >= 100))
+        before = stamps.convert_sample(5.0 + now + step * (number >= 100), before, INTERVAL,
+                                       INTERVAL)
+    after = stamps.convert_sample(5.0 + now + step + gap, before, INTERVAL, waited)
+    assert after - before == pytest.approx(gap)
 
 
 def test_another_jump_of_the_stamps_is_one():

@@ -139,6 +139,28 @@ def test_a_turn_that_begins_within_a_gap_may_have_begun_at_any_time_in_it():
     assert 0.5 < np.mean(squares) < 1.5
 
 
+@pytest.mark.parametrize('frequency', [2.0, 5.0, 9.3])
+@pytest.mark.parametrize('many', [False, True])
+def test_a_vibration_in_a_gap_is_in_the_stated_variance(frequency, many):
+    """Its ends may show the same rate."""
+    squares = []
+    for seed in range(20):
+        generator, time = np.random.default_rng(seed), np.arange(0.0, 4.0, INTERVAL)
+        true = 0.2 * np.sin(2.0 * math.pi * (frequency * time + generator.random()))
+        rate, comes = true + simulate_noise(WHITE, len(time), INTERVAL, generator), time > -1.0
+        for begin in generator.integers(250, 380, 2):
+            comes[begin:begin + 19] = False
+        tracker, inputs = HeadingTracker(WHITE, KNOWN, Settings()), sensitivity_of(rate[comes]).T
+        if many:
+            tracker.follow(time[comes], rate[comes], inputs)
+        else:
+            for sample in zip(time[comes], rate[comes], inputs):
+                tracker.add(*sample)
+        off = tracker.heading - integrate(time, true)[-1]
+        squares.append(off * off / tracker.variance)
+    assert np.mean(squares) < 1.0 + 4.0 * math.sqrt(2.0 / 20)
+
+
 # the heading
 
 def sensitivity_of(rate):

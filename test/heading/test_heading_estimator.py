@@ -92,6 +92,14 @@ class Gyro:
         return math.sqrt(self.live.tracker.variance)
 
 
+@pytest.mark.parametrize('sense', [1.0, -1.0])
+def test_the_scale_factor_error_acts_on_the_turn_and_not_on_the_bias_that_rests_show(sense):
+    """With one sense the bias turns as far as the robot, and back, in the output."""
+    gyro = Gyro(begun(GyroModel(noise=NOISE)), bias=DEGREE).go(60.0, wheels=False)
+    gyro.go(60.0, DEGREE * sense, wheels=True)
+    assert gyro.deviation == pytest.approx(60.0 * DEGREE * 0.03, rel=0.35)
+
+
 @pytest.mark.parametrize('temperature', [25.0, None])
 def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_been_right(
         temperature):
@@ -264,8 +272,8 @@ def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_know
     (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)), Term(CATALOGUE['rate_ramp'], (1e-9,)))
 ], ids=['no effect', 'of temperature', 'of temperature and time'])
 def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(terms):
-    model, remaining = GyroModel(terms, noise=NOISE), (0.01 if terms else 0.03) * DEGREE
-    table = BiasTable(model, entries=[Entry(float(degc), remaining * (degc - 25), 1e-12,
+    model = GyroModel(terms, noise=NOISE)
+    table = BiasTable(model, entries=[Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12,
                                             NOW - 1e5, 0) for degc in range(15, 45)])
     gyro = Gyro(begun(model, table), bias=0.0).go(20.0)
     gyro._bias = 0.3 * DEGREE  # it has become warmer by 10 K, but nobody says so

@@ -174,6 +174,20 @@ def test_rests_of_less_than_two_seconds_between_turns_show_the_bias():
     assert low < math.sqrt(np.mean(np.square(errors))) < high, errors
 
 
+@pytest.mark.parametrize('sigmas', [0.5, 1.5, 3.0])
+def test_a_first_rest_is_kept_whatever_the_bias_of_a_quiet_gyro(sigmas):
+    """Samples deviate from the unknown bias by many times their noise."""
+    quiet, wide = Noise(0.001 * DEGREE), np.diag([SCALE ** 2, (0.5 * DEGREE) ** 2])
+    time = np.arange(0.0, 10.0, INTERVAL)
+    rate = sigmas * 0.5 * DEGREE + simulate_noise(quiet, len(time), INTERVAL,
+                                                  np.random.default_rng(8))
+    tracker = HeadingTracker(quiet, wide, Settings())
+    for at, value in zip(time, rate):
+        tracker.add(at, value, np.array([-value, -1.0]), still=np.array([0.0, -1.0]))
+    assert tracker.is_resting and tracker.bias[0] == pytest.approx(sigmas * 0.5 * DEGREE, rel=0.01)
+    assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
+
+
 def test_a_rest_that_was_too_short_to_learn_from_still_ends_in_time():
     motion = constant_rate_motion([(3, 0), (2, 30), (0.9, 0), (2, -30), (0.4, 0), (2, 30), (3, 0)])
     time, _, heading, rate = gyro(motion, np.random.default_rng(3))

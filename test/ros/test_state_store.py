@@ -160,3 +160,15 @@ def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_is_not(t
     assert path.read_bytes() == b'new'
     assert sorted(os.listdir(tmp_path)) == ['.model.yaml.swp', '.other.yaml.abcd1234',
                                             'model.yaml']
+
+
+def test_what_another_node_writes_to_the_same_file_is_reported_until_this_one_writes(remember):
+    first, second = remember(), remember()
+    first.poll()
+    assert not first.shared_hint
+    second.store_calibration(SelfCalibration(0.01, 0.02))
+    first.poll()
+    second.poll()
+    assert 'was written by another process' in first.shared_hint and not second.shared_hint
+    first.store_calibration(SelfCalibration(0.01, 0.03))
+    assert not first.shared_hint
