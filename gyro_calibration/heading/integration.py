@@ -169,8 +169,12 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
             ends * surplus * (0.5 * surplus + usual))
 
 
-def varied_variance(noise: Noise, usual: float, time: Array, rate: Array,
-                    interval: float) -> float:
+#: Duration, s, of the rates that show how the robot moves in a gap.
+RECENT_DURATION = 2.0
+
+
+def varied_variance(noise: Noise, usual: float, interval: float, time: Array,
+                    rate: Array) -> float:
     """
     Return the variance of an integral over a gap, rad², where the rate varies as before it.
 
@@ -180,7 +184,7 @@ def varied_variance(noise: Noise, usual: float, time: Array, rate: Array,
     Parameters
     ----------
     usual, interval : usual interval, and that between the samples around the gap, s
-    time, rate : before the gap, s and rad/s, shape (n,)
+    time, rate : in the seconds before the gap, s and rad/s, shape (n,)
 
     """
     ends = time[time >= time[0] + interval]
@@ -332,9 +336,8 @@ class BlockIntegrator:
         time, rate = (np.concatenate(pair) for pair in zip(self._window, (time, rate)))
         filtered = filter_rates(self._settings, time, rate)[carried:]
         kept = (filtered == rate[carried:]).astype(float)
-        begin = np.searchsorted(time, time[-1] - self._settings.window, side='right')
-        begin = min(int(begin), len(time) - 1)
-        self._window = time[begin:], rate[begin:]
+        begin = np.searchsorted(time, time[-1] - max(self._settings.window, RECENT_DURATION))
+        self._window, recent = (time[begin:], rate[begin:]), (time, rate)
 
         # from the last sample of the block before on
         before = min(carried, 1)
@@ -345,10 +348,15 @@ class BlockIntegrator:
         interval, step, used = np.diff(time), np.diff(rate), rows[1] > 0.0
         usual, lost = self.intervals.add_many(interval)
         gaps = np.flatnonzero((lost > 0) & (used[1:] | used[:-1]))
+        motion, by_noise = gap_variances(self._noise, usual[gaps], lost[gaps], interval[gaps],
+                                         step[gaps])
+        begins, ends = (np.searchsorted(recent[0], each) for each in (
+            time[gaps] - RECENT_DURATION, time[gaps + 1]))
+        varied = [varied_variance(self._noise, *of_gap, *(each[begin:end] for each in recent))
+                  for *of_gap, begin, end in zip(usual[gaps], interval[gaps], begins, ends)]
         unseen: Array = np.zeros(len(time))
         unseen[0] = self._gap_variance
-        unseen[gaps + 1] = sum(gap_variances(self._noise, usual[gaps], lost[gaps], interval[gaps],
-                                             step[gaps]))
+        unseen[gaps + 1] = np.maximum(motion, varied) + by_noise
         unseen = np.cumsum(unseen)
         self._last_rows, self._integrals = rows[:, -1:], grown[:, -1]
         self._gap_variance = float(unseen[-1])

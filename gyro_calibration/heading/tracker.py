@@ -29,6 +29,7 @@ from gyro_calibration.heading.integration import (
     gap_variances,
     Intervals,
     MAX_RATE,
+    RECENT_DURATION,
     Threshold,
     ThresholdFilter,
     TIME_TOLERANCE,
@@ -67,8 +68,6 @@ import numpy as np
 MAX_RATE_STEP, MAX_ACCELERATION = 0.5, 200.0
 #: Duration between two jumps, s, in which the rate may be erroneous.
 _JUMP_DURATION = 2.0
-#: Duration, s, of the rates that show how the robot moves in a gap.
-_RECENT_DURATION = 2.0
 #: Longest step of the state, s.
 _STEP_DURATION = MEAN_LAGS[0]
 #: Standard deviations of the bias by which a sample at rest may deviate in addition to its noise.
@@ -348,7 +347,7 @@ class HeadingTracker:
                 motion, noise = gap_variances(self._state.noise, usual, lost, interval,
                                               rate - last[1])
                 times, rates = np.array(self._recent_rates).T
-                varied = varied_variance(self._state.noise, usual, times, rates, interval)
+                varied = varied_variance(self._state.noise, usual, interval, times, rates)
                 self._block_integral.lost_variance += max(float(motion), varied)
                 self._block_integral.extra_noise_variance += float(noise)
             interval -= min(lost * usual, interval)
@@ -370,7 +369,7 @@ class HeadingTracker:
 
     def _remember(self, time: Sequence[float], rate: Sequence[float]) -> None:
         self._recent_rates.extend(zip(time, rate))
-        while self._recent_rates[-1][0] - self._recent_rates[0][0] > _RECENT_DURATION:
+        while self._recent_rates[-1][0] - self._recent_rates[0][0] > RECENT_DURATION:
             self._recent_rates.popleft()
 
     # Many samples at once
@@ -464,7 +463,7 @@ class HeadingTracker:
                 piece.epochs.append(self._new_epoch(until - 1))
         if not self._block.duration:
             piece.close_epoch(end - begin)
-        first = int(np.searchsorted(piece.time, piece.time[-1] - _RECENT_DURATION))
+        first = int(np.searchsorted(piece.time, piece.time[-1] - RECENT_DURATION))
         self._remember(piece.time[first:].tolist(), piece.rate[first:].tolist())
         piece.fill_results(usual)
         self.rate = float(piece.results[-1, 2])
