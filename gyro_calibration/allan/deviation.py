@@ -215,16 +215,33 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
 # lost samples
 
 def integrate_angle(rate: Array) -> Array:
-    """
-    Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples.
-
-    Gaps are bridged linearly.
-
-    """
+    """Return the integral of the rate minus its mean, shape (n + 1,), in rate times samples."""
     angle = np.empty(len(rate) + 1)
     angle[0] = 0.0
-    np.cumsum(bridge_gaps(rate - np.nanmean(rate)), out=angle[1:])
+    np.cumsum(_fill_gaps(rate), out=angle[1:])
     return angle
+
+
+def _fill_gaps(rate: Array) -> Array:
+    """
+    Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side.
+
+    A line between the samples at both ends would integrate their noise over the whole gap, which
+    passes for a random walk.
+
+    """
+    known = np.isfinite(rate)
+    values = rate - rate[known].mean()
+    if known.all():
+        return values
+    values[~known] = 0.0
+    begins, ends = np.array([(gap.start, gap.stop) for gap in find_runs(~known)]).T
+    margin = 5 * (ends - begins) + 5
+    low, high = np.maximum(begins - margin, 0), np.minimum(ends + margin, len(rate))
+    sums, counts = (np.concatenate([[0.0], np.cumsum(each)]) for each in (values, known))
+    means = (sums[high] - sums[low]) / np.maximum(counts[high] - counts[low], 1.0)
+    values[~known] = np.repeat(means, ends - begins)
+    return values
 
 
 def _count_lost_before(rate: Array) -> Integers | None:

@@ -27,6 +27,7 @@ import math
 from gyro_calibration.allan.deviation import (
     allan_deviation,
     AllanChart,
+    chi_squared_bounds,
     covariance_form,
 )
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
@@ -41,6 +42,9 @@ from scipy.special import chdtrc
 _TERM_PENALTY = 10.0
 #: Largest difference in -2 ln likelihood of an alternative combination of terms.
 _ALTERNATIVE_LIMIT = 6.0
+#: A combination that is likelier by this in -2 ln likelihood, but has too many terms, widens the
+#: bounds.
+_WIDENING_LIMIT = 1.0
 #: Least p-value of the residuals of an accepted fit.
 _MIN_P_VALUE = 0.05
 #: Relative differences between the Allan deviations and the sum of the terms that are tried; the
@@ -208,6 +212,13 @@ class CombinationFit:
         """Return the standard deviation of the squared coefficient of a term of the fit."""
         return float(self.estimate_squares(self.active_terms)[1][self.active_terms.index(index)])
 
+    def coefficient_bounds(self, index: int) -> tuple[float, float]:
+        """Return 95 % bounds of a coefficient, whose square is taken as a mean square."""
+        square = self.squares[index]
+        lower, upper = chi_squared_bounds(
+            square, max(2.0 * (square / self.square_deviation(index)) ** 2, 1.0))
+        return float(lower), float(upper)
+
 
 def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: float,
                     fixed_term: int = -1, fixed_square: float = 0.0) -> CombinationFit:
@@ -303,6 +314,14 @@ class Ranking:
         return [each for each in self.fits if each.deviance < best.deviance + _ALTERNATIVE_LIMIT
                 and len(each.active_terms) <= len(best.active_terms)
                 and not set(each.active_terms) - {_FILTER_BEND, _Q} <= set(best.active_terms)]
+
+    @cached_property
+    def plausible_fits(self) -> list[CombinationFit]:
+        """Return the best, likelier ones with more terms, and those joined with alternatives."""
+        best = self.best
+        both = [{*best.active_terms, *other.active_terms} for other in self.alternatives]
+        return [best, *(each for each in self.fits if each.deviance
+                        < best.deviance - _WIDENING_LIMIT or set(each.active_terms) in both)]
 
 
 def rank_combinations(octaves: OctaveVariances) -> Ranking:
@@ -502,7 +521,10 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
     if index in ranking.detected_terms and index in best.active_terms:
         value = math.sqrt(best.squares[index])
         deviation = 0.5 * best.square_deviation(index) / value
-        lower, upper = min(lower, value), max(upper, value)
+        possible = ranking.plausible_fits if best is ranking.best else [best]
+        ends = [(value, value), (lower, upper), *(
+            each.coefficient_bounds(index) for each in possible if index in each.active_terms)]
+        lower, upper = min(low for low, _ in ends), max(high for _, high in ends)
     if not value or index in (_B, _K) and ranking.is_replaceable(index):
         lower = 0.0
     unit = interval ** -part.slope
@@ -517,7 +539,7 @@ def _likelihood_bounds(ranking: Ranking, best: CombinationFit, index: int) -> tu
     fits, N, B and K, detected or not, and a process where it is fitted with the term.
 
     """
-    held = {_N, _B, _K, *(each for one in (best, ranking.best, *ranking.alternatives)
+    held = {_N, _B, _K, *(each for one in (best, *ranking.plausible_fits, *ranking.alternatives)
                           for each in one.active_terms)}
     others = tuple(sorted(held - {index}))
     joint = fit_combination(best.octaves, (*others, index), ranking.misfit)

@@ -54,8 +54,9 @@ _MAX_DEVIATION = 0.5 * DEGREE
 OUTLIER_THRESHOLD = 6.0
 #: Minimum spread of temperatures, K; a smaller one is not distinguishable from sensor errors.
 MIN_TEMPERATURE_SPREAD = 1.0
-#: Minimum share of a log in dwells; a swing is steady for short times only.
-_MIN_DWELL_SHARE = 0.05
+#: Minimum share of a log in dwells, as a swing is steady for short times only; and share up to
+#: which another method is proposed.
+_MIN_DWELL_SHARE, _FEW_DWELLS_SHARE = 0.05, 0.25
 #: Duration of the blocks in which the heading is averaged, s, and how many of them show a ramp.
 _BLOCK_DURATION, _RAMP_BLOCKS = 0.1, 5
 
@@ -389,9 +390,13 @@ def find_dwells(log: Log) -> Dwells:
     share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
     if share < _MIN_DWELL_SHARE:
         raise DataRefused(
-            f'the heading is a straight line to {_MAX_DEVIATION / DEGREE:g} deg, for '
-            f'{_MIN_DURATION:g} s at a time without the settling, in {100.0 * share:.0f} % of the '
-            'log; hold each rate for longer, or use the heading itself with --method likelihood')
+            'the reference turns at a constant rate (its heading is a straight line to '
+            f'{_MAX_DEVIATION / DEGREE:g} deg), for {_MIN_DURATION:g} s at a time without the '
+            f'settling, in {100.0 * share:.0f} % of the log; hold each rate for longer, or use '
+            '--method likelihood')
+    if share <= _FEW_DWELLS_SHARE:
+        remarks.append(f'only {100.0 * share:.0f} % of the time is in dwells; --method likelihood '
+                       'uses all of it')
     rate, output, deviation = _average(samples, dwells)
     row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None

@@ -498,6 +498,12 @@ def _check_samples(found: DataQuality, comparison: OutputComparison, has_output:
                 else limit.is_reached(output))
     valid, band = has_output & ~at_limit, find_dead_band(codes, output)
     repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
+    if repeated is not None and len(find_runs(at_limit)) == 1 and np.count_nonzero(
+            at_limit) - 1 <= 2 * max(run.stop - run.start
+                                     for run in find_runs(repeated.is_faulty)):
+        # one run at a limit that is like the others is one of repeats
+        limit, at_limit, valid = None, np.zeros_like(at_limit), has_output
+        repeated = find_repeated_samples(comparison, codes, band, valid, FALSE_ALARM_CHANCE)
     valid = valid if repeated is None else valid & ~repeated.is_faulty
     # Samples next to a dead band are the tail of the noise outside it.
     tested = valid if band is None else valid & ~binary_dilation(

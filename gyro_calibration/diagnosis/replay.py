@@ -237,14 +237,17 @@ def replay(log: Log, usable: Mask, generator: np.random.Generator,
     heading = prepared_log.reference_heading
     if heading is None or not np.isfinite(heading).all():
         heading = integrate_trapezoidal(time, np.nan_to_num(smooth))
+    expected_rounding = (_expected_rounding(log.output, smooth, kept, output_step) if output_step
+                         else np.zeros(len(time)))
     channels = replace(channels_from_log(prepared_log), rate=smooth, time=time, heading=heading,
-                       output=log.output)
+                       output=log.output - expected_rounding)
     has = frozenset(name for name in ('temperature', 'specific_force', 'supply')
                     if getattr(log, name) is not None)
     rounded = heading_step if prepared_log.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
     plain = Replay(channels, reference, kept, place, interval, every, filling, rounded, has,
-                   np.zeros(len(time)), output_step ** 2 / 12.0)
+                   np.zeros(len(time)),
+                   max(output_step ** 2 / 12.0 - float(np.var(expected_rounding[kept])), 0.0))
     if model is None:
         return plain
     # the error by the model is subtracted from the output, and effects use its distorted rate
@@ -276,6 +279,27 @@ def _even_time(time: Array) -> Array:
     if not stamps.has_bursts:
         return time - time[0]
     return stamps.interval * np.concatenate([[0.0], np.cumsum(stamps.lost_after + 1.0)])
+
+
+def _expected_rounding(output: Array, rate: Array, valid: Mask, step: float) -> Array:
+    """
+    Return the mean rounding error of the output, rad/s, shape (n,).
+
+    If the steps are not small compared with the noise, it depends on the rate, and would pass for
+    structure along the rate. It is the Fourier series of a sawtooth, smoothed by the noise before
+    the rounding (Widrow, Kollar and Liu 1996).
+
+    """
+    scale, bias = (np.polyfit(rate[valid], output[valid], 1) if np.ptp(rate[valid]) > 0.0
+                   else (1.0, float(output[valid].mean())))
+    expected = scale * rate + bias
+    variance = max(float(np.var((output - expected)[valid])) - step ** 2 / 12.0, 0.0)
+    total = np.zeros(len(output))
+    for number in range(1, 8):
+        order = 2.0 * math.pi / step * number
+        total += ((-1.0) ** number * 2.0 / order * math.exp(-0.5 * order ** 2 * variance)
+                  * np.sin(order * expected))
+    return total
 
 
 def _reference_rates(log: Log, time: Array, is_held: bool,

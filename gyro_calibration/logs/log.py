@@ -78,6 +78,8 @@ _MAX_LINE_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 24
 _MAX_LOG_VALUES = 1 << 29
 
 _ROS_1_MAGIC = b'#ROSBAG V2.0'
+#: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
+_MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading', *ATTITUDE)
 #: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
 #: as text.
@@ -397,7 +399,7 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
     wrong = _mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        fault = (f'beyond the limit of {MAX_MAGNITUDE:g}'
+        fault = (f'beyond the limit of {_MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE):g}'
                  if np.isfinite(values[row]) else 'not a finite number')
         raise LogError(f'{path}: line {line_numbers[row]}, column {column}: {excerpt(texts[row])} '
                        f'is {fault}; remove the row')
@@ -405,7 +407,7 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
 
 
 def _mask_invalid(values: Array, quantity: str) -> Mask:
-    valid = np.abs(values) <= MAX_MAGNITUDE
+    valid = np.abs(values) <= _MAX_MAGNITUDES.get(quantity, MAX_MAGNITUDE)
     return ~(valid | np.isnan(values)) if quantity in _NULLABLE_QUANTITIES else ~valid
 
 

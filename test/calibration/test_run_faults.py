@@ -137,7 +137,7 @@ def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_len
 
 
 @pytest.mark.parametrize('factor, words', [
-    (60.0, 'either the gyro is in deg/s and read as rad/s, or the profile in rad and read as deg;'),
+    (60.0, 'the gyro is in deg/s and read as rad/s, or the profile in rad and read as deg'),
     (0.159, 'either the gyro is in revolutions/s and read as rad/s, or the profile in rad and '),
     (9.55, 'is in revolutions/min and read as rad/s, or the profile in rad/s and read as rev'),
     (1000.0, r'either the gyro is in thousandths \(mdeg/s, mrad/s\) and read as whole units, or '),

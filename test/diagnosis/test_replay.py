@@ -15,7 +15,7 @@ from dataclasses import replace
 from gyro_calibration.diagnosis.gates import refuse_unusable
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.logs.log import Log
+from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import constant_rate_motion, simulate
 from gyro_calibration.model.noise import Noise
@@ -127,3 +127,14 @@ def test_the_corners_of_a_motion_known_by_its_heading_pass_for_no_dead_zone():
     log = simulate(GyroModel(noise=noise), motion, 20.0, np.random.default_rng(8))
     log = replace(log, reference_rate=None)
     assert not diagnose([log], np.random.default_rng(0), GyroModel(noise=noise)).findings
+
+
+@pytest.mark.parametrize('step, noise', [(1.0, 0.2), (0.5, 0.1)])
+def test_coarse_codes_in_slow_turns_are_quantization_alone(step, noise):
+    time = np.arange(6000) / 50.0
+    rate = 3.0 * np.sin(2.0 * np.pi * time / 47.0)
+    output = 1.01 * rate + 0.3 + noise * np.random.default_rng(0).standard_normal(len(time))
+    found = diagnose([Log(time=time, output=np.round(output / step) * step * DEGREE,
+                          reference_rate=rate * DEGREE)], np.random.default_rng(0))
+    assert [each.effect for each in found.findings] == ['quantization']
+    assert not found.unexplained
