@@ -108,9 +108,10 @@ class ValueSummary:
         if name not in self.components:
             return 'not shown'
         component = self.components[name]
-        estimate, low, high = (format_amount(each, self.unit, self.name) for each in
-                               (component.estimate, component.low, component.high))
-        return f'{estimate} ({low} to {high})' if component.low > 0.0 else f'less than {high}'
+        if component.low <= 0.0:
+            return f'less than {format_amount(component.high, self.unit, self.name)}'
+        return str(format_quantity(Estimate(
+            component.estimate, (component.low, component.high), self.unit), self.name))
 
 
 @dataclass(frozen=True)
