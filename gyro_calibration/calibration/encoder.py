@@ -56,16 +56,17 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     TridiagonalMatrix,
 )
-from gyro_calibration.calibration.reference_noise import (
-    encoder_step,
-    is_course,
-    MAX_ROUNDING_STEP,
-)
+from gyro_calibration.calibration.reference_noise import is_course, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import fit_rate, refuse_scale, RunLimits
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
-from gyro_calibration.logs.quality import find_holes, quantization_step, refuse_dead
+from gyro_calibration.logs.quality import (
+    encoder_step,
+    find_holes,
+    quantization_step,
+    refuse_dead,
+)
 from gyro_calibration.logs.stamps import count_lost_samples
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term

@@ -53,7 +53,6 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.calibration.reference_noise import (
     drop_held_values,
-    encoder_step,
     heading_difference,
     MAX_ROUNDING_STEP,
     rate_noise_share,
@@ -69,6 +68,7 @@ from gyro_calibration.logs.log import (
 )
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    encoder_step,
     find_holes,
     quantization_step,
     robust_deviation,

@@ -29,7 +29,7 @@ import math
 from gyro_calibration.calibration.noise_grid import TridiagonalMatrix
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused
-from gyro_calibration.logs.quality import quantization_step
+from gyro_calibration.logs.quality import encoder_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
@@ -282,7 +282,7 @@ def _select_reference_points(motion: Motion, block: float,
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _ReferencePoints(time, motion.heading_at(time), np.ones(len(time)),
                                 *tracking_error_columns(motion, time, slip_deviation))
-    step = quantization_step(motion.heading)
+    step = encoder_step(motion.heading)
     if not step:
         return _ReferencePoints(motion.time, motion.heading, np.ones(len(motion.time)),
                                 np.empty((len(motion.time), 0)))

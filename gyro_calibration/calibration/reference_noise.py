@@ -20,7 +20,7 @@ from gyro_calibration.heading.integration import integrate_with_curvature
 from gyro_calibration.logs.log import Array, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps,
-    find_codes,
+    encoder_step,
     quantization_step,
     white_noise_deviation,
 )
@@ -28,9 +28,6 @@ import numpy as np
 from scipy import stats
 from scipy.ndimage import uniform_filter1d
 
-#: Least share of the changes of an encoder heading that are not collinear with the two before; in
-#: a calculated motion, rates are constant or change evenly.
-_MIN_IRREGULAR_SHARE = 0.1
 #: Span over which the errors of gyro and reference are compared, s.
 _COMPARISON_SPAN = 1.0
 #: Largest error of an exact reference heading as a share of the difference of the headings over a
@@ -54,16 +51,6 @@ _COURSE_NOISE_RATIO, _FIX_NOISE_RATIO = 8.0, 2.0
 #: Largest ratio of the 90 % to the 99 % quantile of the second differences of a heading that is
 #: straight between fixes.
 _MAX_STRAIGHT_RATIO = 0.1
-
-
-def encoder_step(heading: Array) -> float:
-    """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
-    known = heading[np.isfinite(heading)]
-    step = find_codes(known).step
-    change = np.diff(known)
-    changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
-                          for each in (change, np.diff(change, 2)))
-    return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
 
 
 def update_interval(time: Array, values: Array, step: float) -> float | None:

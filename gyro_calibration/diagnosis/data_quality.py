@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import require_output
-from gyro_calibration.calibration.reference_noise import encoder_step, update_interval
+from gyro_calibration.calibration.reference_noise import update_interval
 from gyro_calibration.diagnosis.causes import CAUSES, make_finding
 from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.gates import (
@@ -47,6 +47,7 @@ from gyro_calibration.diagnosis.gates import (
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    encoder_step,
     find_codes,
     find_runs,
     QuantizationCodes,

@@ -34,7 +34,6 @@ from gyro_calibration.calibration.dwells import (
     require_output,
 )
 from gyro_calibration.calibration.reference_noise import (
-    encoder_step,
     heading_difference,
     is_course,
     MAX_ROUNDING_RATIO,
@@ -55,6 +54,7 @@ from gyro_calibration.logs.log import (
 )
 from gyro_calibration.logs.quality import (
     bridge_gaps,
+    encoder_step,
     find_codes,
     robust_deviation,
     white_noise_deviation,
@@ -557,7 +557,7 @@ def _unit_gates(factor: float, deviation: float, log: Log) -> Iterator[Gate]:
     correct_gyro = ('correct the unit or the range of the gyro (gyro_dps, gyro_rad_s, '
                     '--sensitivity)')
     if name == '-1' or name is None and not is_implausible_factor(-factor):
-        yield Gate('sense', False, f'{evidence}: the two count in opposite senses',
+        yield Gate('sense', False, evidence,
                    'give or omit --invert, or change the sign of the column of the gyro', known)
     elif (name is None and power and log.reference_rate is None
             and 1.0 / MAX_GYRO_RATIO < abs(factor) / slower < MAX_GYRO_RATIO

@@ -136,6 +136,21 @@ def quantization_step(values: Array) -> float:
     return find_codes(values).step
 
 
+#: Least share of the changes of an encoder heading that are not collinear with the two before; in
+#: a calculated motion, rates are constant or change evenly.
+_MIN_IRREGULAR_SHARE = 0.1
+
+
+def encoder_step(heading: Array) -> float:
+    """Return the step of an encoder heading, rad; 0 without one or for a calculated motion."""
+    known = heading[np.isfinite(heading)]
+    step = find_codes(known).step
+    change = np.diff(known)
+    changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
+                          for each in (change, np.diff(change, 2)))
+    return step if step and differing > _MIN_IRREGULAR_SHARE * changes else 0.0
+
+
 def find_runs(mask: Mask) -> list[slice]:
     """Return the slices of consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))

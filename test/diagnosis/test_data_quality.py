@@ -22,13 +22,13 @@ from gyro_calibration.diagnosis.data_quality import (
     update_interval,
 )
 from gyro_calibration.diagnosis.gates import (
-    encoder_step,
     identify_unit_factor,
     is_at_rest,
     refuse_unusable,
     UNIT_FACTORS,
 )
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.quality import encoder_step
 from gyro_calibration.logs.stamps import fit_stamp_grid
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
