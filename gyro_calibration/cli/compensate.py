@@ -147,7 +147,9 @@ def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
                           found: _Totals) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and update the counts."""
     if given.rest or given.hindsight:
-        blocks = iter([track_log(verb.read(given), model, given.hindsight, given.log)])
+        log = verb.read(given)
+        with verb.show_progress('heading'):
+            blocks = iter([track_log(log, model, given.hindsight, given.log)])
     else:
         threshold = Threshold(given.threshold * DEGREE, given.window,
                               model.noise.angle_random_walk)
