@@ -67,7 +67,7 @@ AGE_TOLERANCE = 3600.0
 #: Least variance of a bias, (rad/s)².
 _MIN_VARIANCE = 1e-18
 #: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probabilities.
-#: `benchmarks/bias_table.py --sizes` compares them with more, and with fewer sizes.
+#: With two pairs of sizes the errors in `benchmarks/bias_table.py` are larger.
 _COEFFICIENT_SIZES = {0.1: 0.4, 1.0: 0.6}
 _TURN_ON_SIZES = {0.3: 0.3, 1.0: 0.5, 4.0: 0.2}
 #: Distance up to which the change of the bias with temperature is computed, K; constant beyond.
