@@ -402,11 +402,12 @@ def _copy_problems(log: Log, output: Array) -> Iterator[str]:
         rates += [before, after, 0.5 * (before + after)]
     for rate in rates:
         known = np.isfinite(rate) & np.isfinite(output)
-        if np.count_nonzero(known) < MIN_TABLE_ROWS or not np.ptp(rate[known]) > 0.0:
+        if np.count_nonzero(known) < MIN_TABLE_ROWS or not np.var(rate[known]) > 0.0:
             continue
-        slope, offset = np.polyfit(rate[known], output[known], 1)
-        spread = float(np.std(output[known]))
-        off = float(np.std(output[known] - slope * rate[known] - offset)) / spread
+        spread, seen = float(np.std(output[known])), output[known] - output[known].mean()
+        slope = float(seen @ rate[known] / (np.var(rate[known]) * np.count_nonzero(known)))
+        offset = float(output[known].mean() - slope * rate[known].mean())
+        off = float(np.std(output[known] - slope * rate[known])) / spread
         # or no more than the rounding of both in the file
         printed = math.hypot(find_codes(output[known]).step,
                              slope * find_codes(rate[known]).step) / spread
