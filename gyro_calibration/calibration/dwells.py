@@ -305,7 +305,7 @@ class _Samples(NamedTuple):
 
         """
         time = self.time[rows]
-        return (_fit_slope(time, angle) if self.rate is None
+        return (fit_scale(angle, time)[1] if self.rate is None
                 else float((angle[-1] - angle[0]) / (time[-1] - time[0])))
 
 
@@ -340,12 +340,6 @@ def _select_samples(log: Log) -> tuple[_Samples, list[str]]:
                         [remark] if places else [])
 
 
-def _fit_slope(x: Array, values: Array) -> float:
-    """Return the slope of the straight line through some values."""
-    centred = x - x.mean()
-    return float(centred @ values / (centred @ centred))
-
-
 # dwells of a log in time
 
 def find_dwells(log: Log) -> Dwells:
@@ -363,8 +357,8 @@ def find_dwells(log: Log) -> Dwells:
              if samples.duration(part) > _MIN_DURATION]
     rates = np.array([samples.slope(rows, samples.heading[rows]) for rows in parts])
     if len(rates) > 1 and np.ptp(rates) > 1.0 * DEGREE:  # rests alone do not determine the scale
-        samples = samples._replace(scale=_fit_slope(rates, np.array(
-            [np.median(samples.output[rows]) for rows in parts])))
+        outputs = np.array([np.median(samples.output[rows]) for rows in parts])
+        samples = samples._replace(scale=fit_scale(outputs, rates)[1])
     is_outlier, is_repeated = np.zeros((2, len(time)), dtype=bool)
     kept = []
     for part in parts:
@@ -458,7 +452,7 @@ def _extend_line(time: Array, heading: Array, stretch: slice, tolerance: float) 
     # By at most its own length at both ends, so that the time is linear in the length of the log.
     first = max(0, stretch.start - _length(stretch))
     last = min(len(time), stretch.stop + _length(stretch))
-    line = heading[middle].mean() + _fit_slope(time[middle], heading[middle]) * (
+    line = heading[middle].mean() + fit_scale(heading[middle], time[middle])[1] * (
         time[first:last] - time[middle].mean())
     deviation = np.abs(heading[first:last] - line)
     beyond = np.flatnonzero(deviation > tolerance)

@@ -41,6 +41,7 @@ from gyro_calibration.calibration.reference_noise import (
     rate_noise_share,
     step_evenness,
 )
+from gyro_calibration.calibration.run_faults import fit_scale
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate, Reference
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import (
@@ -404,8 +405,7 @@ def _copy_problems(log: Log, output: Array) -> Iterator[str]:
         known = np.isfinite(rate) & np.isfinite(output)
         if np.count_nonzero(known) < MIN_TABLE_ROWS or not np.var(rate[known]) > 0.0:
             continue
-        spread, seen = float(np.std(output[known])), output[known] - output[known].mean()
-        slope = float(seen @ rate[known] / (np.var(rate[known]) * np.count_nonzero(known)))
+        spread, slope = float(np.std(output[known])), fit_scale(output[known], rate[known])[1]
         offset = float(output[known].mean() - slope * rate[known].mean())
         off = float(np.std(output[known] - slope * rate[known])) / spread
         # or no more than the rounding of both in the file
