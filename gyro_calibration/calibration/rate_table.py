@@ -518,9 +518,9 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
 
     """
     known = np.isfinite(rate)
-    lost = int(np.count_nonzero(~known & (np.abs(dwells.rate) >= min_rate)))
-    dwells, rate = select_dwells(dwells, known), rate[known]
-    wanted = np.abs(dwells.rate) >= min_rate
+    wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # a rate told as text is rounded
+    lost = int(np.count_nonzero(~known & wanted))
+    dwells, rate, wanted = select_dwells(dwells, known), rate[known], wanted[known]
     if not wanted.any():
         raise DataRefused(f'none of {len(known)} dwells turns at {min_rate / DEGREE:g} deg/s or '
                           'faster and has a rate by the model; '

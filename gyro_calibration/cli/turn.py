@@ -153,12 +153,14 @@ def _describe_fit_data(model: GyroModel, log: str) -> str:
 # bins
 
 def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
-    """Return limits of 1, 2, 4, ... times the slowest rate each way, and what lies between."""
+    """Return the limits of bins around 1, 2, 4, ... times the slowest rate, and what lies in."""
     speed = np.abs(errors.rate)
-    # A step just below the fastest turn would make a nearly empty bin.
-    doublings = max(1, math.floor(math.log2(1.6 * speed.max() / slowest)))
-    edges = [*(slowest * 2.0 ** number for number in range(doublings)), float(speed.max())]
-    places = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, doublings - 1)
+    # A limit just below the fastest turn would make a nearly empty bin. Limits lie between the
+    # doubled rates, as those are the rates that are commanded.
+    bins = max(1, math.floor(math.log2(2.13 * speed.max() / slowest)))
+    edges = [slowest, *(0.75 * slowest * 2.0 ** number for number in range(1, bins)),
+             float(speed.max())]
+    places = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, bins - 1)
     both = [*((-high, -low, (places == place) & (errors.rate < 0.0))
               for place, (low, high) in enumerate(zip(edges, edges[1:])))][::-1]
     both += [(low, high, (places == place) & (errors.rate > 0.0))
