@@ -500,15 +500,21 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     Return the settling time of the output after a ramp, s.
 
     A linear response (a filter, a delay) is proportional to the change of rate, so it is averaged
-    over all dwells, which determines a response below the noise of one dwell. It is settled where
-    it is within four standard deviations of its last half; below 20 ppm it always is.
+    over the dwells, which determines a response below the noise of one dwell: over all but the
+    shortest ones, and over the longest ones, which show a slower response. It is settled where it
+    is within four standard deviations of its last half; below 20 ppm it always is.
 
     """
-    if not len(dwells):
-        return 0.0
+    return max((_settling_of_longer(time, error, dwells, rate_change, share)
+                for share in ((0.25, 0.75) if len(dwells) else ())), default=0.0)
+
+
+def _settling_of_longer(time: Array, error: Array, dwells: Sequence[Numbers], rate_change: Array,
+                        share: float) -> float:
+    """Return the settling time, s, by the dwells that are longer than a share of them."""
     durations = np.array([float(np.ptp(time[rows])) for rows in dwells])
     interval, width = max(0.05, float(np.median(np.diff(time)))), 4
-    bins = int(min(np.quantile(durations, 0.25), 9.0) / interval)
+    bins = int(min(np.quantile(durations, share), 9.0) / interval)
     edges = np.arange(bins + 1) * interval
     used = durations >= edges[-1]
     if bins < 8 * width or not rate_change[used].any():
@@ -520,7 +526,7 @@ def _settling_time(time: Array, error: Array, dwells: Sequence[Numbers],
     response = uniform_filter1d(rate_change[used] @ (means - late) / np.sum(
         rate_change[used] ** 2), width, mode='nearest')
     spread = max(float(response[bins // 2:].std()), 2e-5)
-    unsettled = np.flatnonzero(np.abs(response[:bins // 3]) > 4.0 * spread)
+    unsettled = np.flatnonzero(np.abs(response[:bins // 2]) > 4.0 * spread)
     # after ten bins within the limit the response has ended; later ones exceed it by chance
     unsettled = unsettled[np.cumprod(np.diff(unsettled, prepend=-1) <= 10) > 0]
     return (int(unsettled[-1]) + 1 + width // 2) * interval if len(unsettled) else 0.0
