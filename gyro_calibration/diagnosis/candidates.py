@@ -46,7 +46,7 @@ ColumnFunction = Callable[[Replay], Sequence[Array]]
 
 @dataclass(frozen=True)
 class Candidate:
-    """One cause with its shapes."""
+    """One cause with its shapes; after its selection, also with its values."""
 
     cause: str  # its name
     shapes: tuple[float, ...]  # their values, in the order of the effect
@@ -58,6 +58,9 @@ class Candidate:
     # of the range in which its shape, a time or a frequency, is searched; None for a shape that is
     # searched in logarithms
     half_width: float | None = None
+    # coefficients of its columns; empty before a fit, and its shapes are then fixed
+    values: tuple[float, ...] = ()
+    penalty: float = 0.0  # penalty for the choice of its first shapes, in log-likelihood
 
 
 def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:

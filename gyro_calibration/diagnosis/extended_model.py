@@ -22,13 +22,13 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from gyro_calibration.calibration.self_calibration import RunLimits
+from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.data_quality import DataQuality
 from gyro_calibration.diagnosis.findings import Change, Finding, Gain, HeadingCurve
 from gyro_calibration.diagnosis.regression import (
     fit_causes,
     is_single_event,
     RegressionFit,
-    SelectedCause,
 )
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.residuals import NOISE_NAMES
@@ -75,7 +75,7 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
     given = model or GyroModel()
     names = {name for each in findings for name in (each.effect, *each.ambiguous_with)}
     fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
-              or any(each.candidate.cause in CATALOGUE and fit.is_included(place)
+              or any(each.cause in CATALOGUE and fit.is_included(place)
                      for place, each in enumerate(fit.causes)))
     new = add_causes(given, fit, bias_deviation) if fitted else given
     # limit and quantization of the output, if they are findings, from the first log; exact
@@ -161,11 +161,11 @@ def merge_self_calibration(model: GyroModel) -> GyroModel:
                    self_calibration=None)
 
 
-def unmergeable_causes(model: GyroModel, fit: RegressionFit) -> tuple[SelectedCause, ...]:
+def unmergeable_causes(model: GyroModel, fit: RegressionFit) -> tuple[Candidate, ...]:
     """Return the lasting causes of the gyro that cannot be merged with terms of its model."""
     terms, unmergeable = model.terms, []
     for place, known in enumerate(fit.causes):
-        if known.candidate.cause in CATALOGUE and not is_single_event(known):
+        if known.cause in CATALOGUE and not is_single_event(known):
             more = _merge_term(terms, _term_of_cause(fit, place))
             unmergeable += [known] if more is None else []
             terms = more or terms
@@ -201,9 +201,9 @@ def _terms_with_covariance(fit: RegressionFit, bias_deviation: float) -> tuple[l
     terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
     ranks: list[int | None] = [None, None if implausible else fit.estimate_index(-1, 0)]
     for place, known in enumerate(fit.causes):
-        if known.candidate.cause in CATALOGUE and fit.is_included(place):
+        if known.cause in CATALOGUE and fit.is_included(place):
             terms.append(_term_of_cause(fit, place))
-            shapes = len(known.candidate.shapes)
+            shapes = len(known.shapes)
             ranks += [
                 fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
                 for number in range(len(terms[-1].values))]
@@ -217,7 +217,7 @@ def _terms_with_covariance(fit: RegressionFit, bias_deviation: float) -> tuple[l
 
 def _term_of_cause(fit: RegressionFit, cause_index: int) -> Term:
     """Return a cause of the gyro as a term."""
-    candidate = fit.causes[cause_index].candidate
+    candidate = fit.causes[cause_index]
     effect = CATALOGUE[candidate.cause]
     coefficients = ([one.value for one in fit.coefficients(cause_index)]
                     or [candidate.amplitude or 0.0][:len(effect.coefficients)])
@@ -348,7 +348,7 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     named = search_causes(reduced_search)
     straight, plain, extended = (
         replace(fit_causes(reduced_search.problem, some), lasting_only=True)
-        for some in ((), [each for each in named if each.candidate.cause == 'time_offset'], named))
+        for some in ((), [each for each in named if each.cause == 'time_offset'], named))
     models = {'given': None, 'straight': straight, 'plain': plain, 'extended': extended}
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
     counts: list[tuple[int, int]] = []

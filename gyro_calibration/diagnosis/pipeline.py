@@ -19,6 +19,7 @@ import math
 
 from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.diagnosis.candidates import (
+    Candidate,
     common_channels,
     constant_channels,
     is_named,
@@ -75,7 +76,6 @@ from gyro_calibration.diagnosis.regression import (
     fit_causes,
     is_single_event,
     RegressionFit,
-    SelectedCause,
     SMOOTHED_RATIO,
     Value,
 )
@@ -126,7 +126,7 @@ _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K'
                      'specific_force': 'the specific force does not change'}
 
 #: A cause and its alternatives, each with its deficit in log-likelihood.
-Alternatives = Sequence[tuple[SelectedCause, float]]
+Alternatives = Sequence[tuple[Candidate, float]]
 
 
 def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None,
@@ -213,8 +213,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     named, unnamed = withdraw_names(search, everything)
     named, removed = confirm(search, named)
     unconfirmed = [each for each, why in removed.items()
-                   if why == UNPREDICTIVE and is_lasting(each.candidate)]
-    refuted = {each.candidate.cause: why for each, why in removed.items()
+                   if why == UNPREDICTIVE and is_lasting(each)]
+    refuted = {each.cause: why for each, why in removed.items()
                if each not in unconfirmed}
     on_progress(None, 'alternatives')
     named, sets = choose_simplest(search, named, unnamed)
@@ -233,12 +233,12 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     lasting = any(not is_single_event(known) for known, _ in within)
     gain = None
     if (lasting or changed) and not is_scale_implausible(found):
-        tried = {each.candidate.cause for _, members in within for each, _ in members}
+        tried = {each.cause for _, members in within for each, _ in members}
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
     on_progress(None, 'findings')
-    taken = {each.candidate.cause for each in named}
-    doubtful = (tuple(each for each in unconfirmed if each.candidate.cause not in taken)
+    taken = {each.cause for each in named}
+    doubtful = (tuple(each for each in unconfirmed if each.cause not in taken)
                 or find_suspected(search, (*named, *unnamed)))
     findings = [*_cause_findings(search, found, sets, unnamed, doubtful),
                 *_record_findings(quality, changed)]
@@ -273,11 +273,11 @@ def _cause_findings(search: Search, fit: RegressionFit, alternatives_of: Sequenc
                     unnamed: Causes, suspected: Causes) -> Iterator[Finding]:
     """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
     for place, (known, members) in enumerate(zip(fit.causes, alternatives_of)):
-        others = [(each.candidate.cause, lack)
-                  for each, lack in members if each.candidate.cause != known.candidate.cause]
+        others = [(each.cause, lack)
+                  for each, lack in members if each.cause != known.cause]
         yield cause_finding(
             search, fit, place, evidence_for(search, (*fit.causes, *unnamed), place), members,
-            next_experiment(known.candidate.cause, others, observed_range(search.problem.replays)))
+            next_experiment(known.cause, others, observed_range(search.problem.replays)))
     for known in suspected:
         everything = refine_jointly(search, (*fit.causes, *unnamed, known))
         place = len(everything) - 1
@@ -378,15 +378,15 @@ def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
 
 
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: RegressionFit,
-             unnamed: Sequence[SelectedCause], refuted: Mapping[str, str],
-             unmergeable: Sequence[SelectedCause], gain: Gain | None,
+             unnamed: Sequence[Candidate], refuted: Mapping[str, str],
+             unmergeable: Sequence[Candidate], gain: Gain | None,
              model: GyroModel | None) -> Iterator[str]:
     """Give remarks on the records, on withdrawn names, and on the model."""
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    for name in dict.fromkeys(each.candidate.cause for each in unnamed
-                              if is_named(each.candidate)):
+    for name in dict.fromkeys(each.cause for each in unnamed
+                              if is_named(each)):
         why = ('there are tones at many frequencies' if name == 'interference_tone'
                else 'it differs between logs, or other structure lies along the same variable')
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
@@ -398,12 +398,12 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
                f'{100.0 * scale.deviation:.1g} % is not added to the model: the motion is too '
                'small for the noise of gyro and reference; turn faster, in both directions.')
-    for name in dict.fromkeys(each.candidate.cause for each in unmergeable):
+    for name in dict.fromkeys(each.cause for each in unmergeable):
         remedy = ('; remove that one from the given model, and diagnose again' if name in own
                   else '')
         yield (f'A second {name.replace("_", " ")} is not added to the extended model, as it '
                f'cannot be merged with the first one{remedy}.')
-    for name in dict.fromkeys(each.candidate.cause
+    for name in dict.fromkeys(each.cause
                               for each in fit.causes if is_single_event(each)):
         yield (f'The {name.replace("_", " ")} occurs once: it is not in the extended model, '
                'whose bias is the mean over the logs.')
@@ -416,20 +416,20 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
 def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
                   alternatives: Alternatives, separate_by: str) -> Finding:
     """Return the finding of a named cause with its evidence and alternatives."""
-    known = fit.causes[cause_index]
-    candidate, name = known.candidate, known.candidate.cause
+    candidate = fit.causes[cause_index]
+    name = candidate.cause
     parameters = _cause_parameters(fit, cause_index)
     probability = probabilities(
-        {name: 0.0, **{each.candidate.cause: lack for each, lack in reversed(alternatives)}})
-    confounders = [each.candidate.cause
-                   for each, _ in alternatives if each.candidate.cause != name]
+        {name: 0.0, **{each.cause: lack for each, lack in reversed(alternatives)}})
+    confounders = [each.cause
+                   for each, _ in alternatives if each.cause != name]
     size = next(iter(parameters.values()))
     deviation = size.deviation
     if name == 'time_offset' and identify_sample_offset(size.estimate, deviation,
                                                         fit.problem.replays[0].interval):
         confounders.append('unit_error')
     # the evidence of a size of n standard deviations is n² / 2
-    threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
+    threshold = evidence_threshold(name, search.rate) + complexity_penalty(candidate)
     detectable_sigmas = (math.sqrt(2.0 * max(threshold, 0.0))
                          + float(norm.isf(1.0 - _DETECTION_POWER)))
     log = ('' if candidate.log_index is None or len(fit.problem.replays) == 1
@@ -447,12 +447,12 @@ def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence
         separate_by=separate_by or (CAUSES[name].separate_by if confounders else ''),
         evidence=(f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0
                   else ''), probability=probability, where=where,
-        remedy=_SINGLE_EVENT_REMEDY if is_single_event(known) else '')
+        remedy=_SINGLE_EVENT_REMEDY if is_single_event(candidate) else '')
 
 
 def _cause_parameters(fit: RegressionFit, cause_index: int) -> dict[str, Estimate]:
     """Return the parameters of a cause, first the one with the name of the cause."""
-    candidate = fit.causes[cause_index].candidate
+    candidate = fit.causes[cause_index]
     coefficients, shapes = fit.coefficients(cause_index), fit.shapes(cause_index)
     name, effect = candidate.cause, CATALOGUE.get(candidate.cause)
     names = (_SHAPE_NAMES.get(name, ()) if effect is None else tuple(
@@ -496,13 +496,13 @@ def _amplitude_and_phase(fit: RegressionFit, cause_index: int, name: str,
 
 
 def unexplained_structures(search: Search, fit: RegressionFit,
-                           unnamed: Sequence[SelectedCause]) -> list[Unexplained]:
+                           unnamed: Sequence[Candidate]) -> list[Unexplained]:
     """Return the structures without a name with the share of the residual that each explains."""
     causes = (*fit.causes, *unnamed)
     variables: dict[str, list[int]] = {}
     for place, known in enumerate(unnamed):
-        name = (CAUSES[known.candidate.cause].along if is_named(known.candidate)
-                else unnamed_variable(known.candidate))
+        name = (CAUSES[known.cause].along if is_named(known)
+                else unnamed_variable(known))
         variables.setdefault(name, []).append(len(fit.causes) + place)
     least = _residual_variance(search, causes)
     most = _residual_variance(search, fit.causes)
@@ -510,13 +510,13 @@ def unexplained_structures(search: Search, fit: RegressionFit,
     for name, places in variables.items():
         without = _residual_variance(
             search, [known for place, known in enumerate(causes) if place not in places])
-        chance = min(p_value(causes[place].candidate.cause, evidence_for(search, causes, place))
+        chance = min(p_value(causes[place].cause, evidence_for(search, causes, place))
                      for place in places)
         structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return structures
 
 
-def _residual_variance(search: Search, causes: Sequence[SelectedCause]) -> float:
+def _residual_variance(search: Search, causes: Sequence[Candidate]) -> float:
     """Return the variance of the residual of some causes at the grid points."""
     left = fit_causes(search.problem, causes).unbiased_residuals
     return float(np.var(np.concatenate([each.resample(rest) for each, rest

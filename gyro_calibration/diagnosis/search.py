@@ -45,7 +45,6 @@ from gyro_calibration.diagnosis.findings import (
     SUSPECTED_RATE_FACTOR,
 )
 from gyro_calibration.diagnosis.regression import (
-    add_cause,
     build_problem,
     column_evidence,
     fit_causes,
@@ -54,7 +53,6 @@ from gyro_calibration.diagnosis.regression import (
     is_rate_distortion,
     RegressionFit,
     RegressionProblem,
-    SelectedCause,
     with_distorted_rate,
 )
 from gyro_calibration.diagnosis.replay import cosine_transform, inverse_cosine_transform, Replay
@@ -95,7 +93,7 @@ _MIN_REPEAT_CHANCE, _REPEATING_VARIABLES = 1e-3, ('temperature', 'temperature_ra
 #: Why a cause is not named.
 UNPREDICTIVE = 'it does not predict held-out stretches'
 
-Causes = tuple[SelectedCause, ...]
+Causes = tuple[Candidate, ...]
 
 
 def evidence_threshold(cause: str, rate: float) -> float:
@@ -132,7 +130,7 @@ class CandidateColumns:
 
 
 def make_candidate_columns(problem: RegressionProblem, candidates: Sequence[Candidate],
-                           causes: Sequence[SelectedCause] = ()) -> CandidateColumns:
+                           causes: Sequence[Candidate] = ()) -> CandidateColumns:
     """Compute the whitened columns of candidates."""
     replays = [with_distorted_rate(each, causes) for each in problem.replays]
     parts = [candidate_transforms(each, replays) / problem.deviation for each in candidates]
@@ -218,7 +216,7 @@ class _ScreenedCandidate:
 
 
 def find_strongest(search: Search,
-                   causes: Sequence[SelectedCause]) -> tuple[SearchStep | None, list[SearchStep]]:
+                   causes: Sequence[Candidate]) -> tuple[SearchStep | None, list[SearchStep]]:
     """
     Search for one more cause.
 
@@ -226,7 +224,7 @@ def find_strongest(search: Search,
     if no cause is significant, those of suspected causes.
 
     """
-    key = tuple((each.candidate.cause, each.candidate.log_index, *each.candidate.shapes)
+    key = tuple((each.cause, each.log_index, *each.shapes)
                 for each in causes)
     if key not in search.step_cache:
         search.on_progress(None, f'search for causes, {len(causes)} found')
@@ -234,7 +232,7 @@ def find_strongest(search: Search,
     return search.step_cache[key]
 
 
-def _search_strongest(search: Search, causes: Sequence[SelectedCause],
+def _search_strongest(search: Search, causes: Sequence[Candidate],
                       ) -> tuple[SearchStep | None, list[SearchStep]]:
     fit = fit_causes(search.problem, causes)
     first = _screen_causes(search, fit, causes)
@@ -256,15 +254,15 @@ def _search_strongest(search: Search, causes: Sequence[SelectedCause],
     # than its penalty.
     steps = [step for step in steps if step.score > fit.log_likelihood]
     return next((step for step in steps if search.excess_evidence(
-        step.causes[-1].candidate.cause, step.score - fit.log_likelihood) > 0.0), None), steps
+        step.causes[-1].cause, step.score - fit.log_likelihood) > 0.0), None), steps
 
 
 def _screen_causes(search: Search, fit: RegressionFit,
-                   causes: Sequence[SelectedCause]) -> list[_ScreenedCandidate]:
+                   causes: Sequence[Candidate]) -> list[_ScreenedCandidate]:
     """Return the best first shape of each cause."""
     found = _columns_given_causes(search, causes).evidence(fit)
     # A second cause without a free size would only correct the shape of the first.
-    taken = {each.candidate.cause for each in causes if each.candidate.amplitude is not None}
+    taken = {each.cause for each in causes if each.amplitude is not None}
     first = [_ScreenedCandidate(search.candidates[max(own, key=lambda place: found[place])],
                                 float(found[own].max()),
                                 float(logsumexp(found[own])) - math.log(len(own)))
@@ -275,10 +273,10 @@ def _screen_causes(search: Search, fit: RegressionFit,
                     if np.isfinite(each.mean_evidence)]
 
 
-def _columns_given_causes(search: Search, causes: Sequence[SelectedCause]) -> CandidateColumns:
+def _columns_given_causes(search: Search, causes: Sequence[Candidate]) -> CandidateColumns:
     """Return all candidates for the rate that the gyro senses, with shapes to two digits."""
-    key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes))
-                for each in causes if is_rate_distortion(each.candidate.cause))
+    key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
+                for each in causes if is_rate_distortion(each.cause))
     if not key:
         return search.candidate_columns
     if key not in search.columns_cache:
@@ -303,14 +301,15 @@ def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> Se
             return with_shape(candidate, place, first + by if half else first * math.exp(by))
 
         half_range = half or _SHAPE_RANGE
-        best = minimize_scalar(lambda by: -add_cause(fit, moved(by)).log_likelihood,
-                               bounds=(-half_range, half_range), method='bounded',
-                               options={'xatol': 4e-3 * half_range, 'maxiter': 14})
+        best = minimize_scalar(
+            lambda by: -fit_causes(fit.problem, [*fit.causes, moved(by)]).log_likelihood,
+            bounds=(-half_range, half_range), method='bounded',
+            options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
-    done = add_cause(fit, candidate)
+    done = fit_causes(fit.problem, [*fit.causes, candidate])
     score = (done.log_likelihood - VALUE_PENALTY * max(done.column_counts[-1] - 1, 0) - penalty
              - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
-    return SearchStep((*fit.causes, SelectedCause(candidate, penalty=penalty)), score)
+    return SearchStep((*fit.causes, replace(candidate, penalty=penalty)), score)
 
 
 def is_lasting(candidate: Candidate) -> bool:
@@ -327,11 +326,11 @@ def find_suspected(search: Search, selected: Causes) -> Causes:
     """Return one more cause at `SUSPECTED_RATE_FACTOR` times the rate, if there is one."""
     _, steps = find_strongest(search, selected)
     score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
-    cause_names = {each.candidate.cause for each in selected}
+    cause_names = {each.cause for each in selected}
     for step in steps:
         found = step.causes[-1]
-        if (is_lasting(found.candidate) and found.candidate.cause not in cause_names
-                and search.excess_evidence(found.candidate.cause, step.score - score,
+        if (is_lasting(found) and found.cause not in cause_names
+                and search.excess_evidence(found.cause, step.score - score,
                                            SUSPECTED_RATE_FACTOR) > 0.0):
             return (found,)
     return ()
@@ -341,7 +340,7 @@ def find_suspected(search: Search, selected: Causes) -> Causes:
 
 def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
     """Return the logs that may contain one more instance of a cause."""
-    taken = [known.candidate.log_index for known in fit.causes if known.candidate.cause == cause]
+    taken = [known.log_index for known in fit.causes if known.cause == cause]
     return [run
             for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]]
 
@@ -440,7 +439,7 @@ def search_causes(search: Search) -> Causes:
 
     """
     everything = _select_forward(search)
-    if all(is_named(each.candidate) for each in everything):
+    if all(is_named(each) for each in everything):
         return everything
     nameable = [each for each in search.candidates if is_named(each)]
     named = _select_forward(
@@ -449,7 +448,7 @@ def search_causes(search: Search) -> Causes:
     return max((everything, named),
                key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
                    complexity_penalty(each)
-                   + (0.0 if is_named(each.candidate) else UNNAMED_PENALTY) for each in named))
+                   + (0.0 if is_named(each) else UNNAMED_PENALTY) for each in named))
 
 
 def _select_forward(search: Search) -> Causes:
@@ -463,7 +462,7 @@ def _select_forward(search: Search) -> Causes:
     return named
 
 
-def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> Causes:
+def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
     """Refine all shapes and values together by Gauss-Newton steps."""
     current = tuple(causes)
     for _ in range(3 if causes else 0):
@@ -472,8 +471,8 @@ def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> Causes:
     return current
 
 
-def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> SelectedCause:
-    known, candidate = fit.causes[cause_index], fit.causes[cause_index].candidate
+def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> Candidate:
+    known = candidate = fit.causes[cause_index]
     own = dict(zip(fit.column_owners, fit.estimates[0].tolist()))
     values = tuple(own.get((cause_index, number), 0.0)
                    for number in range(fit.column_counts[cause_index]))
@@ -481,16 +480,17 @@ def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> SelectedCause:
         most = 0.3 * abs(candidate.shapes[shape])
         change = np.clip(own.get((cause_index, -1 - shape), 0.0), -most, most)
         candidate = with_shape(candidate, shape, candidate.shapes[shape] + float(change))
-    return replace(known, candidate=candidate, values=values or (candidate.amplitude or 0.0,))
+    return replace(candidate, values=values or (candidate.amplitude or 0.0,),
+                   penalty=known.penalty)
 
 
-def complexity_penalty(cause: SelectedCause) -> float:
+def complexity_penalty(cause: Candidate) -> float:
     """Return the penalty of shapes and columns of a cause, in log-likelihood."""
-    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause.candidate)))
+    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause)))
     return shapes + VALUE_PENALTY * max(len(cause.values) - 1, 0)
 
 
-def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: int) -> float:
+def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
     """Return the evidence for one of the causes given the others."""
     others = [*causes[:cause_index], *causes[cause_index + 1:]]
     return (fit_causes(search.problem, causes).log_likelihood
@@ -501,7 +501,7 @@ def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: i
 def eliminate_backward(search: Search, causes: Causes) -> Causes:
     """Remove causes that are not significant given the others, the weakest first."""
     while causes:
-        excess = [search.excess_evidence(each.candidate.cause, evidence_for(search, causes, place))
+        excess = [search.excess_evidence(each.cause, evidence_for(search, causes, place))
                   for place, each in enumerate(causes)]
         weakest = int(np.argmin(excess))
         if excess[weakest] > 0.0:
@@ -520,34 +520,34 @@ def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     tones, or if a cause along a temperature differs between logs.
 
     """
-    variables = {unnamed_variable(each.candidate)
-                 for each in causes if not is_named(each.candidate)}
+    variables = {unnamed_variable(each)
+                 for each in causes if not is_named(each)}
     exceeded = {name for variable in variables for name in variable.split(' and ')}
-    tones = [each.candidate.log_index for each in causes
-             if each.candidate.cause == 'interference_tone']
+    tones = [each.log_index for each in causes
+             if each.cause == 'interference_tone']
     if any(tones.count(run) >= MAX_PER_LOG['interference_tone'] for run in tones):
         exceeded.add('frequency')
     kept = [each for each in causes
-            if is_named(each.candidate) and CAUSES[each.candidate.cause].along not in exceeded
+            if is_named(each) and CAUSES[each.cause].along not in exceeded
             and _is_repeatable(search, causes, each)]
     unnamed = tuple(each for each in causes if each not in kept
-                    and (not is_named(each.candidate)
-                         or CAUSES[each.candidate.cause].along not in variables))
+                    and (not is_named(each)
+                         or CAUSES[each.cause].along not in variables))
     if len(kept) == len(causes):
         return causes, ()
     left = eliminate_backward(search, refine_jointly(search, (*kept, *unnamed)))
-    keys = {(each.candidate.cause, each.candidate.log_index) for each in kept}
+    keys = {(each.cause, each.log_index) for each in kept}
     return tuple(each for each in left
-                 if (each.candidate.cause, each.candidate.log_index) in keys), unnamed
+                 if (each.cause, each.log_index) in keys), unnamed
 
 
-def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool:
+def _is_repeatable(search: Search, causes: Causes, cause: Candidate) -> bool:
     """Tell whether a cause along a temperature has the same size in all logs within the noise."""
-    candidate, runs = cause.candidate, len(search.problem.replays)
-    if (runs == 1 or CAUSES[candidate.cause].along not in _REPEATING_VARIABLES
-            or candidate.amplitude is not None):
+    runs = len(search.problem.replays)
+    if (runs == 1 or CAUSES[cause.cause].along not in _REPEATING_VARIABLES
+            or cause.amplitude is not None):
         return True
-    alone = [SelectedCause(replace(candidate, log_index=run)) for run in range(runs - 1)]
+    alone = [replace(cause, log_index=run, values=()) for run in range(runs - 1)]
     more = 2.0 * (fit_causes(search.problem, [*causes, *alone]).log_likelihood
                   - fit_causes(search.problem, causes).log_likelihood)
     return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
@@ -555,7 +555,7 @@ def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool
 
 # confirmation
 
-def confirm(search: Search, causes: Causes) -> tuple[Causes, dict[SelectedCause, str]]:
+def confirm(search: Search, causes: Causes) -> tuple[Causes, dict[Candidate, str]]:
     """
     Remove causes that do not predict held-out stretches, or whose intervals include 0.
 
@@ -583,7 +583,7 @@ def prediction_sigmas(log_likelihood_gains: Array) -> float:
             else 0.0)
 
 
-def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[float]:
+def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """
     Return the gain of each cause on held-out stretches in standard deviations.
 
@@ -598,7 +598,7 @@ def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[flo
                               for run, each in enumerate(left)])
     off = np.concatenate(left)
     for place, known in enumerate(causes):
-        if known.candidate.cause == 'reference_slip':
+        if known.cause == 'reference_slip':
             found.append(math.inf)
             continue
         rest = fit_causes(search.problem, [*causes[:place], *causes[place + 1:]])
@@ -617,36 +617,34 @@ def _size_sigmas(search: Search, causes: Causes) -> list[float]:
     for place, known in enumerate(causes):
         sizes = found.coefficients(place) or list(found.shapes(place).values())
         # sine or cosine alone may be 0 for a wave that is not
-        wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
+        wave = len(sizes) == 2 and known.cause != 'reference_slip'
         sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
                       else abs(sizes[0].value) / sizes[0].deviation)
     return sigmas
 
 
 def choose_simplest(search: Search, named: Causes, unnamed: Causes,
-                    ) -> tuple[Causes, list[list[tuple[SelectedCause, float]]]]:
+                    ) -> tuple[Causes, list[list[tuple[Candidate, float]]]]:
     """
     Replace each cause by its simplest alternative.
 
     Return the causes, and for each itself and its alternatives, with deficits in log-likelihood.
 
     """
-    def size(known: SelectedCause) -> int:
+    def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
-        candidate = known.candidate
-        return len(fitted_shape_indices(candidate)) + (
-            0 if candidate.amplitude is not None
-            else len(candidate.columns(search.problem.replays[0])))
+        return len(fitted_shape_indices(known)) + (
+            0 if known.amplitude is not None else len(known.columns(search.problem.replays[0])))
 
     sets = []
     for place in range(len(named)):
-        cause = named[place].candidate.cause
+        cause = named[place].cause
         _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
-        mine = max((step.score for step in steps if step.causes[-1].candidate.cause == cause),
+        mine = max((step.score for step in steps if step.causes[-1].cause == cause),
                    default=np.inf)
         members = [(step.causes[-1], mine - step.score) for step in steps
                    if mine - step.score < RULED_OUT_DEFICIT
-                   and is_named(step.causes[-1].candidate)] or [(named[place], 0.0)]
+                   and is_named(step.causes[-1])] or [(named[place], 0.0)]
         chosen = min((each for each, _ in members), key=size)
         if size(chosen) < size(named[place]):
             named = refine_jointly(search, (*named[:place], chosen, *named[place + 1:]))
