@@ -20,7 +20,7 @@ every cause, the structure is reported as unexplained.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 import math
 
@@ -123,12 +123,13 @@ def smooth_shapes(candidate: Candidate) -> list[int]:
 
 
 def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidate:
-    """Return a candidate with another shape, within the bounds that a model has for it."""
+    """Return a candidate without values with another shape, within the bounds of its effect."""
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
-    return effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
-                            *candidate.shapes[shape_index + 1:], log_index=candidate.log_index,
-                            half_width=candidate.half_width)
+    moved = effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
+                             *candidate.shapes[shape_index + 1:], log_index=candidate.log_index,
+                             half_width=candidate.half_width)
+    return replace(moved, penalty=candidate.penalty)
 
 
 def common_channels(replays: Sequence[Replay]) -> frozenset[str]:

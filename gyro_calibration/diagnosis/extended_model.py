@@ -45,7 +45,7 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student
 
 #: Limits of a plausible scale factor error and its standard deviation.
@@ -337,13 +337,13 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     """
     replays = search.problem.replays
     length = min(HEADING_WINDOW, max(each.duration for each in replays) / 6.0)
-    held_out_masks = [held_out_mask(each, length) for each in replays]
-    if (not any(out.any() for out in held_out_masks)
-            or any(np.count_nonzero(each.valid & ~out) < 20
-                   for each, out in zip(replays, held_out_masks))):
+    blocks = [_held_out_blocks(each, length) for each in replays]
+    if (not any((block >= 0).any() for block in blocks)
+            or any(np.count_nonzero(each.valid & (block < 0)) < 20
+                   for each, block in zip(replays, blocks))):
         return None
     reduced_search = restrict_search(
-        search, [_drop_samples(each, out) for each, out in zip(replays, held_out_masks)], causes,
+        search, [_drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes,
         _REPEATED_ALARM_RATE)
     named = search_causes(reduced_search)
     straight, plain, extended = (
@@ -352,10 +352,9 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     models = {'given': None, 'straight': straight, 'plain': plain, 'extended': extended}
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
     counts: list[tuple[int, int]] = []
-    for run, (each, out) in enumerate(zip(replays, held_out_masks)):
+    for run, (each, block) in enumerate(zip(replays, blocks)):
         left = {name: _rate_residuals(each, run, found) for name, found in models.items()}
-        number = _block_numbers(each, length)
-        for part in (out & (number == place) for place in np.unique(number[out])):
+        for part in (block == place for place in np.unique(block[block >= 0])):
             counts.append((int(np.count_nonzero(part)), 1))
             for name, (of_rate, increments) in left.items():
                 turned = float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
@@ -390,15 +389,12 @@ def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: A
                  for name, each in squares.items() if name != 'straight'})
 
 
-def held_out_mask(replay: Replay, block_duration: float) -> Mask:
-    """Mark the samples that are held out, shape (n,)."""
-    number, time = _block_numbers(replay, block_duration), replay.channels.time
-    count = int((time[-1] - time[0]) / block_duration + 1e-9)
-    return replay.valid & (number % 3 == 1) & (number < count)
-
-
-def _block_numbers(replay: Replay, block_duration: float) -> Array:
-    return np.floor((replay.channels.time - replay.channels.time[0]) / block_duration)
+def _held_out_blocks(replay: Replay, block_duration: float) -> NDArray[np.intp]:
+    """Return the number of the held-out block of each sample, -1 without one, shape (n,)."""
+    since = (replay.channels.time - replay.channels.time[0]) / block_duration
+    number = since.astype(int)
+    held_out = replay.valid & (number % 3 == 1) & (number < int(since[-1] + 1e-9))
+    return np.where(held_out, number, -1)
 
 
 def _drop_samples(replay: Replay, dropped: Mask) -> Replay:

@@ -24,7 +24,7 @@ Axes: g noises, b bands, m coefficients, q columns of a fit, p columns of candid
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -48,6 +48,7 @@ from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.optimize import bisect
 from scipy.special import logsumexp
 
 #: Indices of coefficients.
@@ -393,8 +394,20 @@ def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> Regre
         for shape in smooth_shapes(known) if known.values else ():
             columns.append(_shape_derivative(known, shape, replays, own)[None])
             owners.append((place, -1 - shape))
-    return _fit_columns(problem, distorted, tuple(causes), residual / problem.deviation,
-                        np.concatenate(columns) / problem.deviation, tuple(owners), tuple(widths))
+    whitened, residual = np.concatenate(columns) / problem.deviation, residual / problem.deviation
+    kept = _independent_columns(whitened)
+    of = whitened[kept]
+    information, scores = problem.products(of, of), problem.products(residual[None], of)[:, 0]
+    # of what the values for one noise leave, as the difference of the whole sums is rounded
+    left = residual - np.linalg.solve(information[0], scores[0]) @ of
+    pull = problem.products(left[None], of)[:, 0]
+    squares = problem.squares(left[None])[:, 0] - np.einsum(
+        'gq,gq->g', np.linalg.solve(information, pull[:, :, None])[:, :, 0], pull)
+    determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
+    likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
+    return RegressionFit(problem, distorted, tuple(causes), residual, of,
+                         tuple(owners[place] for place in kept), tuple(widths), information,
+                         scores, squares, likelihood)
 
 
 def _shape_derivative(cause: Candidate, shape_index: int, replays: Sequence[Replay],
@@ -414,26 +427,6 @@ def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
     """Return the amplitude that fits best for a cause whose amplitude is fixed."""
     free = replace(candidate, cause='', amplitude=None)
     return fit_causes(fit.problem, [*fit.causes, free]).coefficients(len(fit.causes))[0].value
-
-
-def _fit_columns(problem: RegressionProblem, distorted: tuple[Replay, ...],
-                 causes: tuple[Candidate, ...], residual: Array, columns: Array,
-                 column_owners: tuple[tuple[int, int], ...],
-                 column_counts: tuple[int, ...]) -> RegressionFit:
-    """Return the fit of a whitened residual to independent columns under each noise."""
-    kept = _independent_columns(columns)
-    of = columns[kept]
-    information, scores = problem.products(of, of), problem.products(residual[None], of)[:, 0]
-    # of what the values for one noise leave, as the difference of the whole sums is rounded
-    left = residual - np.linalg.solve(information[0], scores[0]) @ of
-    pull = problem.products(left[None], of)[:, 0]
-    squares = problem.squares(left[None])[:, 0] - np.einsum(
-        'gq,gq->g', np.linalg.solve(information, pull[:, :, None])[:, :, 0], pull)
-    determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
-    likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
-    return RegressionFit(problem, distorted, causes, residual, of,
-                         tuple(column_owners[place] for place in kept), column_counts, information,
-                         scores, squares, likelihood)
 
 
 def _independent_columns(columns: Array) -> list[int]:
@@ -488,7 +481,7 @@ def column_evidence(fit: RegressionFit, columns: Array,
 # deviations of discontinuous shapes
 
 def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
-    """Return the standard deviation of a shape by the profile of the likelihood."""
+    """Return the standard deviation of a shape by the profile of the likelihood, to 1 %."""
     candidate = fit.causes[cause_index]
     others = fit.causes[:cause_index] + fit.causes[cause_index + 1:]
     shape = candidate.shapes[shape_index]
@@ -498,24 +491,14 @@ def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) ->
         return fit_causes(fit.problem, [*others, moved]).log_likelihood
 
     least = likelihood(0.0) - 0.5 * NORMAL_QUANTILE_975 ** 2
-
-    def is_below_threshold(by: float) -> bool:
-        return likelihood(by) < least
-
     first = fit.problem.replays[0].point_interval if candidate.half_width else 1e-3 * shape
-    return (max(_find_first_true(is_below_threshold, first),
-                _find_first_true(is_below_threshold, -first)) / NORMAL_QUANTILE_975)
-
-
-def _find_first_true(predicate: Callable[[float], bool], first: float) -> float:
-    """Return the distance at which a predicate is first true, to 1 %, by doubling and halving."""
-    near, far = 0.0, first
-    while not predicate(far) and abs(far) < 1e6 * abs(first):
-        near, far = far, 2.0 * far
-    for _ in range(7):
-        middle = 0.5 * (near + far)
-        near, far = (near, middle) if predicate(middle) else (middle, far)
-    return abs(far)
+    ends = []
+    for end in (first, -first):
+        while likelihood(end) >= least and abs(end) < 1e6 * abs(first):
+            end *= 2.0
+        ends.append(abs(bisect(lambda by: likelihood(by) - least, 0.0, end, rtol=0.01)
+                        if likelihood(end) < least else end))
+    return max(ends) / NORMAL_QUANTILE_975
 
 
 # filtered noise
