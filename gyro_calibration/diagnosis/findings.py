@@ -282,9 +282,9 @@ class Diagnosis(Record):
     trace: Trace | None = None
     method: str = ''  # how it was computed, for people; empty for the method of logs in time
     gates: tuple[Gate, ...] = ()  # checks before causes were named
-    reference: Reference | None = None  # of the log; None for several logs or a rate table
     # cause, 'reference' or 'left' -> share in the mean square of the heading error over 60 s
     heading_shares: Mapping[str, float] = field(default_factory=dict)
+    reference: Reference | None = None  # of the log; None for several logs or a rate table
 
     @property
     def verdict(self) -> str:
@@ -298,4 +298,5 @@ class Diagnosis(Record):
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
-        return {'schema': SCHEMA, 'verdict': self.verdict, **super().to_dict()}
+        return {'schema': SCHEMA, 'verdict': self.verdict,
+                'false_alarm_rate': self.false_alarm_rate, **super().to_dict()}
