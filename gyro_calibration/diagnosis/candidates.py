@@ -20,7 +20,7 @@ every cause, the structure is reported as unexplained.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 import math
 
@@ -46,7 +46,7 @@ ColumnFunction = Callable[[Replay], Sequence[Array]]
 
 @dataclass(frozen=True)
 class Candidate:
-    """One cause with its shapes."""
+    """One cause with its shapes; after its selection, also with its values."""
 
     cause: str  # its name
     shapes: tuple[float, ...]  # their values, in the order of the effect
@@ -58,6 +58,9 @@ class Candidate:
     # of the range in which its shape, a time or a frequency, is searched; None for a shape that is
     # searched in logarithms
     half_width: float | None = None
+    # coefficients of its columns; empty before a fit, and its shapes are then fixed
+    values: tuple[float, ...] = ()
+    penalty: float = 0.0  # penalty for the choice of its first shapes, in log-likelihood
 
 
 def candidate_transforms(candidate: Candidate, replays: Sequence[Replay]) -> Array:
@@ -120,12 +123,13 @@ def smooth_shapes(candidate: Candidate) -> list[int]:
 
 
 def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidate:
-    """Return a candidate with another shape, within the bounds that a model has for it."""
+    """Return a candidate without values with another shape, within the bounds of its effect."""
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
-    return effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
-                            *candidate.shapes[shape_index + 1:], log_index=candidate.log_index,
-                            half_width=candidate.half_width)
+    moved = effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
+                             *candidate.shapes[shape_index + 1:], log_index=candidate.log_index,
+                             half_width=candidate.half_width)
+    return replace(moved, penalty=candidate.penalty)
 
 
 def common_channels(replays: Sequence[Replay]) -> frozenset[str]:

@@ -419,14 +419,18 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
                 f'the output is {ratio:.5g} +- {deviation:.2g} times the reference, and '
                 f'{name} is {UNIT_FACTORS[name]:.5g}',
                 () if is_implausible_factor(ratio) else ('scale_factor_error',))]
-    found = DataQuality(tuple(units), notes, has_output, factor)
     if log.time is None:
-        return found
-    found = _check_stamps(found, log, has_output)
-    found = _check_reference(found, log)
+        return DataQuality(tuple(units), notes, has_output, factor)
+    lost, remarks = _check_stamps(log.time, has_output)
+    heading_step, update = _reference_steps(log)
+    if update:
+        remarks.append(f'The reference is updated every {1000.0 * update:.4g} ms, and held in '
+                       'between; it is interpolated.')
     expected = (None if rate is None or line is None
                 else factor * (line.factor * rate + line.offset))
-    return _check_samples(found, compare_output(output * factor, expected), has_output, model, log)
+    found = DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
+                        heading_step=heading_step, update_interval=update)
+    return _check_samples(found, compare_output(output * factor, expected), model, log)
 
 
 def resolve_unit(quality: DataQuality) -> DataQuality:
@@ -452,47 +456,40 @@ def _sized_finding(name: str, value: float, half_width: float, p_value: float, e
         p_value, confounders, evidence=evidence)
 
 
-def _check_stamps(found: DataQuality, log: Log, has_output: Mask) -> DataQuality:
-    """Check the stamps: lost samples are a finding; bursts and clock drift are remarks."""
-    assert log.time is not None
+def _check_stamps(time: Array, has_output: Mask) -> tuple[list[Finding], list[str]]:
+    """Return lost samples as a finding, and remarks on bursts and lost values."""
     without = np.count_nonzero(~has_output)
     remarks = [f'{without} samples have no output, and are left out.'] if without else []
     try:
-        stamps = fit_stamp_grid(log.time)
+        stamps = fit_stamp_grid(time)
     except DataRefused as refused:
-        return replace(found, remarks=(*found.remarks, *remarks,
-                                       f'Lost samples cannot be counted: {refused}.'))
-    found = replace(found, remarks=(*found.remarks, *remarks, *stamps.burst_remarks))
+        return [], [*remarks, f'Lost samples cannot be counted: {refused}.']
+    remarks += stamps.burst_remarks
     lost, steps = stamps.lost_after, np.diff(stamps.time)
-    if not lost.any():
-        return found
     jitter = robust_deviation(steps - np.median(steps)) + 1e-9 * stamps.interval
     late = (lost.max() - 0.5) * stamps.interval / jitter
     chance = min(1.0, len(steps) * float(stats.norm.sf(late)))
-    return found if chance >= FALSE_ALARM_CHANCE else replace(
-        found, findings=(*found.findings,
-                         _sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
-                                        stamps.loss_remarks[0].rstrip('.'))))
+    if not lost.any() or chance >= FALSE_ALARM_CHANCE:
+        return [], remarks
+    return [_sized_finding('dropped_samples', int(lost.sum()), 0.0, chance,
+                           stamps.loss_remarks[0].rstrip('.'))], remarks
 
 
-def _check_reference(found: DataQuality, log: Log) -> DataQuality:
-    """Check the reference for quantization of its heading and for held values."""
+def _reference_steps(log: Log) -> tuple[float, float | None]:
+    """Return the step of a reference heading, rad, and the update interval of a held one, s."""
     assert log.time is not None
-    heading = log.reference_rate is None and log.reference_heading is not None
-    values = log.reference_heading if heading else log.reference_rate
+    is_heading = log.reference_rate is None and log.reference_heading is not None
+    values = log.reference_heading if is_heading else log.reference_rate
     if values is None or np.count_nonzero(np.isfinite(values)) < 3:
-        return found
-    step = encoder_step(values) if heading else 0.0
-    update = update_interval(log.time, values, step)
-    note = [f'The reference is updated every {1000.0 * update:.4g} ms, and held in between; '
-            'it is interpolated.'] if update else []
-    return replace(found, heading_step=step, update_interval=update,
-                   remarks=(*found.remarks, *note))
+        return 0.0, None
+    step = encoder_step(values) if is_heading else 0.0
+    return step, update_interval(log.time, values, step)
 
 
-def _check_samples(found: DataQuality, comparison: OutputComparison, has_output: Mask,
-                   model: GyroModel | None, log: Log) -> DataQuality:
+def _check_samples(found: DataQuality, comparison: OutputComparison, model: GyroModel | None,
+                   log: Log) -> DataQuality:
     """Check the samples of the gyro for quantization, limits, repeats and outliers."""
+    has_output = found.usable
     codes, output = find_codes(comparison.output[has_output]), comparison.output
     limit = find_limit(codes, comparison, FALSE_ALARM_CHANCE)
     at_limit = (np.zeros(len(output), dtype=bool) if limit is None

@@ -22,13 +22,13 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from gyro_calibration.calibration.self_calibration import RunLimits
+from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.data_quality import DataQuality
 from gyro_calibration.diagnosis.findings import Change, Finding, Gain, HeadingCurve
 from gyro_calibration.diagnosis.regression import (
     fit_causes,
     is_single_event,
     RegressionFit,
-    SelectedCause,
 )
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.residuals import NOISE_NAMES
@@ -45,7 +45,7 @@ from gyro_calibration.model.effects import (
 from gyro_calibration.model.gyro_model import GyroModel, have_same_effects, Term
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student
 
 #: Limits of a plausible scale factor error and its standard deviation.
@@ -75,7 +75,7 @@ def extend_model(model: GyroModel | None, fit: RegressionFit, quality: Sequence[
     given = model or GyroModel()
     names = {name for each in findings for name in (each.effect, *each.ambiguous_with)}
     fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
-              or any(each.candidate.cause in CATALOGUE and fit.is_included(place)
+              or any(each.cause in CATALOGUE and fit.is_included(place)
                      for place, each in enumerate(fit.causes)))
     new = add_causes(given, fit, bias_deviation) if fitted else given
     # limit and quantization of the output, if they are findings, from the first log; exact
@@ -161,11 +161,11 @@ def merge_self_calibration(model: GyroModel) -> GyroModel:
                    self_calibration=None)
 
 
-def unmergeable_causes(model: GyroModel, fit: RegressionFit) -> tuple[SelectedCause, ...]:
+def unmergeable_causes(model: GyroModel, fit: RegressionFit) -> tuple[Candidate, ...]:
     """Return the lasting causes of the gyro that cannot be merged with terms of its model."""
     terms, unmergeable = model.terms, []
     for place, known in enumerate(fit.causes):
-        if known.candidate.cause in CATALOGUE and not is_single_event(known):
+        if known.cause in CATALOGUE and not is_single_event(known):
             more = _merge_term(terms, _term_of_cause(fit, place))
             unmergeable += [known] if more is None else []
             terms = more or terms
@@ -201,9 +201,9 @@ def _terms_with_covariance(fit: RegressionFit, bias_deviation: float) -> tuple[l
     terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
     ranks: list[int | None] = [None, None if implausible else fit.estimate_index(-1, 0)]
     for place, known in enumerate(fit.causes):
-        if known.candidate.cause in CATALOGUE and fit.is_included(place):
+        if known.cause in CATALOGUE and fit.is_included(place):
             terms.append(_term_of_cause(fit, place))
-            shapes = len(known.candidate.shapes)
+            shapes = len(known.shapes)
             ranks += [
                 fit.estimate_index(place, -1 - number if number < shapes else number - shapes)
                 for number in range(len(terms[-1].values))]
@@ -217,7 +217,7 @@ def _terms_with_covariance(fit: RegressionFit, bias_deviation: float) -> tuple[l
 
 def _term_of_cause(fit: RegressionFit, cause_index: int) -> Term:
     """Return a cause of the gyro as a term."""
-    candidate = fit.causes[cause_index].candidate
+    candidate = fit.causes[cause_index]
     effect = CATALOGUE[candidate.cause]
     coefficients = ([one.value for one in fit.coefficients(cause_index)]
                     or [candidate.amplitude or 0.0][:len(effect.coefficients)])
@@ -337,25 +337,24 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     """
     replays = search.problem.replays
     length = min(HEADING_WINDOW, max(each.duration for each in replays) / 6.0)
-    held_out_masks = [held_out_mask(each, length) for each in replays]
-    if (not any(out.any() for out in held_out_masks)
-            or any(np.count_nonzero(each.valid & ~out) < 20
-                   for each, out in zip(replays, held_out_masks))):
+    blocks = [_held_out_blocks(each, length) for each in replays]
+    if (not any((block >= 0).any() for block in blocks)
+            or any(np.count_nonzero(each.valid & (block < 0)) < 20
+                   for each, block in zip(replays, blocks))):
         return None
     reduced_search = restrict_search(
-        search, [_drop_samples(each, out) for each, out in zip(replays, held_out_masks)], causes,
+        search, [_drop_samples(each, block >= 0) for each, block in zip(replays, blocks)], causes,
         _REPEATED_ALARM_RATE)
     named = search_causes(reduced_search)
     straight, plain, extended = (
         replace(fit_causes(reduced_search.problem, some), lasting_only=True)
-        for some in ((), [each for each in named if each.candidate.cause == 'time_offset'], named))
+        for some in ((), [each for each in named if each.cause == 'time_offset'], named))
     models = {'given': None, 'straight': straight, 'plain': plain, 'extended': extended}
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
     counts: list[tuple[int, int]] = []
-    for run, (each, out) in enumerate(zip(replays, held_out_masks)):
+    for run, (each, block) in enumerate(zip(replays, blocks)):
         left = {name: _rate_residuals(each, run, found) for name, found in models.items()}
-        number = _block_numbers(each, length)
-        for part in (out & (number == place) for place in np.unique(number[out])):
+        for part in (block == place for place in np.unique(block[block >= 0])):
             counts.append((int(np.count_nonzero(part)), 1))
             for name, (of_rate, increments) in left.items():
                 turned = float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
@@ -390,15 +389,12 @@ def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: A
                  for name, each in squares.items() if name != 'straight'})
 
 
-def held_out_mask(replay: Replay, block_duration: float) -> Mask:
-    """Mark the samples that are held out, shape (n,)."""
-    number, time = _block_numbers(replay, block_duration), replay.channels.time
-    count = int((time[-1] - time[0]) / block_duration + 1e-9)
-    return replay.valid & (number % 3 == 1) & (number < count)
-
-
-def _block_numbers(replay: Replay, block_duration: float) -> Array:
-    return np.floor((replay.channels.time - replay.channels.time[0]) / block_duration)
+def _held_out_blocks(replay: Replay, block_duration: float) -> NDArray[np.intp]:
+    """Return the number of the held-out block of each sample, -1 without one, shape (n,)."""
+    since = (replay.channels.time - replay.channels.time[0]) / block_duration
+    number = since.astype(int)
+    held_out = replay.valid & (number % 3 == 1) & (number < int(since[-1] + 1e-9))
+    return np.where(held_out, number, -1)
 
 
 def _drop_samples(replay: Replay, dropped: Mask) -> Replay:

@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 import math
 from typing import Any, ClassVar, TypeAlias
 
@@ -58,8 +58,7 @@ def _to_data(value: Any) -> Any:
     if isinstance(value, Record):
         return value.to_dict()
     if isinstance(value, Noise):
-        return {name: getattr(value, name)
-                for name in ('angle_random_walk', 'bias_instability', 'rate_random_walk')}
+        return asdict(value)
     if isinstance(value, Mapping):
         return {name: _to_data(each) for name, each in value.items()}
     return list(map(_to_data, value)) if isinstance(value, (tuple, list)) else value
@@ -114,47 +113,28 @@ class Gate(Record):
 
 @dataclass(frozen=True)
 class Finding(Record):
-    """
-    One cause.
-
-    Attributes
-    ----------
-    effect : its name in the catalogue
-    cause : one sentence for people
-    parameters : name -> estimate; for an effect of the model the change of its value, except for
-        noise figures
-    p_value : the probability that a log without it shows as much
-    minimum_detectable : the smallest detectable value of its first parameter, in its unit; None
-        where that has no meaning
-    ambiguous_with : the names of causes that these data cannot rule out instead
-    separate_by : the experiment that would distinguish them; '' without any
-    evidence : one sentence with numbers in units of people
-    along : the variable along which it shows, a key of `Diagnosis.curves`; '' without one
-    status : 'established', or 'suspected' if it is not confirmed on held-out stretches
-    probability : of the cause and of its alternatives, by name; empty if not computed
-    share_of_heading_error : share of the cause in the mean square of the heading error over 60 s;
-        None if not computed
-    where : begin and end, s, of an effect in part of the log; None for the whole log
-    remedy : what to do about it
-
-    """
+    """One cause."""
 
     KEYS = {'along': None}
 
-    effect: str
-    cause: str
+    effect: str  # its name in the catalogue
+    cause: str  # one sentence for people
+    # name -> estimate; for an effect of the model the change of its value, not for noise figures
     parameters: Mapping[str, Estimate]
-    p_value: float
+    p_value: float  # the probability that a log without it shows as much
+    # the smallest detectable value of its first parameter, in its unit; None without a meaning
     minimum_detectable: float | None = None
-    ambiguous_with: tuple[str, ...] = ()
-    separate_by: str = ''
-    evidence: str = ''
-    along: str = ''
-    status: str = 'established'
+    ambiguous_with: tuple[str, ...] = ()  # names of causes that these data cannot rule out instead
+    separate_by: str = ''  # the experiment that would distinguish them; '' without any
+    evidence: str = ''  # one sentence with numbers in units of people
+    along: str = ''  # the variable along which it shows, as in `Diagnosis.curves`; '' without one
+    status: str = 'established'  # or 'suspected', if it is not confirmed on held-out stretches
+    # of the cause and of its alternatives, by name; empty if not computed
     probability: Mapping[str, float] = field(default_factory=dict)
+    # in the mean square of the heading error over 60 s; None if not computed
     share_of_heading_error: float | None = None
-    where: tuple[float, float] | None = None
-    remedy: str = ''
+    where: tuple[float, float] | None = None  # begin and end of an effect in part of the log, s
+    remedy: str = ''  # what to do about it
 
 
 @dataclass(frozen=True)
@@ -185,32 +165,29 @@ class Change(Record):
 
 
 @dataclass(frozen=True)
-class Gain:
-    """
-    Reduction of errors by the extended model on parts held out of selection and fit.
+class Gain(Record):
+    """Reduction of errors by the extended model on parts held out of selection and fit."""
 
-    Attributes
-    ----------
-    held_out : description of the parts
-    rate : errors of the simulated rate, rad/s
-    heading : errors of the simulated change of heading over windows, rad; None if the parts are
-        shorter than a window
-    window : s
-    models : name -> root mean square of the heading error of given, plain (bias, scale factor and
-        delay alone) and extended model, rad
-
-    """
-
-    held_out: str
-    rate: Change
+    held_out: str  # description of the parts
+    rate: Change  # errors of the simulated rate, rad/s
+    # errors of the simulated change of heading over windows, rad; None for shorter parts
     heading: Change | None
-    window: float = 60.0
+    window: float = 60.0  # s
+    # name -> root mean square of the heading error of given, plain (bias, scale factor and delay
+    # alone) and extended model, rad
     models: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def is_worse(self) -> bool:
         """Tell whether the extended model has significantly larger errors."""
         return any(change.is_worse for _, change, _ in self.rows())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as data."""
+        heading = (None if self.heading is None
+                   else {'window_s': self.window, **self.heading.to_dict()})
+        return {'held_out': self.held_out, 'rate_rms': self.rate.to_dict(),
+                'heading_rms': heading, **self.models}
 
     def rows(self) -> list[tuple[str, Change, str]]:
         """Return what was measured before and after, with its unit of SI."""
@@ -282,51 +259,32 @@ class Reference(Record):
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """
-    The results of a diagnosis.
+class Diagnosis(Record):
+    """The results of a diagnosis."""
 
-    Attributes
-    ----------
-    findings : named causes, the strongest first
-    unexplained : structure without a name
-    noise : of the residual
-    simulated : noise of the given model; all 0 without one
-    gain : of the extended model; None if there is nothing to compare
-    before, model : the tested simulation, and the extended one (the same if none is offered)
-    cannot_show : cause -> why these logs cannot show it
-    curves : the residual along each variable
-    heading, noise_curve, trace : for charts
-    remarks : for people, one sentence each
-    false_alarm_rate : per diagnosis
-    logs : names of the files
-    method : how it was computed, for people; empty for the method of logs in time
-    gates : checks before causes were named
-    reference : of the log; None for several logs or a rate table
-    heading_shares : cause, 'reference' or 'left' -> share in the mean square of the heading error
-        over 60 s; empty if not computed
+    KEYS = {'simulated': 'simulated_noise', **dict.fromkeys(
+        ('before', 'model', 'curves', 'heading', 'noise_curve', 'trace', 'method'))}
 
-    """
-
-    findings: tuple[Finding, ...]
-    unexplained: tuple[Unexplained, ...]
-    noise: Noise
-    simulated: Noise
-    gain: Gain | None
-    before: GyroModel
-    model: GyroModel
-    cannot_show: Mapping[str, str] = field(default_factory=dict)
-    curves: Sequence[Curve] = ()
+    findings: tuple[Finding, ...]  # named causes, the strongest first
+    unexplained: tuple[Unexplained, ...]  # structure without a name
+    noise: Noise  # of the residual
+    simulated: Noise  # noise of the given model; all 0 without one
+    gain: Gain | None  # of the extended model; None if there is nothing to compare
+    before: GyroModel  # the tested simulation
+    model: GyroModel  # the extended one; the same if none is offered
+    cannot_show: Mapping[str, str] = field(default_factory=dict)  # cause -> why
+    curves: Sequence[Curve] = ()  # the residual along each variable
     heading: HeadingCurve | None = None
     noise_curve: NoiseCurve | None = None
-    remarks: tuple[str, ...] = ()
-    false_alarm_rate: float = 0.01
-    logs: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # for people, one sentence each
+    false_alarm_rate: float = 0.01  # per diagnosis
+    logs: tuple[str, ...] = ()  # names of the files
     trace: Trace | None = None
-    method: str = ''
-    gates: tuple[Gate, ...] = ()
-    reference: Reference | None = None
+    method: str = ''  # how it was computed, for people; empty for the method of logs in time
+    gates: tuple[Gate, ...] = ()  # checks before causes were named
+    # cause, 'reference' or 'left' -> share in the mean square of the heading error over 60 s
     heading_shares: Mapping[str, float] = field(default_factory=dict)
+    reference: Reference | None = None  # of the log; None for several logs or a rate table
 
     @property
     def verdict(self) -> str:
@@ -340,23 +298,5 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
-        gain = self.gain
-        heading = (None if gain is None or gain.heading is None
-                   else {'window_s': gain.window, **_to_data(gain.heading)})
-        return {
-            'schema': SCHEMA,
-            'verdict': self.verdict,
-            'false_alarm_rate': self.false_alarm_rate,
-            'findings': _to_data(self.findings),
-            'unexplained': _to_data(self.unexplained),
-            'noise': _to_data(self.noise),
-            'simulated_noise': _to_data(self.simulated),
-            'gain': None if gain is None else {
-                'held_out': gain.held_out, 'rate_rms': _to_data(gain.rate),
-                'heading_rms': heading, **gain.models},
-            'cannot_show': dict(self.cannot_show),
-            'remarks': list(self.remarks),
-            'logs': list(self.logs),
-            'gates': _to_data(self.gates),
-            'heading_shares': dict(self.heading_shares),
-            'reference': _to_data(self.reference)}
+        return {'schema': SCHEMA, 'verdict': self.verdict,
+                'false_alarm_rate': self.false_alarm_rate, **super().to_dict()}

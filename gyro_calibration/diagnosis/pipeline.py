@@ -13,12 +13,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.diagnosis.candidates import (
+    Candidate,
     common_channels,
     constant_channels,
     is_named,
@@ -75,7 +76,6 @@ from gyro_calibration.diagnosis.regression import (
     fit_causes,
     is_single_event,
     RegressionFit,
-    SelectedCause,
     SMOOTHED_RATIO,
     Value,
 )
@@ -90,22 +90,17 @@ from gyro_calibration.diagnosis.residuals import (
     residual_curves,
 )
 from gyro_calibration.diagnosis.search import (
-    Causes,
-    choose_simplest,
     complexity_penalty,
-    confirm,
+    confirm_causes,
     evidence_for,
     evidence_threshold,
-    find_suspected,
-    is_lasting,
-    MAX_SLIPS,
     p_value,
     refine_jointly,
+    Scored,
     Search,
     search_causes,
+    Selection,
     start_search,
-    UNPREDICTIVE,
-    withdraw_names,
 )
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, Log, NORMAL_QUANTILE_975
@@ -117,16 +112,11 @@ from scipy.stats import norm
 
 #: Probability that an effect of the minimum detectable size is found.
 _DETECTION_POWER = 0.95
-#: Names of the shape parameters of causes that are not effects of the catalogue.
-_SHAPE_NAMES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MAX_SLIPS)))}
 _SINGLE_EVENT_REMEDY = 'find its cause; it occurs in this log alone, and is not added to the model'
 #: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
                      'specific_force': 'the specific force does not change'}
-
-#: A cause and its alternatives, each with its deficit in log-likelihood.
-Alternatives = Sequence[tuple[SelectedCause, float]]
 
 
 def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None,
@@ -210,15 +200,8 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     if averaged is not search.problem.replays:
         search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
         everything = search_causes(search)
-    named, unnamed = withdraw_names(search, everything)
-    named, removed = confirm(search, named)
-    unconfirmed = [each for each, why in removed.items()
-                   if why == UNPREDICTIVE and is_lasting(each.candidate)]
-    refuted = {each.candidate.cause: why for each, why in removed.items()
-               if each not in unconfirmed}
-    on_progress(None, 'alternatives')
-    named, sets = choose_simplest(search, named, unnamed)
-    found = fit_causes(search.problem, named)
+    selection = confirm_causes(search, everything)
+    found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
     on_progress(None, 'noise figures')
     # without a model, rounding of the output counts only if it is a finding
@@ -228,25 +211,22 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     figures = fit_noise_parameters(found, simulated, rounds)
     noise = figures.noise
     on_progress(None, 'cross-validation')
-    changed = [] if model is None else _model_value_findings(found, model, noise, rate)
-    within = [(known, members) for known, members in zip(named, sets) if known not in out]
+    changed = [] if model is None else list(_model_value_findings(found, model, noise, rate))
+    within = [(known, members) for known, members in zip(found.causes, selection.alternatives)
+              if known not in out]
     lasting = any(not is_single_event(known) for known, _ in within)
     gain = None
     if (lasting or changed) and not is_scale_implausible(found):
-        tried = {each.candidate.cause for _, members in within for each, _ in members}
+        tried = {each.cause for _, members in within for each, _ in members}
         gain = measure_gain(search, tried, model is not None)
     offered = gain is None or not gain.is_worse
     on_progress(None, 'findings')
-    taken = {each.candidate.cause for each in named}
-    doubtful = (tuple(each for each in unconfirmed if each.candidate.cause not in taken)
-                or find_suspected(search, (*named, *unnamed)))
-    findings = [*_cause_findings(search, found, sets, unnamed, doubtful),
-                *_record_findings(quality, changed)]
+    findings = [*_cause_findings(search, found, selection), *_record_findings(quality, changed)]
     if model is not None:
         findings += _noise_findings(figures, model, rate, search.problem.replays)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # without causes that the model has already and that cannot be merged with those
-    inside = replace(fit_causes(search.problem, [each for each in named if each not in out])
+    inside = replace(fit_causes(search.problem, [each for each in found.causes if each not in out])
                      if out else found, lasting_only=True)
     plain = fit_causes(search.problem, [])
     deviation = _mean_bias_deviation(inside, noise)
@@ -262,36 +242,30 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
          for run in range(len(replays))],
         float(np.mean([each.heading_step ** 2 for each in replays])) / 6.0)
     return Diagnosis(tuple(add_remedies(findings, of_heading, after)),
-                     tuple(unexplained_structures(search, found, unnamed)), noise, simulated, gain,
+                     tuple(unexplained_structures(search, found, selection.unnamed)), noise,
+                     simulated, gain,
                      before, after, _untestable_causes(search, logs), residual_curves(left, shown),
                      heading_error_curve(left, shown), allan_curves(found, noise, simulated),
-                     tuple(_remarks(quality, names, found, unnamed, refuted, out, gain, model)),
+                     tuple(_remarks(quality, names, found, selection, out, gain, model)),
                      rate, heading_shares=of_heading)
 
 
-def _cause_findings(search: Search, fit: RegressionFit, alternatives_of: Sequence[Alternatives],
-                    unnamed: Causes, suspected: Causes) -> Iterator[Finding]:
+def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
     """Give the named causes, and the doubtful ones as suspected, each given all named causes."""
-    for place, (known, members) in enumerate(zip(fit.causes, alternatives_of)):
-        others = [(each.candidate.cause, lack)
-                  for each, lack in members if each.candidate.cause != known.candidate.cause]
-        yield cause_finding(
-            search, fit, place, evidence_for(search, (*fit.causes, *unnamed), place), members,
-            next_experiment(known.candidate.cause, others, observed_range(search.problem.replays)))
-    for known in suspected:
-        everything = refine_jointly(search, (*fit.causes, *unnamed, known))
+    for place, members in enumerate(selection.alternatives):
+        evidence = evidence_for(search, (*fit.causes, *selection.unnamed), place)
+        yield cause_finding(search, fit, place, evidence, members)
+    for known in selection.suspected:
+        everything = refine_jointly(search, (*fit.causes, *selection.unnamed, known))
         place = len(everything) - 1
-        yield mark_suspected(cause_finding(
-            search, fit_causes(search.problem, everything), place,
-            evidence_for(search, everything, place), [(everything[-1], 0.0)], ''))
+        yield mark_suspected(cause_finding(search, fit_causes(search.problem, everything), place,
+                                           evidence_for(search, everything, place)))
 
 
 def _record_findings(quality: Sequence[DataQuality], changed: Sequence[Finding]) -> list[Finding]:
     """Return the record findings with the smallest p-value of all logs, and changed values."""
-    best: dict[str, Finding] = {}
-    for each in (each for clean in quality for each in clean.findings):
-        if each.effect not in best or each.p_value < best[each.effect].p_value:
-            best[each.effect] = each
+    best = {each.effect: each for each in sorted(
+        (each for clean in quality for each in clean.findings), key=lambda each: -each.p_value)}
     covered = {name for each in best.values() for name in each.ambiguous_with}
     return [*best.values(), *(each for each in changed if each.effect not in covered)]
 
@@ -304,56 +278,42 @@ def _mean_bias_deviation(fit: RegressionFit, noise: Noise) -> float:
 
 
 def _model_value_findings(fit: RegressionFit, model: GyroModel, noise: Noise,
-                          false_alarm_rate: float) -> list[Finding]:
-    """Return bias and scale factor error as findings if they differ from those of the model."""
-    scale, bias = fit.scale_factor_error, float(np.mean(fit.biases))
-    own = [_model_deviation(model, name) for name in ('bias', 'scale_factor_error')]
+                          false_alarm_rate: float) -> Iterator[Finding]:
+    """Give bias and scale factor error as findings if they differ from those of the model."""
+    own = {name: deviation for name, _, _, deviation in model.estimates()
+           if math.isfinite(deviation)}
     # A bias within the bias instability and random walk of the model is not a finding.
     likely = Noise(noise.angle_random_walk,
                    *(max(getattr(each, name) for each in (noise, model.noise))
                      for name in NOISE_NAMES[1:]))
-    deviations = np.hypot([_mean_bias_deviation(fit, likely), scale.deviation], own)
-    different = []
-    tested = (('bias', bias, float(deviations[0]), ()),
-              ('scale_factor_error', scale.value, float(deviations[1]), ('reference_scale',)))
-    for name, value, deviation, confounders in tested:
-        chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
+    bias = Value(float(np.mean(fit.biases)), _mean_bias_deviation(fit, likely))
+    for name, value, confounders in (
+            ('bias', bias, ()),
+            ('scale_factor_error', fit.scale_factor_error, ('reference_scale',))):
+        deviation = math.hypot(value.deviation, own.get(name, 0.0))
+        chance = float(2.0 * norm.sf(abs(value.value) / deviation)) if deviation > 0.0 else 1.0
         if chance < VALUE_ALARM_SHARE * false_alarm_rate:
-            size = _estimate(Value(value, deviation), CAUSES[name].unit)
-            different.append(make_finding(
-                name, {name: size}, chance, confounders, minimum_detectable=5.4 * deviation,
-                evidence='it adds to the value of the model, '
-                f'{abs(value) / deviation:.3g} sigma from zero'))
-    return different
+            size = _estimate(Value(value.value, deviation), CAUSES[name].unit)
+            yield make_finding(name, {name: size}, chance, confounders,
+                               minimum_detectable=5.4 * deviation,
+                               evidence='it adds to the value of the model, '
+                               f'{abs(value.value) / deviation:.3g} sigma from zero')
 
 
-def _model_deviation(model: GyroModel, name: str) -> float:
-    """Return the standard deviation that a model states for one of its values, or 0."""
-    if model.covariance is None:
-        return 0.0
-    owners = [term.effect.name for term in model.terms for _ in term.fitted_indices]
-    return (float(np.sqrt(model.covariance[owners.index(name), owners.index(name)]))
-            if name in owners else 0.0)
-
-
-def _noise_findings(noise_parameters: NoiseParameters, model: GyroModel, false_alarm_rate: float,
-                    replays: Sequence[Replay]) -> list[Finding]:
-    """Return the noise figures that differ from those of the model and lie outside its bounds."""
-    found, expected = [], model.noise
-    # The steps of an encoder hide white noise.
-    for name in NOISE_NAMES[1:] if any(each.heading_step for each in replays) else NOISE_NAMES:
-        if noise_parameters.p_values.get(name, 1.0) < VALUE_ALARM_SHARE * false_alarm_rate:
-            low, high = model.noise_bounds.get(name, (math.inf, -math.inf))
-            if (noise_parameters.intervals[name][0] <= high
-                    and low <= noise_parameters.intervals[name][1]):
-                continue
-            unit, value = CAUSES[name].unit, getattr(noise_parameters.noise, name)
-            found.append(
-                make_finding(name, {name: Estimate(value, noise_parameters.intervals[name], unit)},
-                             noise_parameters.p_values[name], evidence='the model states '
-                             f'{format_amount(getattr(expected, name), unit, name)}, '
-                             f'the log {format_amount(value, unit, name)}'))
-    return found
+def _noise_findings(figures: NoiseParameters, model: GyroModel, false_alarm_rate: float,
+                    replays: Sequence[Replay]) -> Iterator[Finding]:
+    """Give the noise figures that differ from those of the model and lie outside its bounds."""
+    has_steps = any(each.heading_step for each in replays)  # which hide white noise
+    for name, chance in figures.p_values.items():
+        interval, bounds = figures.intervals[name], model.noise_bounds.get(name)
+        if (chance < VALUE_ALARM_SHARE * false_alarm_rate
+                and not (has_steps and name == NOISE_NAMES[0])
+                and not (bounds and interval[0] <= bounds[1] and bounds[0] <= interval[1])):
+            unit, value = CAUSES[name].unit, getattr(figures.noise, name)
+            yield make_finding(name, {name: Estimate(value, interval, unit)}, chance,
+                               evidence='the model states '
+                               f'{format_amount(getattr(model.noise, name), unit, name)}, '
+                               f'the log {format_amount(value, unit, name)}')
 
 
 def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
@@ -378,19 +338,18 @@ def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
 
 
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: RegressionFit,
-             unnamed: Sequence[SelectedCause], refuted: Mapping[str, str],
-             unmergeable: Sequence[SelectedCause], gain: Gain | None,
+             selection: Selection, unmergeable: Sequence[Candidate], gain: Gain | None,
              model: GyroModel | None) -> Iterator[str]:
     """Give remarks on the records, on withdrawn names, and on the model."""
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    for name in dict.fromkeys(each.candidate.cause for each in unnamed
-                              if is_named(each.candidate)):
-        why = ('there are tones at many frequencies' if name == 'interference_tone'
-               else 'it differs between logs, or other structure lies along the same variable')
-        yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
-    for name, why in refuted.items():
+    reasons = {each.cause: 'there are tones at many frequencies, or it differs between logs, or '
+               'other structure lies along the same variable'
+               for each in selection.unnamed if is_named(each)}
+    reasons |= {each.cause: 'it does not predict held-out stretches, or its size may be 0'
+                for each in selection.refuted}
+    for name, why in reasons.items():
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     scale = fit.scale_factor_error
     own = {term.effect.name for term in ([] if model is None else model.terms)}
@@ -398,12 +357,12 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
                f'{100.0 * scale.deviation:.1g} % is not added to the model: the motion is too '
                'small for the noise of gyro and reference; turn faster, in both directions.')
-    for name in dict.fromkeys(each.candidate.cause for each in unmergeable):
+    for name in dict.fromkeys(each.cause for each in unmergeable):
         remedy = ('; remove that one from the given model, and diagnose again' if name in own
                   else '')
         yield (f'A second {name.replace("_", " ")} is not added to the extended model, as it '
                f'cannot be merged with the first one{remedy}.')
-    for name in dict.fromkeys(each.candidate.cause
+    for name in dict.fromkeys(each.cause
                               for each in fit.causes if is_single_event(each)):
         yield (f'The {name.replace("_", " ")} occurs once: it is not in the extended model, '
                'whose bias is the mean over the logs.')
@@ -414,37 +373,35 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
 # findings
 
 def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence: float,
-                  alternatives: Alternatives, separate_by: str) -> Finding:
+                  alternatives: Sequence[Scored] = ()) -> Finding:
     """Return the finding of a named cause with its evidence and alternatives."""
-    known = fit.causes[cause_index]
-    candidate, name = known.candidate, known.candidate.cause
-    parameters = _cause_parameters(fit, cause_index)
+    known, replays = fit.causes[cause_index], fit.problem.replays
+    name, parameters = known.cause, _cause_parameters(fit, cause_index)
     probability = probabilities(
-        {name: 0.0, **{each.candidate.cause: lack for each, lack in reversed(alternatives)}})
-    confounders = [each.candidate.cause
-                   for each, _ in alternatives if each.candidate.cause != name]
+        {name: 0.0, **{each.cause: lack for each, lack in reversed(alternatives)}})
+    others = [(each.cause, lack) for each, lack in alternatives if each.cause != name]
+    confounders = [other for other, _ in others]
     size = next(iter(parameters.values()))
     deviation = size.deviation
     if name == 'time_offset' and identify_sample_offset(size.estimate, deviation,
-                                                        fit.problem.replays[0].interval):
+                                                        replays[0].interval):
         confounders.append('unit_error')
     # the evidence of a size of n standard deviations is n² / 2
     threshold = evidence_threshold(name, search.rate) + complexity_penalty(known)
     detectable_sigmas = (math.sqrt(2.0 * max(threshold, 0.0))
                          + float(norm.isf(1.0 - _DETECTION_POWER)))
-    log = ('' if candidate.log_index is None or len(fit.problem.replays) == 1
-           else f'in log {candidate.log_index + 1}, ')
+    log = ('' if known.log_index is None or len(replays) == 1
+           else f'in log {known.log_index + 1}, ')
     where = None
     if name == 'bias_step':
-        time = fit.problem.replays[candidate.log_index or 0].channels.time
-        where = candidate.shapes[0], float(time[-1])
+        where = known.shapes[0], float(replays[known.log_index or 0].channels.time[-1])
     elif name == 'reference_slip':
-        where = min(candidate.shapes[1:]), max(candidate.shapes[1:])
+        where = min(known.shapes[1:]), max(known.shapes[1:])
     return make_finding(
-        name, parameters, p_value(name, evidence),
-        tuple(dict.fromkeys(confounders)),
+        name, parameters, p_value(name, evidence), tuple(dict.fromkeys(confounders)),
         minimum_detectable=detectable_sigmas * deviation if deviation > 0.0 else None,
-        separate_by=separate_by or (CAUSES[name].separate_by if confounders else ''),
+        separate_by=(next_experiment(name, others, observed_range(replays))
+                     or (CAUSES[name].separate_by if confounders else '')),
         evidence=(f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0
                   else ''), probability=probability, where=where,
         remedy=_SINGLE_EVENT_REMEDY if is_single_event(known) else '')
@@ -452,28 +409,26 @@ def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence
 
 def _cause_parameters(fit: RegressionFit, cause_index: int) -> dict[str, Estimate]:
     """Return the parameters of a cause, first the one with the name of the cause."""
-    candidate = fit.causes[cause_index].candidate
-    coefficients, shapes = fit.coefficients(cause_index), fit.shapes(cause_index)
-    name, effect = candidate.cause, CATALOGUE.get(candidate.cause)
-    names = (_SHAPE_NAMES.get(name, ()) if effect is None else tuple(
-        parameter.name for parameter in effect.nonlinear_parameters + effect.coefficients))
-    unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
-            else CAUSES[name].units.get(name, '1'))
-    parameters = {}
+    known, coefficients = fit.causes[cause_index], fit.coefficients(cause_index)
+    name, effect = known.cause, CATALOGUE.get(known.cause)
     own = () if effect is None else effect.coefficients
+    unit = own[0].unit if own else CAUSES[name].units.get(name, '1')
+    shapes = ([(shape.name, shape.unit) for shape in effect.nonlinear_parameters + own]
+              if effect is not None else [('width', 's')])
+    parameters = {}
     if len(own) > 1 and [each.name for each in own] != ['sine', 'cosine']:
         parameters = {each.name: _estimate(value, each.unit)
                       for each, value in zip(own, coefficients)}
     elif len(coefficients) == 2 and name != 'reference_slip':
-        parameters = _amplitude_and_phase(fit, cause_index, name, coefficients, unit)
+        parameters = _amplitude_and_phase(fit, cause_index, coefficients, unit)
     elif coefficients:
         parameters = {name: _estimate(coefficients[0], unit)}
-    for number, value in shapes.items():
-        parameters[names[number] if parameters else name] = _estimate(
-            value, 's' if effect is None else effect.parameters[number].unit)
+    for number, value in fit.shapes(cause_index).items():
+        shape, shape_unit = shapes[number]
+        parameters[shape if parameters else name] = _estimate(value, shape_unit)
     if name == 'reference_slip':
-        parameters.update({names[1 + number]: Estimate(at, (at, at), 's')
-                           for number, at in enumerate(candidate.shapes[1:])})
+        parameters.update({f'slip_time_{place}': Estimate(at, (at, at), 's')
+                           for place, at in enumerate(known.shapes[1:])})
     return parameters
 
 
@@ -481,28 +436,28 @@ def _estimate(value: Value, unit: str) -> Estimate:
     return Estimate.from_half_width(value.value, NORMAL_QUANTILE_975 * value.deviation, unit)
 
 
-def _amplitude_and_phase(fit: RegressionFit, cause_index: int, name: str,
-                         coefficients: Sequence[Value], unit: str) -> dict[str, Estimate]:
+def _amplitude_and_phase(fit: RegressionFit, cause_index: int, coefficients: Sequence[Value],
+                         unit: str) -> dict[str, Estimate]:
     """Return amplitude and phase of ``sine sin + cosine cos``, with intervals by covariance."""
     sine, cosine = (value.value for value in coefficients)
-    amplitude, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+    amplitude, phase = math.hypot(sine, cosine), math.atan2(cosine, sine)
     ranks = [rank for rank in (fit.estimate_index(cause_index, number) for number in range(2))
              if rank is not None]
     covariance = fit.covariance[np.ix_(ranks, ranks)]
-    rotation = np.array([[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]])
+    rotation = np.array([[sine, cosine], [-cosine, sine]]) / amplitude
     deviation = np.sqrt(np.diag(rotation @ covariance @ rotation.T))
-    return {name: _estimate(Value(amplitude, float(deviation[0])), unit),
+    return {fit.causes[cause_index].cause: _estimate(Value(amplitude, float(deviation[0])), unit),
             'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
 
 
 def unexplained_structures(search: Search, fit: RegressionFit,
-                           unnamed: Sequence[SelectedCause]) -> list[Unexplained]:
+                           unnamed: Sequence[Candidate]) -> list[Unexplained]:
     """Return the structures without a name with the share of the residual that each explains."""
     causes = (*fit.causes, *unnamed)
     variables: dict[str, list[int]] = {}
     for place, known in enumerate(unnamed):
-        name = (CAUSES[known.candidate.cause].along if is_named(known.candidate)
-                else unnamed_variable(known.candidate))
+        name = (CAUSES[known.cause].along if is_named(known)
+                else unnamed_variable(known))
         variables.setdefault(name, []).append(len(fit.causes) + place)
     least = _residual_variance(search, causes)
     most = _residual_variance(search, fit.causes)
@@ -510,13 +465,13 @@ def unexplained_structures(search: Search, fit: RegressionFit,
     for name, places in variables.items():
         without = _residual_variance(
             search, [known for place, known in enumerate(causes) if place not in places])
-        chance = min(p_value(causes[place].candidate.cause, evidence_for(search, causes, place))
+        chance = min(p_value(causes[place].cause, evidence_for(search, causes, place))
                      for place in places)
         structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return structures
 
 
-def _residual_variance(search: Search, causes: Sequence[SelectedCause]) -> float:
+def _residual_variance(search: Search, causes: Sequence[Candidate]) -> float:
     """Return the variance of the residual of some causes at the grid points."""
     left = fit_causes(search.problem, causes).unbiased_residuals
     return float(np.var(np.concatenate([each.resample(rest) for each, rest

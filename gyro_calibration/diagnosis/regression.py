@@ -24,7 +24,7 @@ Axes: g noises, b bands, m coefficients, q columns of a fit, p columns of candid
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -48,6 +48,7 @@ from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.optimize import bisect
 from scipy.special import logsumexp
 
 #: Indices of coefficients.
@@ -58,16 +59,6 @@ MIN_INDEPENDENT_SHARE = 1e-7
 #: that in the second quarter of the frequencies; of a smoothed record before causes are fitted
 #: (jumps have 0.18, noise not less).
 _MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO, SMOOTHED_RATIO = 0.25, 0.7, 0.05
-
-
-@dataclass(frozen=True)
-class SelectedCause:
-    """A selected cause."""
-
-    candidate: Candidate  # the cause with its shapes
-    # coefficients of its columns; empty before a fit, and its shapes are then fixed
-    values: tuple[float, ...] = ()
-    penalty: float = 0.0  # penalty for the choice of its first shapes, in log-likelihood
 
 
 @dataclass(frozen=True)
@@ -167,7 +158,7 @@ class RegressionFit:
     problem: RegressionProblem  # the logs and noises
     # the logs with the rate that the gyro senses, distorted by causes
     distorted: tuple[Replay, ...]
-    causes: tuple[SelectedCause, ...]  # causes
+    causes: tuple[Candidate, ...]  # causes
     residual: Array  # whitened, less the columns of causes of fixed amplitude, shape (m,)
     # whitened and independent: scale factor error, those of the causes, and derivatives with
     # respect to their shapes, shape (q, m)
@@ -259,8 +250,8 @@ class RegressionFit:
         """Return standard deviations of discontinuous shapes, by cause and index."""
         return {(place, -1 - shape): profile_deviation(self, place, shape)
                 for place, known in enumerate(self.causes)
-                for shape in fitted_shape_indices(known.candidate)
-                if shape not in smooth_shapes(known.candidate)}
+                for shape in fitted_shape_indices(known)
+                if shape not in smooth_shapes(known)}
 
     def estimate_index(self, cause_index: int, number: int) -> int | None:
         """Return the index of a value among the estimates: column from 0, or shape below 0."""
@@ -293,7 +284,7 @@ class RegressionFit:
 
     def shapes(self, cause_index: int) -> dict[int, Value]:
         """Return the fitted shapes of a cause, by their places."""
-        candidate = self.causes[cause_index].candidate
+        candidate = self.causes[cause_index]
         return {place: replace(self._column_value(cause_index, -1 - place),
                                value=candidate.shapes[place])
                 for place in fitted_shape_indices(candidate)}
@@ -305,19 +296,18 @@ class RegressionFit:
         found: dict[str, Array] = {}
         new = replay
         for known in self.causes:
-            if is_rate_distortion(known.candidate.cause):
+            if is_rate_distortion(known.cause):
                 before, new = new, with_distorted_rate(new, [known])
-                found[known.candidate.cause] = new.channels.rate - before.channels.rate
+                found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
         for place, known in enumerate(self.causes):
-            candidate = known.candidate
-            if (is_rate_distortion(candidate.cause) or candidate.log_index not in (None, log_index)
+            if (is_rate_distortion(known.cause) or known.log_index not in (None, log_index)
                     or not self.is_included(place)):
                 continue
-            values = ([candidate.amplitude] if candidate.amplitude is not None
+            values = ([known.amplitude] if known.amplitude is not None
                       else [one.value for one in self.coefficients(place)])
-            for value, column in zip(values, candidate.columns(new)):
-                found[candidate.cause] = found.get(candidate.cause, 0.0) + value * column
+            for value, column in zip(values, known.columns(new)):
+                found[known.cause] = found.get(known.cause, 0.0) + value * column
         return found
 
     def total_contribution(self, replay: Replay, log_index: int) -> Array:
@@ -349,7 +339,7 @@ class RegressionFit:
             if place < 0:
                 parts = [each.channels.rate for each in self.distorted]
             elif number >= 0 and self.is_included(place):
-                parts = [self.causes[place].candidate.columns(each)[number]
+                parts = [self.causes[place].columns(each)[number]
                          for each in self.distorted]
             else:
                 continue
@@ -358,9 +348,9 @@ class RegressionFit:
         return float(means @ self.estimates[1] @ means)
 
 
-def is_single_event(cause: SelectedCause) -> bool:
+def is_single_event(cause: Candidate) -> bool:
     """Tell whether a cause is an effect of the gyro in one log alone: a step or a tone."""
-    return cause.candidate.log_index is not None and cause.candidate.cause in CATALOGUE
+    return cause.log_index is not None and cause.cause in CATALOGUE
 
 
 def is_rate_distortion(name: str) -> bool:
@@ -368,20 +358,20 @@ def is_rate_distortion(name: str) -> bool:
     return name in CATALOGUE and CATALOGUE[name].stage == 'rate'
 
 
-def with_distorted_rate(replay: Replay, causes: Sequence[SelectedCause]) -> Replay:
+def with_distorted_rate(replay: Replay, causes: Sequence[Candidate]) -> Replay:
     """Return a log with the rate that the gyro senses, distorted by causes."""
     rate, time = replay.channels.rate, replay.channels.time
     for known in causes:
-        if is_rate_distortion(known.candidate.cause):
-            distortion = CATALOGUE[known.candidate.cause].distortion
+        if is_rate_distortion(known.cause):
+            distortion = CATALOGUE[known.cause].distortion
             assert distortion is not None
-            rate = distortion(rate, time, *known.candidate.shapes)
+            rate = distortion(rate, time, *known.shapes)
     return replay.with_rate(rate)
 
 
 # fits
 
-def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause]) -> RegressionFit:
+def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> RegressionFit:
     """Fit causes to logs, and the shapes of those that have values to first order."""
     distorted = tuple(with_distorted_rate(each, causes) for each in problem.replays)
     widths = []
@@ -392,66 +382,21 @@ def fit_causes(problem: RegressionProblem, causes: Sequence[SelectedCause]) -> R
     columns, owners = [np.concatenate([each.transform_samples(each.channels.rate)
                                        for each in distorted])[None]], [(-1, 0)]
     for place, known in enumerate(causes):
-        distorts = is_rate_distortion(known.candidate.cause)
+        distorts = is_rate_distortion(known.cause)
         replays = problem.replays if distorts else distorted
-        own = candidate_transforms(known.candidate, replays)
-        widths.append(len(own) if known.candidate.amplitude is None else 0)
-        if known.candidate.amplitude is None:
+        own = candidate_transforms(known, replays)
+        widths.append(len(own) if known.amplitude is None else 0)
+        if known.amplitude is None:
             columns.append(own)
             owners += [(place, number) for number in range(len(own))]
         elif not distorts:
-            residual = residual - known.candidate.amplitude * own[0]
-        for shape in smooth_shapes(known.candidate) if known.values else ():
+            residual = residual - known.amplitude * own[0]
+        for shape in smooth_shapes(known) if known.values else ():
             columns.append(_shape_derivative(known, shape, replays, own)[None])
             owners.append((place, -1 - shape))
-    return _fit_columns(problem, distorted, tuple(causes), residual / problem.deviation,
-                        np.concatenate(columns) / problem.deviation, tuple(owners), tuple(widths))
-
-
-def _shape_derivative(cause: SelectedCause, shape_index: int, replays: Sequence[Replay],
-                      columns: Array) -> Array:
-    """Return the derivative of a cause's contribution with respect to a shape, shape (m,)."""
-    candidate = cause.candidate
-    shape = candidate.shapes[shape_index]
-    # so small that the phase of a wave changes little up to the end of a log
-    step = 1e-7 * (abs(shape) or 1.0)
-    moved = with_shape(candidate, shape_index, shape + step)
-    if moved.shapes[shape_index] == shape:  # at its upper bound
-        moved = with_shape(candidate, shape_index, shape - step)
-    change = np.tensordot(cause.values, candidate_transforms(moved, replays) - columns, 1)
-    return np.asarray(change / (moved.shapes[shape_index] - shape))
-
-
-def add_cause(fit: RegressionFit, candidate: Candidate) -> RegressionFit:
-    """Add a cause to a fit at its present shapes, and keep the other columns."""
-    if is_rate_distortion(candidate.cause):
-        return fit_causes(fit.problem, [*fit.causes, SelectedCause(candidate)])
-    own = candidate_transforms(candidate, fit.distorted) / fit.problem.deviation
-    residual, columns = fit.residual, fit.columns
-    owner, place = fit.column_owners, len(fit.causes)
-    if candidate.amplitude is None:
-        columns = np.concatenate([columns, own])
-        owner = (*owner, *((place, number) for number in range(len(own))))
-    else:
-        residual = residual - candidate.amplitude * own[0]
-    widths = (*fit.column_counts, len(own) if candidate.amplitude is None else 0)
-    return _fit_columns(fit.problem, fit.distorted, (*fit.causes, SelectedCause(candidate)),
-                        residual, columns, owner, widths)
-
-
-def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
-    """Return the amplitude that fits best for a cause whose amplitude is fixed."""
-    free = add_cause(fit, replace(candidate, cause='', amplitude=None))
-    return free.coefficients(len(fit.causes))[0].value
-
-
-def _fit_columns(problem: RegressionProblem, distorted: tuple[Replay, ...],
-                 causes: tuple[SelectedCause, ...], residual: Array, columns: Array,
-                 column_owners: tuple[tuple[int, int], ...],
-                 column_counts: tuple[int, ...]) -> RegressionFit:
-    """Return the fit of a whitened residual to independent columns under each noise."""
-    kept = _independent_columns(columns)
-    of = columns[kept]
+    whitened, residual = np.concatenate(columns) / problem.deviation, residual / problem.deviation
+    kept = _independent_columns(whitened)
+    of = whitened[kept]
     information, scores = problem.products(of, of), problem.products(residual[None], of)[:, 0]
     # of what the values for one noise leave, as the difference of the whole sums is rounded
     left = residual - np.linalg.solve(information[0], scores[0]) @ of
@@ -460,9 +405,28 @@ def _fit_columns(problem: RegressionProblem, distorted: tuple[Replay, ...],
         'gq,gq->g', np.linalg.solve(information, pull[:, :, None])[:, :, 0], pull)
     determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
     likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
-    return RegressionFit(problem, distorted, causes, residual, of,
-                         tuple(column_owners[place] for place in kept), column_counts, information,
+    return RegressionFit(problem, distorted, tuple(causes), residual, of,
+                         tuple(owners[place] for place in kept), tuple(widths), information,
                          scores, squares, likelihood)
+
+
+def _shape_derivative(cause: Candidate, shape_index: int, replays: Sequence[Replay],
+                      columns: Array) -> Array:
+    """Return the derivative of a cause's contribution with respect to a shape, shape (m,)."""
+    shape = cause.shapes[shape_index]
+    # so small that the phase of a wave changes little up to the end of a log
+    step = 1e-7 * (abs(shape) or 1.0)
+    moved = with_shape(cause, shape_index, shape + step)
+    if moved.shapes[shape_index] == shape:  # at its upper bound
+        moved = with_shape(cause, shape_index, shape - step)
+    change = np.tensordot(cause.values, candidate_transforms(moved, replays) - columns, 1)
+    return np.asarray(change / (moved.shapes[shape_index] - shape))
+
+
+def free_amplitude(fit: RegressionFit, candidate: Candidate) -> float:
+    """Return the amplitude that fits best for a cause whose amplitude is fixed."""
+    free = replace(candidate, cause='', amplitude=None)
+    return fit_causes(fit.problem, [*fit.causes, free]).coefficients(len(fit.causes))[0].value
 
 
 def _independent_columns(columns: Array) -> list[int]:
@@ -517,30 +481,24 @@ def column_evidence(fit: RegressionFit, columns: Array,
 # deviations of discontinuous shapes
 
 def profile_deviation(fit: RegressionFit, cause_index: int, shape_index: int) -> float:
-    """Return the standard deviation of a shape by the profile of the likelihood."""
-    candidate = fit.causes[cause_index].candidate
-    others = fit_causes(fit.problem, fit.causes[:cause_index] + fit.causes[cause_index + 1:])
-    least = add_cause(others, candidate).log_likelihood - 0.5 * NORMAL_QUANTILE_975 ** 2
+    """Return the standard deviation of a shape by the profile of the likelihood, to 1 %."""
+    candidate = fit.causes[cause_index]
+    others = fit.causes[:cause_index] + fit.causes[cause_index + 1:]
     shape = candidate.shapes[shape_index]
 
-    def is_below_threshold(by: float) -> bool:
-        return add_cause(others, with_shape(candidate, shape_index,
-                                            shape + by)).log_likelihood < least
+    def likelihood(by: float) -> float:
+        moved = with_shape(candidate, shape_index, shape + by)
+        return fit_causes(fit.problem, [*others, moved]).log_likelihood
 
+    least = likelihood(0.0) - 0.5 * NORMAL_QUANTILE_975 ** 2
     first = fit.problem.replays[0].point_interval if candidate.half_width else 1e-3 * shape
-    return (max(_find_first_true(is_below_threshold, first),
-                _find_first_true(is_below_threshold, -first)) / NORMAL_QUANTILE_975)
-
-
-def _find_first_true(predicate: Callable[[float], bool], first: float) -> float:
-    """Return the distance at which a predicate is first true, to 1 %, by doubling and halving."""
-    near, far = 0.0, first
-    while not predicate(far) and abs(far) < 1e6 * abs(first):
-        near, far = far, 2.0 * far
-    for _ in range(7):
-        middle = 0.5 * (near + far)
-        near, far = (near, middle) if predicate(middle) else (middle, far)
-    return abs(far)
+    ends = []
+    for end in (first, -first):
+        while likelihood(end) >= least and abs(end) < 1e6 * abs(first):
+            end *= 2.0
+        ends.append(abs(bisect(lambda by: likelihood(by) - least, 0.0, end, rtol=0.01)
+                        if likelihood(end) < least else end))
+    return max(ends) / NORMAL_QUANTILE_975
 
 
 # filtered noise

@@ -182,14 +182,9 @@ def _likelihood_interval(bands: BandEnergies, place: int, best: Array,
         return (bands.fit((place, best[place] + shift), best)[1] - min_cost
                 - float(chi2.ppf(0.95, 1)))
 
-    ends = []
-    for shift, unlimited in ((-0.02, -np.inf), (0.02, 12.0)):
-        while abs(shift) < 12.0 and excess(shift) < 0.0:
-            shift *= 2.0
-        ends.append(unlimited if abs(shift) >= 12.0
-                    else brentq(excess, 0.0, shift, xtol=1e-3))
-    return float(np.exp(0.5 * (best[place] + ends[0]))), float(
-        np.exp(0.5 * (best[place] + ends[1])))
+    low, high = ((brentq(excess, 0.0, end, xtol=1e-3) if excess(end) > 0.0 else unlimited)
+                 for end, unlimited in ((-12.0, -np.inf), (12.0, 12.0)))
+    return float(np.exp(0.5 * (best[place] + low))), float(np.exp(0.5 * (best[place] + high)))
 
 
 # curves

@@ -45,7 +45,6 @@ from gyro_calibration.diagnosis.findings import (
     SUSPECTED_RATE_FACTOR,
 )
 from gyro_calibration.diagnosis.regression import (
-    add_cause,
     build_problem,
     column_evidence,
     fit_causes,
@@ -54,8 +53,6 @@ from gyro_calibration.diagnosis.regression import (
     is_rate_distortion,
     RegressionFit,
     RegressionProblem,
-    SelectedCause,
-    with_distorted_rate,
 )
 from gyro_calibration.diagnosis.replay import cosine_transform, inverse_cosine_transform, Replay
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
@@ -92,10 +89,9 @@ STRETCH_COUNT = 64
 #: whose causes are named only if they have the same size in all logs.
 _MIN_REPEAT_CHANCE, _REPEATING_VARIABLES = 1e-3, ('temperature', 'temperature_rate')
 
-#: Why a cause is not named.
-UNPREDICTIVE = 'it does not predict held-out stretches'
-
-Causes = tuple[SelectedCause, ...]
+Causes = tuple[Candidate, ...]
+#: A cause with a log-likelihood: its evidence, the likelihood with it, or its deficit.
+Scored = tuple[Candidate, float]
 
 
 def evidence_threshold(cause: str, rate: float) -> float:
@@ -118,178 +114,129 @@ def p_value(cause: str, evidence: float) -> float:
 
 
 @dataclass(frozen=True)
-class CandidateColumns:
-    """Candidates with their columns, for the rate that the gyro senses."""
-
-    candidates: tuple[Candidate, ...]  # causes with their first shapes
-    groups: tuple[tuple[int, ...], ...]  # indices of the columns of each candidate
-    columns: Array  # whitened, shape (p, m)
-
-    def evidence(self, fit: RegressionFit) -> Array:
-        """Return the evidence of each candidate, less the penalty of columns beyond the first."""
-        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in self.groups])
-        return column_evidence(fit, self.columns, self.groups) - penalty
-
-
-def make_candidate_columns(problem: RegressionProblem, candidates: Sequence[Candidate],
-                           causes: Sequence[SelectedCause] = ()) -> CandidateColumns:
-    """Compute the whitened columns of candidates."""
-    replays = [with_distorted_rate(each, causes) for each in problem.replays]
-    parts = [candidate_transforms(each, replays) / problem.deviation for each in candidates]
-    ends = np.cumsum([len(part) for part in parts]).tolist()
-    groups = tuple(tuple(range(end - len(part), end)) for end, part in zip(ends, parts))
-    return CandidateColumns(tuple(candidates), groups,
-                            np.concatenate([np.empty((0, len(problem.deviation))), *parts]))
-
-
-@dataclass(frozen=True)
-class SearchStep:
-    """A list of causes and its score."""
-
-    causes: Causes
-    score: float
-
-
-@dataclass(frozen=True)
 class Search:
     """State of a search."""
 
     problem: RegressionProblem  # the logs
-    # columns of all candidates without causes that distort the rate
-    candidate_columns: CandidateColumns
+    candidates: tuple[Candidate, ...]  # causes with their first shapes
     rate: float  # false alarms per cause
     # causes that are scanned for over all frequencies or times
     scanned_causes: frozenset[str] = frozenset(MAX_PER_LOG)
     # causes that these logs cannot distinguish from bias and scale factor error
     unidentifiable: frozenset[str] = frozenset()
     # columns_cache, step_cache: caches of columns and of steps, by the named causes
-    columns_cache: dict[tuple[Any, ...], CandidateColumns] = field(default_factory=dict)
-    step_cache: dict[tuple[Any, ...], tuple[SearchStep | None, list[SearchStep]]] = field(
+    columns_cache: dict[tuple[Any, ...], tuple[Array, list[range]]] = field(default_factory=dict)
+    step_cache: dict[tuple[Any, ...], tuple[Candidate | None, list[Scored]]] = field(
         default_factory=dict)
     # is called with None and the name of each step that begins
     on_progress: OnProgress = lambda share, words: None
 
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Return all causes with their first shapes."""
-        return self.candidate_columns.candidates
-
-    def excess_evidence(self, cause: str, evidence: float, rate_factor: float = 1.0) -> float:
-        """Return an evidence less its threshold at so many times the false-alarm rate."""
-        return evidence - evidence_threshold(cause, rate_factor * self.rate)
+    def candidate_evidence(self, fit: RegressionFit) -> Array:
+        """Return the evidence of each candidate, less the penalty of columns beyond the first."""
+        # for the rate that the gyro senses, with shapes to two digits
+        key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
+                    for each in fit.causes if is_rate_distortion(each.cause))
+        if key not in self.columns_cache:
+            for other in self.columns_cache.keys() - {()}:  # one is hundreds of megabytes
+                del self.columns_cache[other]
+            parts = [candidate_transforms(each, fit.distorted) for each in self.candidates]
+            ends = np.cumsum([len(part) for part in parts]).tolist()
+            columns = np.concatenate([np.empty((0, len(self.problem.deviation))), *parts])
+            self.columns_cache[key] = (columns / self.problem.deviation, [
+                range(end - len(part), end) for end, part in zip(ends, parts)])
+        columns, groups = self.columns_cache[key]
+        penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in groups])
+        return column_evidence(fit, columns, groups) - penalty
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
                  on_progress: OnProgress = lambda share, words: None) -> Search:
     """Set up a search: candidates and noises."""
     on_progress(None, 'candidate causes')
-    found = [*propose_candidates(replays), *generic_terms(replays)]
-    problem = build_problem(replays)
-    columns, fit = make_candidate_columns(problem, found), fit_causes(problem, [])
+    found = (*propose_candidates(replays), *generic_terms(replays))
+    problem, places = build_problem(replays), indices_by_cause(found)
+    fit = fit_causes(problem, [])
     if not np.isfinite(fit.noise_log_likelihood).all():
         raise DataRefused('the residual of the simulation is larger than any noise that is tried; '
                           'check columns and units')
-    shown, places = columns.evidence(fit), indices_by_cause(found)
-    unidentifiable = frozenset(
-        cause for cause, own in places.items() if not np.isfinite(shown[own]).any())
-    return Search(problem, columns, rate / len(places), on_progress=on_progress,
-                  unidentifiable=unidentifiable)
+    search = Search(problem, found, rate / len(places), on_progress=on_progress)
+    shown = search.candidate_evidence(fit)
+    return replace(search, unidentifiable=frozenset(
+        cause for cause, own in places.items() if not np.isfinite(shown[own]).any()))
 
 
 def restrict_search(search: Search, replays: Sequence[Replay], causes: Collection[str],
                     rate: float) -> Search:
     """Return a search for some causes in other parts of the logs, with a false-alarm rate."""
-    problem = build_problem(replays)
-    return replace(search, problem=problem, rate=rate, columns_cache={}, step_cache={},
-                   candidate_columns=make_candidate_columns(
-                       problem, [each for each in search.candidates if each.cause in causes]),
-                   scanned_causes=search.scanned_causes & frozenset(causes))
+    return replace(search, problem=build_problem(replays), rate=rate, columns_cache={},
+                   step_cache={}, scanned_causes=search.scanned_causes & frozenset(causes),
+                   candidates=tuple(each for each in search.candidates if each.cause in causes))
 
 
 # one more cause
 
-@dataclass(frozen=True)
-class _ScreenedCandidate:
-    """A candidate: its evidence, and the mean evidence over all first shapes of its cause."""
-
-    candidate: Candidate
-    evidence: float
-    mean_evidence: float
-
-
-def find_strongest(search: Search,
-                   causes: Sequence[SelectedCause]) -> tuple[SearchStep | None, list[SearchStep]]:
+def find_strongest(search: Search, causes: Sequence[Candidate],
+                   ) -> tuple[Candidate | None, list[Scored]]:
     """
     Search for one more cause.
 
-    Return the best step, None if no cause is significant, and all refined steps, the best first;
-    if no cause is significant, those of suspected causes.
+    Return the best cause, None if none is significant, and all that were refined with their
+    log-likelihoods, the best first; if none is significant, those that are suspected.
 
     """
-    key = tuple((each.candidate.cause, each.candidate.log_index, *each.candidate.shapes)
-                for each in causes)
-    if key not in search.step_cache:
-        search.on_progress(None, f'search for causes, {len(causes)} found')
-        search.step_cache[key] = _search_strongest(search, causes)
-    return search.step_cache[key]
-
-
-def _search_strongest(search: Search, causes: Sequence[SelectedCause],
-                      ) -> tuple[SearchStep | None, list[SearchStep]]:
+    key = tuple((each.cause, each.log_index, *each.shapes) for each in causes)
+    if key in search.step_cache:
+        return search.step_cache[key]
+    search.on_progress(None, f'search for causes, {len(causes)} found')
     fit = fit_causes(search.problem, causes)
-    first = _screen_causes(search, fit, causes)
-    significant = [each for each in first if search.excess_evidence(
-        each.candidate.cause, each.mean_evidence) > 0.0]
+    first = _screen_causes(search, fit)
+    significant = [each for each, evidence in first
+                   if p_value(each.cause, evidence - each.penalty) < search.rate]
     if significant:
-        top = max(first, key=lambda each: each.evidence)
-        worth = [each for each in first if (is_named(each.candidate) or each in significant)
-                 and each.evidence > 0.8 * top.evidence - 8.0]
+        top = max(evidence for _, evidence in first)
+        worth = [(each, evidence) for each, evidence in first
+                 if (is_named(each) or each in significant) and evidence > 0.8 * top - 8.0]
     else:
-        worth = [each for each in first if is_lasting(each.candidate) and search.excess_evidence(
-            each.candidate.cause, each.mean_evidence, SUSPECTED_RATE_FACTOR) > 0.0]
-    worth.sort(key=lambda each: -each.evidence)
-    steps = sorted((refine_shape(fit, each.candidate, each.evidence - each.mean_evidence)
-                    for each in worth[:MAX_CONFOUNDERS]), key=lambda step: -step.score)
-    if not significant:
-        return None, steps
-    # The screening fits a free size at the first shape; after refinement a cause may explain less
-    # than its penalty.
-    steps = [step for step in steps if step.score > fit.log_likelihood]
-    return next((step for step in steps if search.excess_evidence(
-        step.causes[-1].candidate.cause, step.score - fit.log_likelihood) > 0.0), None), steps
+        worth = [(each, evidence) for each, evidence in first
+                 if is_lasting(each) and p_value(
+                     each.cause, evidence - each.penalty) < SUSPECTED_RATE_FACTOR * search.rate]
+    worth.sort(key=lambda each: -each[1])
+    steps = sorted((refine_shape(fit, each) for each, _ in worth[:MAX_CONFOUNDERS]),
+                   key=lambda step: -step[1])
+    best = None
+    if significant:
+        # The screening fits a free size at the first shape; after refinement a cause may explain
+        # less than its penalty.
+        steps = [(each, score) for each, score in steps if score > fit.log_likelihood]
+        best = next((each for each, score in steps if p_value(
+            each.cause, score - fit.log_likelihood) < search.rate), None)
+    search.step_cache[key] = best, steps
+    return best, steps
 
 
-def _screen_causes(search: Search, fit: RegressionFit,
-                   causes: Sequence[SelectedCause]) -> list[_ScreenedCandidate]:
-    """Return the best first shape of each cause."""
-    found = _columns_given_causes(search, causes).evidence(fit)
+def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
+    """
+    Return the best first shape of each cause with its evidence.
+
+    Its penalty is the difference to the mean evidence over all first shapes of the cause.
+
+    """
+    found = search.candidate_evidence(fit)
     # A second cause without a free size would only correct the shape of the first.
-    taken = {each.candidate.cause for each in causes if each.candidate.amplitude is not None}
-    first = [_ScreenedCandidate(search.candidates[max(own, key=lambda place: found[place])],
-                                float(found[own].max()),
-                                float(logsumexp(found[own])) - math.log(len(own)))
-             for cause, own in indices_by_cause(search.candidates).items()
-             if cause not in taken and np.isfinite(found[own]).any()]
+    taken = {each.cause for each in fit.causes if each.amplitude is not None}
+    first = []
+    for cause, own in indices_by_cause(search.candidates).items():
+        if cause not in taken and np.isfinite(found[own]).any():
+            best = max(own, key=lambda place: found[place])
+            mean = float(logsumexp(found[own])) - math.log(len(own))
+            first.append((replace(search.candidates[best], penalty=float(found[best]) - mean),
+                          float(found[best])))
     scans = {'interference_tone': find_tones, 'reference_slip': find_slips}
-    return first + [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)
-                    if np.isfinite(each.mean_evidence)]
+    return first + [each for cause in sorted(search.scanned_causes) for each in scans[cause](fit)]
 
 
-def _columns_given_causes(search: Search, causes: Sequence[SelectedCause]) -> CandidateColumns:
-    """Return all candidates for the rate that the gyro senses, with shapes to two digits."""
-    key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes))
-                for each in causes if is_rate_distortion(each.candidate.cause))
-    if not key:
-        return search.candidate_columns
-    if key not in search.columns_cache:
-        search.columns_cache.clear()  # one is hundreds of megabytes
-        search.columns_cache[key] = make_candidate_columns(search.problem, search.candidates,
-                                                           causes)
-    return search.columns_cache[key]
-
-
-def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> SearchStep:
-    """Add a cause with its best shape near the given one, less the penalty for this choice."""
+def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
+    """Return a cause with its best shape near the given one, and the likelihood with it."""
     if fitted_shape_indices(candidate) and candidate.cause != 'reference_slip':
         place = fitted_shape_indices(candidate)[0]
         if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
@@ -303,14 +250,15 @@ def refine_shape(fit: RegressionFit, candidate: Candidate, penalty: float) -> Se
             return with_shape(candidate, place, first + by if half else first * math.exp(by))
 
         half_range = half or _SHAPE_RANGE
-        best = minimize_scalar(lambda by: -add_cause(fit, moved(by)).log_likelihood,
-                               bounds=(-half_range, half_range), method='bounded',
-                               options={'xatol': 4e-3 * half_range, 'maxiter': 14})
+        best = minimize_scalar(
+            lambda by: -fit_causes(fit.problem, [*fit.causes, moved(by)]).log_likelihood,
+            bounds=(-half_range, half_range), method='bounded',
+            options={'xatol': 4e-3 * half_range, 'maxiter': 14})
         candidate = moved(best.x)
-    done = add_cause(fit, candidate)
-    score = (done.log_likelihood - VALUE_PENALTY * max(done.column_counts[-1] - 1, 0) - penalty
-             - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
-    return SearchStep((*fit.causes, SelectedCause(candidate, penalty=penalty)), score)
+    done = fit_causes(fit.problem, [*fit.causes, candidate])
+    return candidate, (
+        done.log_likelihood - VALUE_PENALTY * max(done.column_counts[-1] - 1, 0)
+        - candidate.penalty - (0.0 if is_named(candidate) else UNNAMED_PENALTY))
 
 
 def is_lasting(candidate: Candidate) -> bool:
@@ -327,26 +275,22 @@ def find_suspected(search: Search, selected: Causes) -> Causes:
     """Return one more cause at `SUSPECTED_RATE_FACTOR` times the rate, if there is one."""
     _, steps = find_strongest(search, selected)
     score = fit_causes(search.problem, selected).log_likelihood if steps else 0.0
-    cause_names = {each.candidate.cause for each in selected}
-    for step in steps:
-        found = step.causes[-1]
-        if (is_lasting(found.candidate) and found.candidate.cause not in cause_names
-                and search.excess_evidence(found.candidate.cause, step.score - score,
-                                           SUSPECTED_RATE_FACTOR) > 0.0):
-            return (found,)
-    return ()
+    cause_names = {each.cause for each in selected}
+    return next(((each,) for each, likelihood in steps
+                 if is_lasting(each) and each.cause not in cause_names and p_value(
+                     each.cause, likelihood - score) < SUSPECTED_RATE_FACTOR * search.rate), ())
 
 
 # scans over all frequencies and times
 
 def _logs_to_scan(fit: RegressionFit, cause: str) -> list[int]:
     """Return the logs that may contain one more instance of a cause."""
-    taken = [known.candidate.log_index for known in fit.causes if known.candidate.cause == cause]
+    taken = [known.log_index for known in fit.causes if known.cause == cause]
     return [run
             for run in range(len(fit.problem.replays)) if taken.count(run) < MAX_PER_LOG[cause]]
 
 
-def find_tones(fit: RegressionFit) -> list[_ScreenedCandidate]:
+def find_tones(fit: RegressionFit) -> list[Scored]:
     """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
     found, left = [], fit.whitened_series()
     for run in _logs_to_scan(fit, 'interference_tone'):
@@ -362,11 +306,16 @@ def find_tones(fit: RegressionFit) -> list[_ScreenedCandidate]:
             aliases = np.concatenate([places + frequency, places[1:] - frequency])
             frequency = max(aliases.tolist(), key=lambda at: _amplitude(
                 each, each.channels.output - each.reference, at))
-            most, count = float(power[best]) - VALUE_PENALTY, len(power) * len(left)
-            found.append(_ScreenedCandidate(
+            found.append((replace(
                 effect_candidate('interference_tone', frequency, log_index=run,
-                                 half_width=1.0 / each.duration), most, most - math.log(count)))
-    return [max(found, key=lambda one: one.mean_evidence)] if found else []
+                                 half_width=1.0 / each.duration),
+                penalty=math.log(len(power) * len(left))), float(power[best]) - VALUE_PENALTY))
+    return _best_of_scan(found)
+
+
+def _best_of_scan(found: Sequence[Scored]) -> list[Scored]:
+    return sorted((each for each in found if math.isfinite(each[1])),
+                  key=lambda each: each[1] - each[0].penalty)[-1:]
 
 
 def _amplitude(replay: Replay, values: Array, frequency: float) -> float:
@@ -375,7 +324,7 @@ def _amplitude(replay: Replay, values: Array, frequency: float) -> float:
     return float(2.0 * np.abs(np.mean(values[replay.valid] * wave)))
 
 
-def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
+def find_slips(fit: RegressionFit) -> list[Scored]:
     """Return the clearest jumps of the reference's heading, where it accelerates."""
     found, left = [], fit.whitened_series()
     factors = [own / each for own, each in zip(fit.whitening_factors(), fit.problem.split_by_log(
@@ -388,13 +337,13 @@ def find_slips(fit: RegressionFit) -> list[_ScreenedCandidate]:
             tried = [_fit_slips(each, run, left[run], factors[run], moments,
                                 max(width, 0.5 * each.point_interval)) for width in SLIP_DURATIONS]
             # The largest number indicates a continuous disturbance, not slips.
-            if max(len(one.candidate.shapes) - 1 for one in tried) < MAX_SLIPS:
+            if max(len(slips.shapes) - 1 for slips, _ in tried) < MAX_SLIPS:
                 found += tried
-    return [max(found, key=lambda one: one.mean_evidence)] if found else []
+    return _best_of_scan(found)
 
 
 def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indices: Indices,
-               width: float) -> _ScreenedCandidate:
+               width: float) -> Scored:
     """Return slips of one duration, at least 1 s apart, with evidence for the times scanned."""
     time = np.arange(replay.point_count) * replay.point_interval
     likely = math.log(len(indices) * len(SLIP_DURATIONS))
@@ -414,9 +363,9 @@ def _fit_slips(replay: Replay, log_index: int, white: Array, factor: Array, indi
         if all(abs(at - other) > 1.0 for other in chosen):
             chosen.append(at)
             total += float(value[place])
-    return _ScreenedCandidate(
-        effect_candidate('reference_slip', width, *chosen, log_index=log_index),
-        total + likely * len(chosen), total if chosen else -np.inf)
+    penalty = likely * len(chosen)
+    slips = effect_candidate('reference_slip', width, *chosen, log_index=log_index)
+    return replace(slips, penalty=penalty), total + penalty
 
 
 def _matched_filter(white: Array, whitening_factor: Array, time: Array,
@@ -440,30 +389,28 @@ def search_causes(search: Search) -> Causes:
 
     """
     everything = _select_forward(search)
-    if all(is_named(each.candidate) for each in everything):
+    if all(is_named(each) for each in everything):
         return everything
-    nameable = [each for each in search.candidates if is_named(each)]
-    named = _select_forward(
-        replace(search, candidate_columns=make_candidate_columns(search.problem, nameable),
-                columns_cache={}, step_cache={}))
+    named = _select_forward(replace(search, candidates=tuple(filter(is_named, search.candidates)),
+                                    columns_cache={}, step_cache={}))
     return max((everything, named),
                key=lambda named: fit_causes(search.problem, named).log_likelihood - sum(
                    complexity_penalty(each)
-                   + (0.0 if is_named(each.candidate) else UNNAMED_PENALTY) for each in named))
+                   + (0.0 if is_named(each) else UNNAMED_PENALTY) for each in named))
 
 
 def _select_forward(search: Search) -> Causes:
     """Add causes one by one (forward selection)."""
     named: Causes = ()
     for _ in range(2 * MAX_CAUSES):  # some are removed again
-        step, _ = find_strongest(search, named) if len(named) < MAX_CAUSES else (None, [])
-        if step is None:
+        one_more = find_strongest(search, named)[0] if len(named) < MAX_CAUSES else None
+        if one_more is None:
             break
-        named = eliminate_backward(search, refine_jointly(search, step.causes))
+        named = eliminate_backward(search, refine_jointly(search, (*named, one_more)))
     return named
 
 
-def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> Causes:
+def refine_jointly(search: Search, causes: Sequence[Candidate]) -> Causes:
     """Refine all shapes and values together by Gauss-Newton steps."""
     current = tuple(causes)
     for _ in range(3 if causes else 0):
@@ -472,8 +419,8 @@ def refine_jointly(search: Search, causes: Sequence[SelectedCause]) -> Causes:
     return current
 
 
-def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> SelectedCause:
-    known, candidate = fit.causes[cause_index], fit.causes[cause_index].candidate
+def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> Candidate:
+    candidate = fit.causes[cause_index]
     own = dict(zip(fit.column_owners, fit.estimates[0].tolist()))
     values = tuple(own.get((cause_index, number), 0.0)
                    for number in range(fit.column_counts[cause_index]))
@@ -481,16 +428,16 @@ def _gauss_newton_update(fit: RegressionFit, cause_index: int) -> SelectedCause:
         most = 0.3 * abs(candidate.shapes[shape])
         change = np.clip(own.get((cause_index, -1 - shape), 0.0), -most, most)
         candidate = with_shape(candidate, shape, candidate.shapes[shape] + float(change))
-    return replace(known, candidate=candidate, values=values or (candidate.amplitude or 0.0,))
+    return replace(candidate, values=values or (candidate.amplitude or 0.0,))
 
 
-def complexity_penalty(cause: SelectedCause) -> float:
+def complexity_penalty(cause: Candidate) -> float:
     """Return the penalty of shapes and columns of a cause, in log-likelihood."""
-    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause.candidate)))
+    shapes = max(cause.penalty, VALUE_PENALTY * len(fitted_shape_indices(cause)))
     return shapes + VALUE_PENALTY * max(len(cause.values) - 1, 0)
 
 
-def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: int) -> float:
+def evidence_for(search: Search, causes: Sequence[Candidate], cause_index: int) -> float:
     """Return the evidence for one of the causes given the others."""
     others = [*causes[:cause_index], *causes[cause_index + 1:]]
     return (fit_causes(search.problem, causes).log_likelihood
@@ -501,10 +448,10 @@ def evidence_for(search: Search, causes: Sequence[SelectedCause], cause_index: i
 def eliminate_backward(search: Search, causes: Causes) -> Causes:
     """Remove causes that are not significant given the others, the weakest first."""
     while causes:
-        excess = [search.excess_evidence(each.candidate.cause, evidence_for(search, causes, place))
-                  for place, each in enumerate(causes)]
-        weakest = int(np.argmin(excess))
-        if excess[weakest] > 0.0:
+        chances = [p_value(each.cause, evidence_for(search, causes, place))
+                   for place, each in enumerate(causes)]
+        weakest = int(np.argmax(chances))
+        if chances[weakest] < search.rate:
             break
         causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
     return causes
@@ -520,34 +467,33 @@ def withdraw_names(search: Search, causes: Causes) -> tuple[Causes, Causes]:
     tones, or if a cause along a temperature differs between logs.
 
     """
-    variables = {unnamed_variable(each.candidate)
-                 for each in causes if not is_named(each.candidate)}
+    variables = {unnamed_variable(each)
+                 for each in causes if not is_named(each)}
     exceeded = {name for variable in variables for name in variable.split(' and ')}
-    tones = [each.candidate.log_index for each in causes
-             if each.candidate.cause == 'interference_tone']
+    tones = [each.log_index for each in causes if each.cause == 'interference_tone']
     if any(tones.count(run) >= MAX_PER_LOG['interference_tone'] for run in tones):
         exceeded.add('frequency')
     kept = [each for each in causes
-            if is_named(each.candidate) and CAUSES[each.candidate.cause].along not in exceeded
+            if is_named(each) and CAUSES[each.cause].along not in exceeded
             and _is_repeatable(search, causes, each)]
     unnamed = tuple(each for each in causes if each not in kept
-                    and (not is_named(each.candidate)
-                         or CAUSES[each.candidate.cause].along not in variables))
+                    and (not is_named(each)
+                         or CAUSES[each.cause].along not in variables))
     if len(kept) == len(causes):
         return causes, ()
     left = eliminate_backward(search, refine_jointly(search, (*kept, *unnamed)))
-    keys = {(each.candidate.cause, each.candidate.log_index) for each in kept}
+    keys = {(each.cause, each.log_index) for each in kept}
     return tuple(each for each in left
-                 if (each.candidate.cause, each.candidate.log_index) in keys), unnamed
+                 if (each.cause, each.log_index) in keys), unnamed
 
 
-def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool:
+def _is_repeatable(search: Search, causes: Causes, cause: Candidate) -> bool:
     """Tell whether a cause along a temperature has the same size in all logs within the noise."""
-    candidate, runs = cause.candidate, len(search.problem.replays)
-    if (runs == 1 or CAUSES[candidate.cause].along not in _REPEATING_VARIABLES
-            or candidate.amplitude is not None):
+    runs = len(search.problem.replays)
+    if (runs == 1 or CAUSES[cause.cause].along not in _REPEATING_VARIABLES
+            or cause.amplitude is not None):
         return True
-    alone = [SelectedCause(replace(candidate, log_index=run)) for run in range(runs - 1)]
+    alone = [replace(cause, log_index=run, values=()) for run in range(runs - 1)]
     more = 2.0 * (fit_causes(search.problem, [*causes, *alone]).log_likelihood
                   - fit_causes(search.problem, causes).log_likelihood)
     return bool(chi2.sf(max(more, 0.0), len(cause.values) * len(alone)) > _MIN_REPEAT_CHANCE)
@@ -555,22 +501,41 @@ def _is_repeatable(search: Search, causes: Causes, cause: SelectedCause) -> bool
 
 # confirmation
 
-def confirm(search: Search, causes: Causes) -> tuple[Causes, dict[SelectedCause, str]]:
-    """
-    Remove causes that do not predict held-out stretches, or whose intervals include 0.
+@dataclass(frozen=True)
+class Selection:
+    """The causes that the data support, and what is left of a search."""
 
-    Return the confirmed causes, and the removed ones with the reason.
+    named: Causes  # confirmed, each the simplest of its alternatives
+    # of each named cause, itself included, with deficits in log-likelihood
+    alternatives: Sequence[Sequence[Scored]]
+    unnamed: Causes  # structure without a name, and causes whose names it withdraws
+    suspected: Causes
+    refuted: Causes  # causes that are not confirmed, and not suspected
 
-    """
-    removed = {}
+
+def confirm_causes(search: Search, causes: Causes) -> Selection:
+    """Withdraw names, confirm the others, and take the simplest of what the data allow."""
+    search.on_progress(None, 'alternatives')
+    named, unnamed = withdraw_names(search, causes)
+    named, removed = _remove_unconfirmed(search, named)
+    named, alternatives = choose_simplest(search, named, unnamed)
+    taken = {each.cause for each in named}
+    suspected = tuple(each for each in removed if is_lasting(each) and each.cause not in taken)
+    return Selection(named, alternatives, unnamed,
+                     suspected or find_suspected(search, (*named, *unnamed)),
+                     tuple(each for each in removed if not is_lasting(each)))
+
+
+def _remove_unconfirmed(search: Search, causes: Causes) -> tuple[Causes, Causes]:
+    """Separate causes from those that predict no held-out stretches, or may have the size 0."""
+    removed: Causes = ()
     while causes:
-        predicted = np.array(held_out_sigmas(search, causes)) / MIN_PREDICTION_SIGMAS
-        sizes = np.array(_size_sigmas(search, causes)) / NORMAL_QUANTILE_975
-        weakest = int(np.argmin(np.minimum(predicted, sizes)))
-        if min(predicted[weakest], sizes[weakest]) > 1.0:
+        sigmas = np.minimum(np.array(held_out_sigmas(search, causes)) / MIN_PREDICTION_SIGMAS,
+                            np.array(_size_sigmas(search, causes)) / NORMAL_QUANTILE_975)
+        weakest = int(np.argmin(sigmas))
+        if sigmas[weakest] > 1.0:
             break
-        removed[causes[weakest]] = (UNPREDICTIVE if predicted[weakest] <= 1.0
-                                    else 'the interval of its size includes 0')
+        removed = (*removed, causes[weakest])
         causes = refine_jointly(search, causes[:weakest] + causes[weakest + 1:])
     return causes, removed
 
@@ -583,7 +548,7 @@ def prediction_sigmas(log_likelihood_gains: Array) -> float:
             else 0.0)
 
 
-def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[float]:
+def held_out_sigmas(search: Search, causes: Sequence[Candidate]) -> list[float]:
     """
     Return the gain of each cause on held-out stretches in standard deviations.
 
@@ -598,7 +563,7 @@ def held_out_sigmas(search: Search, causes: Sequence[SelectedCause]) -> list[flo
                               for run, each in enumerate(left)])
     off = np.concatenate(left)
     for place, known in enumerate(causes):
-        if known.candidate.cause == 'reference_slip':
+        if known.cause == 'reference_slip':
             found.append(math.inf)
             continue
         rest = fit_causes(search.problem, [*causes[:place], *causes[place + 1:]])
@@ -617,36 +582,32 @@ def _size_sigmas(search: Search, causes: Causes) -> list[float]:
     for place, known in enumerate(causes):
         sizes = found.coefficients(place) or list(found.shapes(place).values())
         # sine or cosine alone may be 0 for a wave that is not
-        wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
+        wave = len(sizes) == 2 and known.cause != 'reference_slip'
         sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
                       else abs(sizes[0].value) / sizes[0].deviation)
     return sigmas
 
 
-def choose_simplest(search: Search, named: Causes, unnamed: Causes,
-                    ) -> tuple[Causes, list[list[tuple[SelectedCause, float]]]]:
+def choose_simplest(search: Search, named: Causes,
+                    unnamed: Causes) -> tuple[Causes, list[list[Scored]]]:
     """
     Replace each cause by its simplest alternative.
 
     Return the causes, and for each itself and its alternatives, with deficits in log-likelihood.
 
     """
-    def size(known: SelectedCause) -> int:
+    def size(known: Candidate) -> int:
         """Return the number of fitted values of a cause."""
-        candidate = known.candidate
-        return len(fitted_shape_indices(candidate)) + (
-            0 if candidate.amplitude is not None
-            else len(candidate.columns(search.problem.replays[0])))
+        return len(fitted_shape_indices(known)) + (
+            0 if known.amplitude is not None else len(known.columns(search.problem.replays[0])))
 
     sets = []
     for place in range(len(named)):
-        cause = named[place].candidate.cause
+        cause = named[place].cause
         _, steps = find_strongest(search, (*named[:place], *named[place + 1:], *unnamed))
-        mine = max((step.score for step in steps if step.causes[-1].candidate.cause == cause),
-                   default=np.inf)
-        members = [(step.causes[-1], mine - step.score) for step in steps
-                   if mine - step.score < RULED_OUT_DEFICIT
-                   and is_named(step.causes[-1].candidate)] or [(named[place], 0.0)]
+        mine = max((score for each, score in steps if each.cause == cause), default=math.inf)
+        members = [(each, mine - score) for each, score in steps
+                   if mine - score < RULED_OUT_DEFICIT and is_named(each)] or [(named[place], 0.0)]
         chosen = min((each for each, _ in members), key=size)
         if size(chosen) < size(named[place]):
             named = refine_jointly(search, (*named[:place], chosen, *named[place + 1:]))

@@ -20,7 +20,7 @@ from gyro_calibration.diagnosis.extended_model import (
     unmergeable_causes,
 )
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression import build_problem, fit_causes, SelectedCause
+from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.words import headline, is_in_extended_model
 from gyro_calibration.logs.log import Log, write_log
@@ -78,7 +78,7 @@ def on_top(own, found, *shapes, supply=None):
                     covariance=np.diag([1e-10, 1e-8, 1e-12, 1e-12][:2 + len(own.fitted_indices)]))
     log = replace(drive(), supply=supply)
     laid = replay(log, np.ones(len(log), dtype=bool), np.random.default_rng(3), model=model)
-    named = [SelectedCause(effect_candidate(found, *shapes), (1e-4,))]
+    named = [replace(effect_candidate(found, *shapes), values=(1e-4,))]
     return model, fit_causes(build_problem([laid]), named)
 
 
@@ -105,7 +105,7 @@ def test_the_extended_model_says_what_model_and_finding_say_together(own, found,
     assert (not unmergeable_causes(model, outcome) and new.output_from_channels(
         channels.with_rate(rate, rate)) == pytest.approx(together, abs=1e-12))
     # how well the error is known is what the model, the bias and the finding say of it
-    columns = np.array([rate, *(outcome.causes[0].candidate.columns(laid))])
+    columns = np.array([rate, *(outcome.causes[0].columns(laid))])
     own_rows, rows = (
         np.array([row + 0.0 * rate for each in terms for row in each.sensitivity(channels)])
         for terms in (model.terms, new.terms))
@@ -130,7 +130,7 @@ def test_delays_and_paces_of_clocks_add_up(name, own, found):
 def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, own, shape):
     model, outcome = on_top(term(name, *own), name, shape)
     (out,) = unmergeable_causes(model, outcome)
-    assert out.candidate.cause == name
+    assert out.cause == name
     assert not unmergeable_causes(GyroModel(), outcome)
 
 

@@ -85,4 +85,4 @@ FIGURES = NoiseParameters(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3
     ({'angle_random_walk': (0.9e-3, 1.04e-3)}, 1)], ids=['none', 'wide', 'narrow'])
 def test_noise_within_the_bounds_of_a_model_is_no_finding(bounds, found):
     model = GyroModel(noise=Noise(1e-3), noise_bounds=bounds)
-    assert len(_noise_findings(FIGURES, model, 0.01, ())) == found
+    assert len(list(_noise_findings(FIGURES, model, 0.01, ()))) == found

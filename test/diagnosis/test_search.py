@@ -22,7 +22,7 @@ from gyro_calibration.diagnosis.candidates import (
     propose_candidates,
 )
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression import build_problem, fit_causes, SelectedCause
+from gyro_calibration.diagnosis.regression import build_problem, fit_causes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import (
     evidence_for,
@@ -87,7 +87,7 @@ def test_a_set_is_reported_beside_a_cause_of_many_values(both):
     ('~time', 8e-4 * np.exp(-0.5 * ((TIME - 150.0) / 8.0) ** 2), 10)])
 def test_what_may_be_anywhere_pays_for_the_places_to_the_end(cause, added, places):
     search, named = found_in([laid(resting(added))])
-    assert [each.candidate.cause for each in named] == [cause]
+    assert [each.cause for each in named] == [cause]
     assert evidence_for(search, named, 0) < gained(search, named) - math.log(places)
 
 
@@ -141,8 +141,8 @@ def test_a_tone_above_what_is_searched_has_its_own_frequency_and_size():
     each = laid(resting(tone(1e-3, 30.0, time), time))
     assert each.decimation == 2
     _, named = found_in([each])
-    assert [known.candidate.cause for known in named] == ['interference_tone']
-    assert (named[0].candidate.shapes[0] == pytest.approx(30.0, abs=1e-3)
+    assert [known.cause for known in named] == ['interference_tone']
+    assert (named[0].shapes[0] == pytest.approx(30.0, abs=1e-3)
             and math.hypot(*named[0].values) == pytest.approx(1e-3, rel=0.05))
 
 
@@ -172,8 +172,8 @@ LATE = (TIME >= 200.0) & (TIME < 300.0)
 
 def test_a_step_is_found_where_the_kept_samples_begin_late():
     search, named = found_in([laid(resting(6e-4 * (TIME >= 261.0)), LATE)])
-    assert [known.candidate.cause for known in named] == ['bias_step']
-    assert named[0].candidate.shapes[0] == pytest.approx(261.0, abs=2.0)
+    assert [known.cause for known in named] == ['bias_step']
+    assert named[0].shapes[0] == pytest.approx(261.0, abs=2.0)
     moments = [each.shapes[0]
                for each in search.candidates if each.cause in ('bias_step', '~time')]
     assert moments and 200.0 < min(moments) < max(moments) < 300.0
@@ -202,7 +202,7 @@ def test_columns_that_nearly_depend_on_each_other_leave_a_positive_residual():
         3).standard_normal(len(time)) + (time / 21.0) ** 3)
     powers = Candidate('~time', (), lambda each: [
         (each.channels.time / 21.0) ** power for power in range(1, 20)])
-    fit = fit_causes(build_problem([laid(log)]), [SelectedCause(powers)])
+    fit = fit_causes(build_problem([laid(log)]), [powers])
     assert (fit.residual_squares > 0.0).all()
     units = fit.columns / np.linalg.norm(fit.columns, axis=1)[:, None]
     assert np.linalg.svd(units, compute_uv=False)[-1] ** 2 > 0.5e-9
