@@ -208,9 +208,8 @@ class Calibration:
         gain, total = float(np.sum((new_basis.T @ white) ** 2)), float(white @ white)
         share = 1.0 - (total - gain) / freedom / max(total / (freedom + count), 1e-300)
         # Columns in their own unit, for the covariance of the dwells may be another one.
-        plain = [np.apply_along_axis(whitener.restore, 0, each)
-                 for each in (known_basis, new_basis)]
-        uncertain = Uncertainty.from_fit(self.used, self.scatter, np.column_stack(plain), error)
+        plain = whitener.restore(np.column_stack([known_basis, new_basis]))
+        uncertain = Uncertainty.from_fit(self.used, self.scatter, plain, error)
         of_model = new_basis.T @ whitener.whiten(self.given_errors)
         values = uncertain.offsets[:, -count:]
         covariances = uncertain.covariances[:, -count:, -count:] + of_model @ of_model.T
