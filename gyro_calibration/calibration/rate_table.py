@@ -592,30 +592,21 @@ def equal_bins(values: Array, max_bins: int) -> Iterator[tuple[float, float, Mas
 @dataclass(frozen=True)
 class TurnErrors:
     """
-    Errors of full turns, counter-clockwise positive as the heading is, each array of shape (n,).
+    Errors of full turns, counter-clockwise positive as the heading is.
 
     Attributes
     ----------
-    rate : true rate of the turn, rad/s
-    temperature : degC; None where the log holds none
-    static : with the static bias only, rad per turn
-    modelled : with the model, and the static bias after it, rad per turn
-    sweep : that the turn was measured in
-    location : of each turn in its file
+    turns : their dwells
+    static : with the static bias only, rad per turn, shape (n,)
+    modelled : with the model, and the static bias after it, rad per turn, shape (n,)
     remarks : on the source of the static bias, and on turns without an error, one sentence each
 
     """
 
-    rate: Array
-    temperature: Array | None
+    turns: Dwells
     static: Array
     modelled: Array
-    sweep: Numbers
-    location: tuple[str, ...]
     remarks: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.rate)
 
 
 def compute_turn_errors(dwells: Dwells, rate: Array,
@@ -657,8 +648,7 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     remarks = [remark]
     if lost:
         remarks.append(f'{lost} turns are left out: the other sweeps do not determine the model')
-    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.location,
-                      tuple(remarks))
+    return TurnErrors(turns, static, modelled, tuple(remarks))
 
 
 #: Number of a sweep -> the dwells that determine its static bias, and their weights.
@@ -699,15 +689,3 @@ def _find_nearest(dwells: Dwells, turns: Dwells,
     return [rests[min(rests, key=lambda number: (
         number != sweep, abs(of_rest[number] - temperature), abs(number - sweep)))]
         for sweep, temperature in zip(turns.sweep.tolist(), at.tolist())]
-
-
-class ErrorSummary(NamedTuple):
-    """Root mean square and largest absolute value of errors, rad per turn."""
-
-    rms: float
-    largest: float
-
-
-def summarize_errors(errors: Array) -> ErrorSummary:
-    """Return how large some errors are, shape (n,) with n above 0."""
-    return ErrorSummary(rms(errors), float(np.abs(errors).max()))
