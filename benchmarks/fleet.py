@@ -96,7 +96,7 @@ def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
             found = pooled.components
             for name, value in true.items():
                 held[name].append(found[name].low <= value <= found[name].high)
-            estimates.append([found[name].estimate for name in true])
+            estimates.append([found[name].value for name in true])
             for name, wanted, value in (
                     ('mean', {}, np.array([3.0])),
                     ('unit', {'unit': np.arange(units)}, values),

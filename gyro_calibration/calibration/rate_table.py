@@ -44,17 +44,42 @@ from gyro_calibration.calibration.scatter import (
 )
 from gyro_calibration.calibration.self_calibration import refuse_scale
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
-from gyro_calibration.model.effects import Channels, Effect
+from gyro_calibration.model.effects import (
+    Channels,
+    CUBIC_NONLINEARITY,
+    Effect,
+    SINE_RESPONSE,
+)
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.stats import f as fisher
 
 #: Beyond this condition number of the columns, each of length one, the effects are not separable.
 MAX_CONDITION_NUMBER = 1e3
+#: Two effects that explain nearly the same -> the other one.
+CONFOUNDERS = {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}
 #: rad/s; the error of slower turns is mostly bias, not scale; as published.
 MIN_TURN_RATE = 5.0 * DEGREE
 #: A dwell that turns slower than this is a rest.
 MAX_REST_RATE = 0.1 * DEGREE
+
+
+class ColumnTest(NamedTuple):
+    """
+    How much columns explain of the errors of dwells.
+
+    Attributes
+    ----------
+    p_value : that errors without them are explained as well
+    gain : reduction of the sum of the whitened squared residuals
+    share : of the variance, from 0 to 1
+
+    """
+
+    p_value: float
+    gain: float
+    share: float
 
 
 @dataclass(frozen=True)
@@ -66,6 +91,8 @@ class Calibration:
     ----------
     terms : effects with their values
     dwells : all of them
+    given : the model that is corrected; an ideal gyro where there is none. Its effects that are
+        not fitted count as known
     scatter : of the dwells, and which were fitted
     residual : error of each dwell that the effects do not explain, rad/s, shape (n,)
     left_out_residual : the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at
@@ -79,6 +106,7 @@ class Calibration:
 
     terms: tuple[Term, ...]
     dwells: Dwells
+    given: GyroModel
     scatter: Scatter
     residual: Array
     left_out_residual: Array
@@ -100,8 +128,8 @@ class Calibration:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Return the distribution of the fitted values, of more dwells than there are values."""
-        return Uncertainty.from_fit(self.used, self.scatter,
-                                    *_linearize_output(self.used, self.terms))
+        return Uncertainty.from_fit(self.used, self.scatter, *_linearize_output(
+            self.used, self.terms, self.residual[self.scatter.inliers]))
 
     @cached_property
     def model(self) -> GyroModel:
@@ -136,53 +164,106 @@ class Calibration:
         assert self.model.covariance is not None
         return math.sqrt(float(np.diag(self.model.covariance)[self.last_index(effect)]))
 
-    def p_value(self, effect: Effect, change: Array | None = None,
-                by_model: Array | None = None) -> float:
+    def refit(self, effects: Sequence[Effect]) -> Calibration:
+        """Fit other effects to the same dwells; raise `DataRefused` where that is not possible."""
+        return (self if tuple(effects) == self.effects
+                else fit_effects(self.dwells, effects, self.scatter, self.given))
+
+    def p_value(self, effect: Effect) -> float:
+        """Return the two-sided p-value of an effect, or of its change from the given model."""
+        # the whole effect, not its derivative by a shape, which vanishes near zero for a sine
+        change = self.change(effect)
+        others = [each for each in self.terms if each.effect is not effect]
+        return self.test(change[:, None], sensitivity_columns(self.used, others), change).p_value
+
+    def change(self, effect: Effect) -> Array:
+        """Return the error of an effect less that of the given model, of fitted dwells, rad/s."""
+        channels, zeros = channels_of(self.used), np.zeros(len(self.used))
+        new, = (term.error(channels) for term in self.terms if term.effect is effect)
+        replaced = replaced_term(self.given, effect)
+        return zeros + new - (zeros if replaced is None else replaced.error(channels))
+
+    def test(self, columns: Array, known: Array, unexplained: Array | float = 0.0) -> ColumnTest:
         """
-        Return the two-sided p-value of an effect.
+        Test whether columns explain the errors of the fitted dwells, given other columns.
+
+        It is an F test, averaged over what the scatter may be, in addition to the uncertainty of
+        the given model.
 
         Parameters
         ----------
-        effect : of the fit
-        change : of the error of each fitted dwell, rad/s, shape (n,), that is put to the test;
-            None for the whole effect
-        by_model : errors of the dwells by those of a given model's values, rad/s, shape (n, k)
+        columns : that are tested, shape (n, m)
+        known : of other values that are fitted, shape (n, k)
+        unexplained : error in addition to the residual, rad/s, shape (n,)
 
         """
-        others = [each for each in self.terms if each.effect is not effect]
-        if change is None:
-            # the whole effect, not its derivative by a shape, which vanishes near zero for a sine
-            change = sum(term.error(channels_of(self.used)) for term in self.terms
-                         if term.effect is effect) + np.zeros(len(self.used))
-        columns = sensitivity_columns(self.used, others)
-        left = change - columns @ np.linalg.lstsq(columns, change, rcond=None)[0]
+        whitener, error = Whitener(self.used, self.scatter), (
+            self.residual[self.scatter.inliers] + unexplained)
+        known_basis, white, new = _beside(*map(whitener.whiten, (known, error, columns)))
         # a sine may have its zeros at the rates of all dwells
-        if not self.dof or np.linalg.norm(left) <= 1e-9 * np.linalg.norm(change):
-            return 1.0
-        columns = np.column_stack([columns, change])
-        uncertainty = Uncertainty.from_fit(self.used, self.scatter, columns,
-                                           self.residual[self.scatter.inliers])
-        share = 1.0  # of the deviation of the last value that is due to the dwells
-        if by_model is not None:
-            whitener = Whitener(self.used, self.scatter)
-            inverse = np.linalg.pinv(
-                whitener.whiten(columns / np.linalg.norm(columns, axis=0)))[-1]
-            other = inverse @ whitener.whiten(by_model)
-            share = math.sqrt(inverse @ inverse / (inverse @ inverse + other @ other))
-        below = float(uncertainty.probability_below(-share)[-1])
-        return 2.0 * min(below, 1.0 - below)
+        new_basis = _orthonormal_columns(new, 1.0 / MAX_CONDITION_NUMBER)
+        count, freedom = new_basis.shape[1], len(white) - known_basis.shape[1] - new_basis.shape[1]
+        if not count or freedom < 1:
+            return ColumnTest(1.0, 0.0, 0.0)
+        gain, total = float(np.sum((new_basis.T @ white) ** 2)), float(white @ white)
+        share = 1.0 - (total - gain) / freedom / max(total / (freedom + count), 1e-300)
+        # Columns in their own unit, for the covariance of the dwells may be another one.
+        plain = whitener.restore(np.column_stack([known_basis, new_basis]))
+        uncertain = Uncertainty.from_fit(self.used, self.scatter, plain, error)
+        of_model = new_basis.T @ whitener.whiten(self.given_errors)
+        values = uncertain.offsets[:, -count:]
+        covariances = uncertain.covariances[:, -count:, -count:] + of_model @ of_model.T
+        squares = np.einsum('ki,ki->k', values,
+                            np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
+        chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.dof))
+        return ColumnTest(chance, gain, min(max(share, 0.0), 1.0))
+
+    def gains(self, columns: Array, known: Array, unexplained: Array) -> Array:
+        """Return the gain of each column alone, shape (m,), with the arguments of `test`."""
+        whitener, error = Whitener(self.used, self.scatter), (
+            self.residual[self.scatter.inliers] + unexplained)
+        _, white, new = _beside(*map(whitener.whiten, (known, error, columns)))
+        lengths = np.linalg.norm(new, axis=0)
+        new = new / np.where(lengths > 1.0 / MAX_CONDITION_NUMBER, lengths, math.inf)
+        return np.asarray((new.T @ white) ** 2)
+
+    @cached_property
+    def given_errors(self) -> Array:
+        """
+        Return what errors of the given model's values do to the fitted dwells, rad/s.
+
+        Each of one standard deviation, and independent, shape (n, k); none where they are unknown.
+
+        """
+        known, covariance = static_terms(self.given), self.given.covariance
+        if covariance is None:
+            return np.empty((len(self.used), 0))
+        chosen = [place for place, owner in enumerate(value_owners(self.given.terms))
+                  if owner in known]
+        sizes, directions = np.linalg.eigh(covariance[np.ix_(chosen, chosen)])
+        return (sensitivity_columns(self.used, known, self.given.reference_temperature)
+                @ (directions * np.sqrt(np.maximum(sizes, 0.0))))
+
+    def prediction_covariance(self, dwells: Dwells) -> Array:
+        """Return the covariance of the errors of other dwells, of one sweep, (rad/s)², (n, n)."""
+        rows, shared = sensitivity_columns(dwells, self.terms), self.scatter.sweep_columns(dwells)
+        of_fit = 0.0 if self.model.covariance is None else rows @ self.model.covariance @ rows.T
+        return np.asarray(of_fit + np.diag(self.scatter.deviation(dwells) ** 2)
+                          + shared @ shared.T)
 
     @property
     def min_non_monotonic_rate(self) -> float | None:
         """
-        Return the slowest rate of a dwell, rad/s, at which the output no longer grows with it.
+        Return the slowest rate of the range, rad/s, at which the output no longer grows with it.
 
         None where the output always grows with the rate.
 
         """
-        steepness = GyroModel(self.terms).output_slope(channels_of(self.dwells))
-        folded = np.broadcast_to(steepness <= 0.1, len(self.dwells))
-        return float(np.abs(self.dwells.rate[folded]).min()) if folded.any() else None
+        # also between the rates of the dwells, where a fast sine would hide
+        rate = np.linspace(self.dwells.rate.min(), self.dwells.rate.max(), 1000)
+        channels = Channels(rate, rate, self.given.reference_temperature)
+        folded = np.broadcast_to(GyroModel(self.terms).output_slope(channels) <= 0.1, len(rate))
+        return float(np.abs(rate[folded]).min()) if folded.any() else None
 
     @property
     def uncorrected_rms(self) -> float:
@@ -217,17 +298,35 @@ class Calibration:
         return float(np.mean(sum_by_part(squares, parts) / np.bincount(parts)))
 
 
-def channels_of(dwells: Dwells) -> Channels:
-    """Return the inputs of the effects."""
-    temperature = (np.full(len(dwells), np.nan) if dwells.temperature is None
-                   else dwells.temperature)
-    return Channels(dwells.rate, dwells.output, temperature)
+def channels_of(dwells: Dwells, temperature: float = math.nan) -> Channels:
+    """Return the inputs of the effects, at a temperature, degC, where the dwells have none."""
+    return Channels(dwells.rate, dwells.output, np.full(len(dwells), temperature)
+                    if dwells.temperature is None else dwells.temperature,
+                    np.arange(1.0, len(dwells) + 1.0))
+
+
+def value_owners(terms: Sequence[Term]) -> list[Term]:
+    """Return the term of each fitted value, in the order of a covariance."""
+    return [term for term in terms for _ in term.fitted_indices]
+
+
+def static_terms(model: GyroModel) -> list[Term]:
+    """Return the effects of a model that dwells show: those of rate, output and temperature."""
+    return [term for term in model.terms
+            if term.effect.inputs <= {'rate', 'output', 'temperature'}
+            and term.effect.distortion is None]
+
+
+def replaced_term(model: GyroModel, effect: Effect) -> Term | None:
+    """Return the term of a model in place of which an effect is fitted, or its confounder's."""
+    terms = {term.effect: term for term in model.terms}
+    return terms.get(effect) or terms.get(CONFOUNDERS.get(effect, effect))
 
 
 # the fit
 
 def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | None = None,
-                reference_temperature: float | None = None) -> Calibration:
+                given: GyroModel | None = None) -> Calibration:
     """
     Fit effects to dwells by generalised least squares, solved by QR.
 
@@ -240,7 +339,8 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     dwells : of a rate table or a log
     effects : each once
     scatter : of the dwells, if it is known already
-    reference_temperature : that temperatures count from, degC; default: the mean
+    given : model that is corrected: its effects are known, unless they, or their confounders, are
+        among the fitted ones. Temperatures count from its reference temperature, or the mean
 
     Raises
     ------
@@ -249,11 +349,10 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     """
     _refuse_unobservable(dwells, effects)
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
-    if reference_temperature is None:
-        reference_temperature = round(float(temperature.mean()), 1)
+    given = given or GyroModel(reference_temperature=round(float(temperature.mean()), 1))
     # conventions are final; shapes and coefficients are fitted
     conventions = {
-        'reference_temperature': reference_temperature,
+        'reference_temperature': given.reference_temperature,
         'output_centre': 0.5 * float(dwells.output.max() + dwells.output.min()),
         'output_scale': 0.5 * float(np.ptp(dwells.output)) or 1.0,
         'temperature_centre': 0.5 * float(temperature.max() + temperature.min()),
@@ -262,9 +361,14 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     terms = tuple(
         Term(effect, tuple(conventions.get(parameter.name, parameter.default or 0.0)
                            for parameter in effect.parameters)) for effect in effects)
-    scatter = scatter or estimate_scatter(dwells)
-    used = select_dwells(dwells, scatter.inliers)
-    values = sum(len(term.fitted_indices) for term in terms)
+    channels, known = channels_of(dwells, given.reference_temperature), static_terms(given)
+    scatter = scatter or estimate_scatter(replace(dwells, output=dwells.output - sum(
+        term.error(channels) for term in known)))
+    replaced = [replaced_term(given, effect) for effect in effects]
+    rest = replace(dwells, output=dwells.output - sum(
+        term.error(channels) for term in known if term not in replaced))
+    used = select_dwells(rest, scatter.inliers)
+    values = len(value_owners(terms))
     if len(used) < values:
         raise DataRefused(f'{len(used)} dwells do not determine {values} values; '
                           'add dwells, or fit fewer effects')
@@ -275,7 +379,7 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     left_out, deviation = np.full((2, len(dwells)), np.nan)
     left_out[scatter.inliers] = _left_out_residuals(orthogonal, whitened, whitener)
     deviation[scatter.inliers] = whitener.deviation
-    return Calibration(terms, dwells, scatter, unexplained_error(dwells, terms), left_out,
+    return Calibration(terms, dwells, given, scatter, unexplained_error(rest, terms), left_out,
                        deviation, float(np.linalg.cond(triangle)), len(used) - len(lengths),
                        float(whitened @ whitened))
 
@@ -286,14 +390,16 @@ def unexplained_error(dwells: Dwells, terms: Sequence[Term]) -> Array:
     return dwells.output - dwells.rate - sum(term.error(channels) for term in terms)
 
 
-def sensitivity_columns(dwells: Dwells, terms: Sequence[Term]) -> Array:
+def sensitivity_columns(dwells: Dwells, terms: Sequence[Term],
+                        temperature: float = math.nan) -> Array:
     """Return the derivatives of the error by each fitted value, shape (n, m)."""
-    channels = channels_of(dwells)
+    channels = channels_of(dwells, temperature)
     return np.column_stack([np.empty((len(dwells), 0)), *(
         row + np.zeros(len(dwells)) for term in terms for row in term.sensitivity(channels))])
 
 
-def _linearize_output(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
+def _linearize_output(dwells: Dwells, terms: Sequence[Term],
+                      residual: Array) -> tuple[Array, Array]:
     """
     Return the columns, shape (n, m), and residual of the output at the reference rate.
 
@@ -307,7 +413,7 @@ def _linearize_output(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Arr
     """
     model, channels = GyroModel(tuple(terms)), channels_of(dwells)
     if not model.uses_channel('output'):
-        return sensitivity_columns(dwells, terms), unexplained_error(dwells, terms)
+        return sensitivity_columns(dwells, terms), residual
     expected, step = model.output_from_channels(channels), 1e-5
     below, here, above = (channels.with_rate(channels.rate, expected + change)
                           for change in (-step, 0.0, step))
@@ -372,6 +478,19 @@ def _factor_columns(dwells: Dwells, terms: Sequence[Term],
     if not np.linalg.cond(triangle) < MAX_CONDITION_NUMBER:
         raise _unidentifiable_error(terms, triangle)
     return orthogonal, triangle, lengths
+
+
+def _beside(known: Array, error: Array, columns: Array) -> tuple[Array, Array, Array]:
+    """Return a basis of known columns, and the rest of errors, and of columns of length one."""
+    known = _orthonormal_columns(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), 1e-6)
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    return known, error - known @ (known.T @ error), columns - known @ (known.T @ columns)
+
+
+def _orthonormal_columns(columns: Array, tolerance: float) -> Array:
+    """Return orthonormal columns that span others, shape (n, m), but for parts below a size."""
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, sizes > tolerance]
 
 
 def _left_out_residuals(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
@@ -473,30 +592,21 @@ def equal_bins(values: Array, max_bins: int) -> Iterator[tuple[float, float, Mas
 @dataclass(frozen=True)
 class TurnErrors:
     """
-    Errors of full turns, counter-clockwise positive as the heading is, each array of shape (n,).
+    Errors of full turns, counter-clockwise positive as the heading is.
 
     Attributes
     ----------
-    rate : true rate of the turn, rad/s
-    temperature : degC; None where the log holds none
-    static : with the static bias only, rad per turn
-    modelled : with the model, and the static bias after it, rad per turn
-    sweep : that the turn was measured in
-    location : of each turn in its file
+    turns : their dwells
+    static : with the static bias only, rad per turn, shape (n,)
+    modelled : with the model, and the static bias after it, rad per turn, shape (n,)
     remarks : on the source of the static bias, and on turns without an error, one sentence each
 
     """
 
-    rate: Array
-    temperature: Array | None
+    turns: Dwells
     static: Array
     modelled: Array
-    sweep: Numbers
-    location: tuple[str, ...]
     remarks: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.rate)
 
 
 def compute_turn_errors(dwells: Dwells, rate: Array,
@@ -538,8 +648,7 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
     remarks = [remark]
     if lost:
         remarks.append(f'{lost} turns are left out: the other sweeps do not determine the model')
-    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.location,
-                      tuple(remarks))
+    return TurnErrors(turns, static, modelled, tuple(remarks))
 
 
 #: Number of a sweep -> the dwells that determine its static bias, and their weights.
@@ -580,15 +689,3 @@ def _find_nearest(dwells: Dwells, turns: Dwells,
     return [rests[min(rests, key=lambda number: (
         number != sweep, abs(of_rest[number] - temperature), abs(number - sweep)))]
         for sweep, temperature in zip(turns.sweep.tolist(), at.tolist())]
-
-
-class ErrorSummary(NamedTuple):
-    """Root mean square and largest absolute value of errors, rad per turn."""
-
-    rms: float
-    largest: float
-
-
-def summarize_errors(errors: Array) -> ErrorSummary:
-    """Return how large some errors are, shape (n,) with n above 0."""
-    return ErrorSummary(rms(errors), float(np.abs(errors).max()))

@@ -44,6 +44,7 @@ from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.logs.log import Array, DataRefused, Mask, NORMAL_QUANTILE_975
 from gyro_calibration.model.gyro_model import Tolerance
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
@@ -134,34 +135,29 @@ def sum_by_part(values: Array, parts: Numbers) -> Array:
 
 
 class Whitener:
-    """The covariance of the errors of dwells: independent sweeps, two shared directions each."""
+    """The covariance of the errors of dwells: independent sweeps, by their Cholesky factors."""
 
     def __init__(self, dwells: Dwells, scatter: Scatter):
-        """Find the directions of each sweep, and the scatter of its dwells along them."""
         self.parts = cross_validation_parts(dwells)
         self.deviation = scatter.deviation(dwells)
-        self._shared = scatter.sweep_columns(dwells) / self.deviation[:, None]
-        self._eigenvalues, self._eigenvectors = np.linalg.eigh(
-            sum_by_part(self._shared[:, :, None] * self._shared[:, None, :], self.parts))
+        shared = scatter.sweep_columns(dwells)
+        rows = (np.flatnonzero(self.parts == part) for part in range(self.parts.max() + 1))
+        self._factors = [(own, np.linalg.cholesky(
+            np.diag(self.deviation[own] ** 2) + shared[own] @ shared[own].T)) for own in rows]
 
     def whiten(self, values: Array) -> Array:
         """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
-        return self._multiply_power((values.T / self.deviation).T, -0.5)
+        whitened = np.empty_like(values)
+        for own, factor in self._factors:
+            whitened[own] = solve_triangular(factor, values[own], lower=True)
+        return whitened
 
     def restore(self, whitened: Array) -> Array:
-        """Return what `whiten` was given, shape (n,)."""
-        return self._multiply_power(whitened, 0.5) * self.deviation
-
-    def _multiply_power(self, values: Array, power: float) -> Array:
-        """Multiply by a power of the covariance in units of the dwells' own."""
-        sizes = np.maximum(self._eigenvalues, 1e-12)
-        # the covariance is the identity plus the products of two columns for each sweep
-        inner = (self._eigenvectors * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :]
-                 @ self._eigenvectors.swapaxes(1, 2))
-        columns = values.reshape(len(values), -1)
-        along = inner @ sum_by_part(self._shared[:, :, None] * columns[:, None, :], self.parts)
-        return values + np.einsum('ni,nim->nm', self._shared, along[self.parts]).reshape(
-            values.shape)
+        """Return what `whiten` was given."""
+        values = np.empty_like(whitened)
+        for own, factor in self._factors:
+            values[own] = factor @ whitened[own]
+        return values
 
 
 # its size

@@ -26,19 +26,18 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.calibration.dwells import Dwells
-from gyro_calibration.calibration.rate_table import Calibration, fit_effects
-from gyro_calibration.calibration.scatter import (
-    BIAS_SLOPE_DEVIATION,
-    estimate_scatter,
-    SCALE_SLOPE_DEVIATION,
-    Scatter,
+from gyro_calibration.calibration.rate_table import (
+    Calibration,
+    channels_of,
+    CONFOUNDERS,
+    fit_effects,
 )
+from gyro_calibration.calibration.scatter import BIAS_SLOPE_DEVIATION, SCALE_SLOPE_DEVIATION
 from gyro_calibration.logs.log import Array, DataRefused, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
-    Channels,
     CUBIC_NONLINEARITY,
     Effect,
     SCALE_FACTOR_ERROR,
@@ -46,6 +45,7 @@ from gyro_calibration.model.effects import (
     SINE_RESPONSE,
     STATIC_EFFECTS,
 )
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
 #: Probability of taking an effect that is not there, in one calibration.
@@ -56,8 +56,10 @@ MIN_DISTINGUISHING_SIGMAS = 4.0
 #: Technology -> which of sine response and cubic nonlinearity its physics causes.
 TECHNOLOGY_EFFECTS = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
                       'mems': CUBIC_NONLINEARITY}
-#: Two effects that explain nearly the same -> the other one.
-CONFOUNDERS = {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}
+
+
+#: Effects of every gyro.
+BASIC_EFFECTS = BIAS, SCALE_FACTOR_ERROR
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     DataRefused : too few dwells for anything
 
     """
-    best = fit_supported_effects(dwells, technology)
+    best = find_supported_effects(dwells, FALSE_ALARM_RATE)
     for slope, typical_deviation in ((BIAS_TEMPERATURE, BIAS_SLOPE_DEVIATION),
                                      (SCALE_FACTOR_TEMPERATURE, SCALE_SLOPE_DEVIATION)):
         extended = None if slope in best.effects else try_fit(best, (*best.effects, slope))
@@ -143,49 +145,47 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
             best = extended
     best, confounders = resolve_confounders(
         best, technology, None if technology else SINE_RESPONSE)
-    tried = len(STATIC_EFFECTS) - len({BIAS, SCALE_FACTOR_ERROR} & {*best.effects})
+    tried = len(STATIC_EFFECTS) - len({*BASIC_EFFECTS} & {*best.effects})
     return Selection(best, tuple(_explain_choice(best, effect, FALSE_ALARM_RATE / tried,
                                                  confounders)
                                  for effect in STATIC_EFFECTS.values()), confounders)
 
 
-def fit_supported_effects(dwells: Dwells, technology: str | None = None,
-                          false_alarm_rate: float = FALSE_ALARM_RATE) -> Calibration:
+def find_supported_effects(dwells: Dwells, false_alarm_rate: float,
+                           given: GyroModel | None = None) -> Calibration:
     """
     Fit the effects that predict left-out sweeps better, at a false alarm rate.
 
     The best one is added until none is supported, then those that later ones made superfluous are
-    removed.
+    removed. With a given model they are changes of it.
 
     """
-    scatter = estimate_scatter(dwells)
-    base = _fit_base(dwells, scatter)
+    best = base = _fit_base(dwells, given)
     candidates = [effect for effect in STATIC_EFFECTS.values() if effect not in base.effects]
-    limit, best = false_alarm_rate / len(candidates), base
+    limit = false_alarm_rate / len(candidates)
     while True:
         tried = [try_fit(best, _add_effect(best.effects, effect)) for effect in candidates
                  if not {effect, CONFOUNDERS.get(effect)} & {*best.effects}]
         better = [each
                   for each in tried if each is not None and _is_supported(best, each, limit)]
         if not better:
-            break
+            return _remove_superfluous(best, base.effects, limit)
         best = min(better, key=Calibration.cross_validation_misfit)
-    return resolve_confounders(_remove_superfluous(best, base.effects, limit), technology)[0]
 
 
 def try_fit(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
     """Fit other effects to the dwells of a fit; None if they cannot be separated."""
     try:
-        return fit_effects(fit.dwells, effects, fit.scatter)
+        return fit.refit(effects)
     except DataRefused:
         return None
 
 
-def _fit_base(dwells: Dwells, scatter: Scatter) -> Calibration:
+def _fit_base(dwells: Dwells, given: GyroModel | None) -> Calibration:
     """Fit bias and scale factor error, or the one of them that the dwells determine."""
-    for effects in ((BIAS, SCALE_FACTOR_ERROR), (BIAS,), (SCALE_FACTOR_ERROR,)):
+    for effects in (BASIC_EFFECTS, *((each,) for each in BASIC_EFFECTS)):
         try:
-            return fit_effects(dwells, effects, scatter)
+            return fit_effects(dwells, effects, given=given)
         except DataRefused:
             continue
     raise DataRefused(f'{len(dwells)} dwells show neither a bias nor a scale factor; '
@@ -240,7 +240,7 @@ def resolve_confounders(fit: Calibration, technology: str | None, bounded_effect
     effect = next((each for each in CONFOUNDERS if each in fit.effects), None)
     if effect is None:
         return fit, ()
-    swapped = try_fit(fit, replace_effect(fit.effects, effect, CONFOUNDERS[effect]))
+    swapped = try_replace(fit, effect, CONFOUNDERS[effect])
     # with all rates at its zeros a sine fits any data
     if swapped is None or swapped.min_non_monotonic_rate is not None:
         return fit, ()
@@ -283,20 +283,18 @@ def distinguishing_rate(fit: Calibration, other: Calibration) -> float | None:
 def _separation_sigmas(fit: Calibration, other: Calibration, rates: Array) -> float:
     """Return the difference of two fits in one more sweep at rates (n,), standard deviations."""
     count, known = len(rates), fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
-    deviation = np.full(count, np.median(known) if len(known) else np.nan)
-    sweep = Dwells(rates, rates, None, deviation, np.zeros(count, dtype=int), ('',) * count)
-    channels = Channels(rates, rates, np.full(count, fit.model.reference_temperature))
-    rows = np.column_stack([row for term in fit.terms for row in term.sensitivity(channels)])
-    fit_covariance = 0.0 if fit.model.covariance is None else rows @ fit.model.covariance @ rows.T
-    shared = fit.scatter.sweep_columns(sweep)
-    covariance = fit_covariance + np.diag(fit.scatter.deviation(sweep) ** 2) + shared @ shared.T
-    difference = np.asarray(fit.model.error(channels) - other.model.error(channels))
-    return math.sqrt(float(difference @ np.linalg.solve(covariance, difference)))
+    sweep = Dwells(rates, rates, np.full(count, fit.model.reference_temperature),
+                   np.full(count, np.median(known) if len(known) else np.nan),
+                   np.zeros(count, dtype=int), ('',) * count)
+    difference = np.asarray(fit.model.error(channels_of(sweep))
+                            - other.model.error(channels_of(sweep)))
+    return math.sqrt(float(
+        difference @ np.linalg.solve(fit.prediction_covariance(sweep), difference)))
 
 
-def replace_effect(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
-    """Return the effects with another one in place of one of them."""
-    return tuple(other if each is taken else each for each in effects)
+def try_replace(fit: Calibration, taken: Effect, other: Effect) -> Calibration | None:
+    """Fit another effect in place of one of a fit; None if that is not possible."""
+    return try_fit(fit, [other if each is taken else each for each in fit.effects])
 
 
 # reasons
@@ -306,8 +304,8 @@ def _explain_choice(fit: Calibration, effect: Effect, significance: float,
     """Return the gain of a fit with the effect over one without it, or with its confounder."""
     for pair in confounders:
         if effect.name == pair.other:
-            swapped = fit_effects(
-                fit.dwells, replace_effect(fit.effects, CONFOUNDERS[effect], effect), fit.scatter)
+            swapped = try_replace(fit, CONFOUNDERS[effect], effect)
+            assert swapped is not None
             reason = f'explains the same as {pair.taken}, in place of which it is tried here'
             return EffectChoice(effect.name, False, fit.left_out_rms, swapped.left_out_rms,
                                 math.nan, reason)
@@ -317,7 +315,7 @@ def _explain_choice(fit: Calibration, effect: Effect, significance: float,
         return EffectChoice(effect.name, True, math.nan, fit.left_out_rms, math.nan,
                             'nothing else can be seen')
     try:
-        other = fit_effects(fit.dwells, rest if taken else _add_effect(rest, effect), fit.scatter)
+        other = fit.refit(rest if taken else _add_effect(rest, effect))
     except DataRefused as error:
         return EffectChoice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)

@@ -276,10 +276,10 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
 
     """
     figure, panels = _panels(2, 1, (8.5, 8))
-    temperature = errors.temperature
+    temperature = errors.turns.temperature
     for axes, error, words in zip(panels[:, 0], (errors.static, errors.modelled),
                                   ('static bias only', 'the model and its static bias')):
-        dots = _draw_dots(axes, errors.rate / DEGREE, error / DEGREE, temperature)
+        dots = _draw_dots(axes, errors.turns.rate / DEGREE, error / DEGREE, temperature)
         limit = 1.15 * float(np.abs(error).max()) / DEGREE or 1e-3
         axes.axvspan(-min_rate / DEGREE, min_rate / DEGREE, facecolor='none', edgecolor='0.7',
                      hatch='///', linewidth=0)

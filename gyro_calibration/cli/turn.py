@@ -33,12 +33,10 @@ from gyro_calibration.calibration.dwells import (
 from gyro_calibration.calibration.rate_table import (
     compute_turn_errors,
     equal_bins,
-    ErrorSummary,
     MIN_TURN_RATE,
-    summarize_errors,
     TurnErrors,
 )
-from gyro_calibration.calibration.scatter import cross_validation_parts, find_inliers
+from gyro_calibration.calibration.scatter import cross_validation_parts, find_inliers, rms
 from gyro_calibration.calibration.selection import select_effects, TECHNOLOGY_EFFECTS
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.plots import draw_turn_errors
@@ -154,41 +152,48 @@ def _describe_fit_data(model: GyroModel, log: str) -> str:
 
 def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
     """Return the limits of bins around 1, 2, 4, ... times the slowest rate, and what lies in."""
-    speed = np.abs(errors.rate)
+    rate = errors.turns.rate
+    speed = np.abs(rate)
     # A limit just below the fastest turn would make a nearly empty bin. Limits lie between the
     # doubled rates, as those are the rates that are commanded.
     bins = max(1, math.floor(math.log2(2.13 * speed.max() / slowest)))
     edges = [slowest, *(0.75 * slowest * 2.0 ** number for number in range(1, bins)),
              float(speed.max())]
     places = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, bins - 1)
-    both = [*((-high, -low, (places == place) & (errors.rate < 0.0))
-              for place, (low, high) in enumerate(zip(edges, edges[1:])))][::-1]
-    both += [(low, high, (places == place) & (errors.rate > 0.0))
-             for place, (low, high) in enumerate(zip(edges, edges[1:]))]
-    return [each for each in both if each[2].any()]
+    up = [(low, high, (places == place) & (rate > 0.0))
+          for place, (low, high) in enumerate(zip(edges, edges[1:]))]
+    down = [(-high, -low, (places == place) & (rate < 0.0))
+            for place, (low, high) in enumerate(zip(edges, edges[1:]))]
+    return [each for each in (*down[::-1], *up) if each[2].any()]
 
 
 def _temperature_bins(errors: TurnErrors) -> Bins:
-    return [] if errors.temperature is None else [
-        each for each in equal_bins(errors.temperature, 8) if each[2].any()]
+    return [] if errors.turns.temperature is None else [
+        each for each in equal_bins(errors.turns.temperature, 8) if each[2].any()]
 
 
 # the answer
 
 def _lines(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> Iterator[str]:
-    before, after = summarize_errors(errors.static), summarize_errors(errors.modelled)
-    yield (f'Error of a turn of 360 deg: largest {_format_error(before.largest)} with the static '
-           f'bias only, {_format_error(after.largest)} with the model, a factor of '
-           f'{_format_ratio(before.largest, after.largest)}; rms {_format_error(before.rms)} and '
-           f'{_format_error(after.rms)}, a factor of {_format_ratio(before.rms, after.rms)}.')
-    yield (f'{len(errors)} turns, {given.slowest:g} deg/s and faster, '
-           f'of {len(np.unique(errors.sweep))} sweeps in {given.log}.')
+    (rms_before, largest_before), (rms_after, largest_after) = map(
+        _sizes, (errors.static, errors.modelled))
+    yield (f'Error of a turn of 360 deg: largest {_format_error(largest_before)} with the static '
+           f'bias only, {_format_error(largest_after)} with the model, a factor of '
+           f'{_format_ratio(largest_before, largest_after)}; rms {_format_error(rms_before)} and '
+           f'{_format_error(rms_after)}, a factor of {_format_ratio(rms_before, rms_after)}.')
+    yield (f'{len(errors.turns)} turns, {given.slowest:g} deg/s and faster, '
+           f'of {len(np.unique(errors.turns.sweep))} sweeps in {given.log}.')
     for remark in remarks:
         yield f'{remark[0].upper()}{remark[1:]}.'
     yield from _table('rate [deg/s]', errors,
                       [(low / DEGREE, high / DEGREE, mask)
                        for low, high, mask in _rate_bins(errors, given.slowest * DEGREE)])
     yield from _table('temperature [degC]', errors, _temperature_bins(errors))
+
+
+def _sizes(errors: Array) -> tuple[float, float]:
+    """Return the root mean square and the largest absolute value of errors."""
+    return rms(errors), float(np.abs(errors).max())
 
 
 def _format_error(error: float) -> str:
@@ -210,43 +215,42 @@ def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
         label = f'{low:.4g} to {high:.4g}'
         yield f'{label:20} {np.count_nonzero(mask):5d}' + ''.join(
             f'  {value / DEGREE:7.3f} {100.0 * value / math.tau:7.3f}'
-            for each in (errors.static, errors.modelled)
-            for value in (summarize_errors(each[mask]).rms, summarize_errors(each[mask]).largest))
+            for each in (errors.static, errors.modelled) for value in _sizes(each[mask]))
 
 
 def _data(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> dict[str, Any]:
-    before, after = summarize_errors(errors.static), summarize_errors(errors.modelled)
-    ratios = {f'ratio_{name}': getattr(before, name) / getattr(after, name)
-              if getattr(after, name) > 0.0 else None for name in ('rms', 'largest')}
-    return {'turns': len(errors), 'slowest_rad_s': given.slowest * DEGREE,
-            'static': _error_data(before), 'modelled': _error_data(after), **ratios,
+    turns = errors.turns
+    ratios = [before / after if after > 0.0 else None
+              for before, after in zip(_sizes(errors.static), _sizes(errors.modelled))]
+    return {'turns': len(turns), 'slowest_rad_s': given.slowest * DEGREE,
+            **_error_data(errors, np.ones(len(turns), dtype=bool)),
+            'ratio_rms': ratios[0], 'ratio_largest': ratios[1],
             'by_rate': _bin_data('rad_s', errors, _rate_bins(errors, given.slowest * DEGREE)),
             'by_temperature': _bin_data('degc', errors, _temperature_bins(errors)),
-            'rate_rad_s': errors.rate.tolist(), 'temperature_degc': None
-            if errors.temperature is None else errors.temperature.tolist(),
+            'rate_rad_s': turns.rate.tolist(), 'temperature_degc': None
+            if turns.temperature is None else turns.temperature.tolist(),
             'static_rad_per_turn': errors.static.tolist(),
             'modelled_rad_per_turn': errors.modelled.tolist(),
-            'sweep': errors.sweep.tolist(), 'place': list(errors.location), 'remarks': remarks}
+            'sweep': turns.sweep.tolist(), 'place': list(turns.location), 'remarks': remarks}
 
 
-def _error_data(errors: ErrorSummary) -> dict[str, float]:
-    return {'rms_rad_per_turn': errors.rms, 'largest_rad_per_turn': errors.largest}
+def _error_data(errors: TurnErrors, mask: Mask) -> dict[str, dict[str, float]]:
+    return {name: dict(zip(('rms_rad_per_turn', 'largest_rad_per_turn'), _sizes(each[mask])))
+            for name, each in (('static', errors.static), ('modelled', errors.modelled))}
 
 
 def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]:
     return [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
-             'static': _error_data(summarize_errors(errors.static[mask])),
-             'modelled': _error_data(summarize_errors(errors.modelled[mask]))}
-            for low, high, mask in bins]
+             **_error_data(errors, mask)} for low, high, mask in bins]
 
 
 def _write_table(path: str, errors: TurnErrors) -> None:
-    temperature = (np.full(len(errors), np.nan) if errors.temperature is None
-                   else errors.temperature)
+    turns = errors.turns
+    temperature = np.full(len(turns), np.nan) if turns.temperature is None else turns.temperature
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc',
                      'static_rad_per_turn', 'modelled_rad_per_turn'))
-    writer.writerows(zip(errors.location, *(values.tolist() for values in (
-        errors.sweep, errors.rate, temperature, errors.static, errors.modelled))))
+    writer.writerows(zip(turns.location, *(values.tolist() for values in (
+        turns.sweep, turns.rate, temperature, errors.static, errors.modelled))))
     write_atomically(path, text.getvalue().encode())

@@ -19,8 +19,9 @@ because output less rate is the error to be explained.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 import math
 
 from gyro_calibration.calibration.dwells import (
@@ -33,27 +34,24 @@ from gyro_calibration.calibration.dwells import (
 from gyro_calibration.calibration.rate_table import (
     Calibration,
     channels_of,
+    CONFOUNDERS,
     equal_bins,
     fit_effects,
+    replaced_term,
     sensitivity_columns,
+    static_terms,
+    value_owners,
 )
-from gyro_calibration.calibration.scatter import (
-    cross_validation_parts,
-    MIN_SWEEPS,
-    Scatter,
-    surface_dof,
-    Uncertainty,
-    Whitener,
-)
+from gyro_calibration.calibration.scatter import cross_validation_parts, MIN_SWEEPS, surface_dof
 from gyro_calibration.calibration.selection import (
-    CONFOUNDERS,
+    BASIC_EFFECTS,
     distinguishing_rate,
-    fit_supported_effects,
+    find_supported_effects,
     MIN_DISTINGUISHING_SIGMAS,
-    replace_effect,
     resolve_confounders,
     TECHNOLOGY_EFFECTS,
     try_fit,
+    try_replace,
 )
 from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding
 from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
@@ -74,16 +72,14 @@ from gyro_calibration.diagnosis.findings import (
     Unexplained,
 )
 from gyro_calibration.diagnosis.gates import refuse_unusable
-from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, NORMAL_QUANTILE_975
 from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
-    Channels,
+    CATALOGUE,
     CUBIC_NONLINEARITY,
     Effect,
-    SATURATION,
     SCALE_FACTOR_ERROR,
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
@@ -94,12 +90,9 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import block_diag
-from scipy.stats import f as fisher
 from scipy.stats import norm
 from scipy.stats import t as student
 
-#: Fitted in any case.
-NUISANCE_EFFECTS = (BIAS, SCALE_FACTOR_ERROR)
 _METHOD_TEXT = (
     'The rates and temperatures of the dwells were simulated, and the difference of measured and '
     'simulated outputs was compared with the effects of rate and temperature. The scatter of '
@@ -137,23 +130,23 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
     record = resolve_unit(inspect_record(log, model))
     dwells = replace(dwells, output=dwells.output * record.unit_factor)
     named = name_causes(dwells, model, false_alarm_rate)
-    structures, gains = find_structure(named, 0.2 * false_alarm_rate)
+    structures, gains = find_structure(named.fit, 0.2 * false_alarm_rate)
     # structure along the variable of a cause, above a tenth of what that explains
     withdrawn = frozenset(
-        effect.name for effect in named.causes if effect not in NUISANCE_EFFECTS
-        and any(gain > 0.1 * _misfit_reduction(named, effect) for name, gain in gains.items()
+        effect for effect in named.causes if effect not in BASIC_EFFECTS
+        and any(gain > 0.1 * named.misfit_reduction(effect) for name, gain in gains.items()
                 if CAUSES[effect.name].along in name.split('_times_')))
     if withdrawn:
-        named = name_causes(dwells, model, false_alarm_rate, withdrawn)
-        structures, _ = find_structure(named, 0.2 * false_alarm_rate)
+        named = NamedCauses.of(named.fit, model, false_alarm_rate, withdrawn)
+        structures, _ = find_structure(named.fit, 0.2 * false_alarm_rate)
     gain = (_cross_validated_gain(dwells, model, false_alarm_rate, withdrawn, on_progress)
             if named.causes else None)
     on_progress(0.97, 'findings')
-    before = simulation_under_test(dwells, model, named)
+    before = model or named.plain_model
     offered = bool(named.causes) and not (gain is not None and gain.is_worse)
-    after = assemble_model(dwells, model, named.fit) if offered else before
-    strongest_first = sorted(named.causes, key=lambda each: -_misfit_reduction(named, each))
-    outliers = _outlier_findings(dwells, named.fit, 0.05 * false_alarm_rate)
+    after = assemble_model(model, named.fit) if offered else before
+    strongest_first = sorted(named.causes, key=lambda each: -named.misfit_reduction(each))
+    outliers = _outlier_findings(named.fit, 0.05 * false_alarm_rate)
     findings = add_remedies([*record.findings, *outliers, *(
         _cause_finding(named, effect) for effect in strongest_first)], {}, after)
     if after is not before:
@@ -162,7 +155,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
     return Diagnosis(
         tuple(findings), structures, Noise(),
         Noise() if model is None else model.noise, gain, before, after, _untestable_causes(dwells),
-        error_curves(dwells, named.fit.scatter, before, after),
+        error_curves(named.fit, before, after),
         remarks=(*record.remarks, *dwells.remarks,
                  *_remarks(dwells, model, named, structures, withdrawn, gain, offered)),
         false_alarm_rate=false_alarm_rate,
@@ -172,7 +165,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, false_alarm_rat
 # the steps
 
 def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-                          withdrawn: frozenset[str], on_progress: OnProgress) -> Gain | None:
+                          withdrawn: frozenset[Effect], on_progress: OnProgress) -> Gain | None:
     """Return the gain on sweeps left out of selection and fit in turn; None if not possible."""
     parts = cross_validation_parts(dwells)
     count = min(8, int(parts.max()) + 1)  # of groups of sweeps, for the computing time
@@ -184,8 +177,7 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
         rest, left_out = select_dwells(dwells, ~hidden), select_dwells(dwells, hidden)
         try:
             named = name_causes(rest, model, false_alarm_rate, withdrawn)
-            models = (model or GyroModel(), simulation_under_test(rest, None, named),
-                      assemble_model(rest, model, named.fit))
+            models = (model or GyroModel(), named.plain_model, assemble_model(model, named.fit))
         except DataRefused:
             continue
         for each, error in zip(models, errors.values()):
@@ -203,27 +195,21 @@ def _cross_validated_gain(dwells: Dwells, model: GyroModel | None, false_alarm_r
                              'plain' if model is None else 'given', HEADING_WINDOW)
 
 
-def _outlier_findings(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Finding]:
+def _outlier_findings(fit: Calibration, level: float) -> Iterator[Finding]:
     """Give outlying dwells, if the largest deviation from a fit to the others is significant."""
-    outlying = np.flatnonzero(~fit.scatter.inliers)
-    freedom = surface_dof(select_dwells(dwells, fit.scatter.inliers))
-    if not len(outlying) or min(freedom, fit.dof) < 1:
+    outlying, freedom = ~fit.scatter.inliers, surface_dof(fit.used)
+    if not outlying.any() or min(freedom, fit.dof) < 1:
         return
-    # in standard deviations about a fit without them
-    used, shared = select_dwells(dwells, fit.scatter.inliers), fit.scatter.sweep_columns(dwells)
-    columns = Whitener(used, fit.scatter).whiten(sensitivity_columns(used, fit.terms))
-    of_fit = sensitivity_columns(dwells, fit.terms) @ np.linalg.pinv(columns)
-    deviation = np.sqrt(fit.scatter.deviation(dwells) ** 2 + np.sum(shared ** 2, axis=1)
-                        + np.sum(of_fit ** 2, axis=1))
-    sigmas = (np.abs(fit.residual) / deviation)[outlying]
-    chance = min(1.0, len(dwells) * 2.0 * float(student.sf(sigmas.max(), freedom)))
+    dwells = select_dwells(fit.dwells, outlying)
+    sigmas = np.abs(fit.residual[outlying]) / np.sqrt(np.diag(fit.prediction_covariance(dwells)))
+    chance = min(1.0, len(fit.dwells) * 2.0 * float(student.sf(sigmas.max(), freedom)))
     if chance < level:
-        places = format_list([dwells.location[row] for row in outlying])
         yield make_finding(
-            'outliers', {'outliers': Estimate.from_half_width(float(len(outlying)), 0.0, '1')},
+            'outliers', {'outliers': Estimate.from_half_width(float(len(dwells)), 0.0, '1')},
             chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
-            evidence=f'{len(outlying)} of {len(dwells)} dwells are up to '
-            f'{sigmas.max():.0f} sigma from the others: {places}', along='rate')
+            evidence=f'{len(dwells)} of {len(fit.dwells)} dwells are up to '
+            f'{sigmas.max():.0f} sigma from the others: {format_list(dwells.location)}',
+            along='rate')
 
 
 # causes that dwells support
@@ -235,67 +221,62 @@ class NamedCauses:
 
     Attributes
     ----------
-    fit : of causes, bias and scale factor to dwells less the effects of the model that are kept
-    change_fit : the same as changes in addition to the whole model, by which causes are tested
+    fit : of causes, bias and scale factor to the dwells
     causes : the named effects of the fit
-    model : that is tested
-    false_alarm_rate : false-alarm rate of the diagnosis
+    false_alarm_rate : of the diagnosis
 
     """
 
     fit: Calibration
-    change_fit: Calibration
     causes: tuple[Effect, ...]
-    model: GyroModel
     false_alarm_rate: float
 
-    def change_effect(self, effect: Effect) -> Effect:
-        """Return the change that stands for an effect of the fit: itself, or its confounder."""
-        return effect if effect in self.change_fit.effects else CONFOUNDERS.get(effect, effect)
+    @classmethod
+    def of(cls, fit: Calibration, model: GyroModel | None, false_alarm_rate: float,
+           withdrawn: Collection[Effect] = ()) -> NamedCauses:
+        """Return the causes among the effects of a fit, without those that are withdrawn."""
+        fit = fit.refit([each for each in fit.effects if each not in withdrawn])
+        named = cls(fit, (), false_alarm_rate)
+        causes = [each for each in fit.effects if each not in BASIC_EFFECTS
+                  or model is not None and fit.p_value(each) < named.level(each)]
+        if _is_slope_by_origin(fit):
+            causes.remove(BIAS_TEMPERATURE)
+        return replace(named, causes=tuple(causes))
 
-    def p_value(self, effect: Effect) -> float:
-        """Return the p-value of a cause, corrected for the number of causes tried."""
-        if effect in NUISANCE_EFFECTS:
-            return min(1.0, _change_p_value(self.fit, self.model, effect) * len(NUISANCE_EFFECTS))
-        p_value = self.change_fit.p_value(self.change_effect(effect), by_model=model_uncertainty(
-            self.change_fit, self.model))
-        return min(1.0, p_value * (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS)))
+    def level(self, effect: Effect) -> float:
+        """
+        Return the p-value below which a cause is named.
 
+        Of the false-alarm rate, 65 % is for causes other than bias and scale factor, and 10 % for
+        a bias and a scale factor that differ from the model's.
 
-# a model against dwells
+        """
+        share = 0.1 if effect in BASIC_EFFECTS else 0.65
+        return share * self.false_alarm_rate / self.tested_count(effect)
 
-def model_channels(model: GyroModel, dwells: Dwells) -> Channels:
-    """Return the channels of a model, at its reference temperature if the table has none."""
-    channels = channels_of(dwells)
-    return (channels if dwells.temperature is not None
-            else replace(channels, temperature=np.full(len(dwells), model.reference_temperature)))
+    def tested_count(self, effect: Effect) -> int:
+        """Return the number of causes that were tested together with one."""
+        basic = len(BASIC_EFFECTS)
+        return basic if effect in BASIC_EFFECTS else len(STATIC_EFFECTS) - basic
 
+    def fit_without(self, effect: Effect) -> Calibration | None:
+        """Return a fit with the effect as it is in the model, or None if it is not possible."""
+        return try_fit(self.fit, [each for each in self.fit.effects if each is not effect])
 
-def simulate_output(model: GyroModel, dwells: Dwells) -> Array:
-    """Return the output that a model has for the dwells, rad/s, shape (n,)."""
-    known = replace(model, terms=tuple(visible_terms(model)))
-    return (np.asarray(known.output_from_channels(model_channels(model, dwells)))
-            + np.zeros(len(dwells)))
+    def misfit_reduction(self, effect: Effect) -> float:
+        """Return the reduction of the sum of squares by a cause."""
+        rest = self.fit_without(effect)
+        return math.inf if rest is None else rest.misfit - self.fit.misfit
 
+    @property
+    def plain_model(self) -> GyroModel:
+        """Return the best bias and scale factor of an ideal gyro."""
+        basic = [each for each in BASIC_EFFECTS if each in self.fit.effects]
+        return fit_effects(self.fit.dwells, basic, self.fit.scatter).model
 
-def visible_terms(model: GyroModel) -> list[Term]:
-    """Return the effects of a model that dwells can show: of rate, output and temperature."""
-    return [term for term in model.terms
-            if term.effect.inputs <= {'rate', 'output', 'temperature'}
-            and term.effect.distortion is None]
-
-
-def _subtract_effects(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) -> Dwells:
-    """Return dwells whose output is without the effects of a model that are not refitted."""
-    channels, names = model_channels(model, dwells), {effect.name for effect in refitted}
-    return replace(dwells, output=dwells.output - sum(
-        term.error(channels) for term in visible_terms(model) if term.effect.name not in names))
-
-
-# choice of causes
 
 def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float,
-                withdrawn: frozenset[str] = frozenset()) -> NamedCauses:
+                withdrawn: Collection[Effect] = ()) -> NamedCauses:
     """
     Find the causes that dwells support on top of a model, or of an ideal gyro.
 
@@ -304,58 +285,20 @@ def name_causes(dwells: Dwells, model: GyroModel | None, false_alarm_rate: float
     dwells : of a rate table
     model : that is put to the test, if one was given
     false_alarm_rate : false-alarm rate of the diagnosis
-    withdrawn : the names of causes that are withdrawn
+    withdrawn : causes that are not named
 
     """
-    tested = model or GyroModel()
-    technology = tested.gyro.get('technology')
-    technology = technology if technology in TECHNOLOGY_EFFECTS else None
-    level = significance_level(false_alarm_rate)
-    change = fit_supported_effects(
-        _subtract_effects(dwells, tested), technology,
-        level * (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS)))
-    change = _refit(change, [each for each in change.effects if each.name not in withdrawn])
-    by_model = model_uncertainty(change, tested)
-    guilty = [each for each in change.effects if each not in NUISANCE_EFFECTS
-              and change.p_value(each, by_model=by_model) < level]
-    if BIAS_TEMPERATURE_QUADRATIC in guilty and BIAS_TEMPERATURE not in guilty:
-        guilty.insert(0, BIAS_TEMPERATURE)  # a parabola needs its slope
-    change = _refit(change, [each for each in change.effects
-                             if each in (*NUISANCE_EFFECTS, *guilty)])
-    if _is_slope_by_origin(change):
-        guilty.remove(BIAS_TEMPERATURE)
-    if model is None:
-        return NamedCauses(change, change, tuple(guilty), tested, false_alarm_rate)
-    # the changed effects as a whole, the values of the model and their changes
-    own = {term.effect for term in model.terms}
-    effects = tuple(CONFOUNDERS[each] if each not in own and CONFOUNDERS.get(each) in own else each
-                    for each in change.effects)
-    fit = fit_effects(_subtract_effects(dwells, model, effects), effects, change.scatter,
-                      model.reference_temperature)
-    fit, _ = resolve_confounders(fit, technology)
-    level = significance_level(false_alarm_rate, is_nuisance=True)
-    causes = (*(each if each in fit.effects else CONFOUNDERS[each] for each in guilty),
-              *(each for each in NUISANCE_EFFECTS
-                if each in fit.effects and _change_p_value(fit, model, each) < level))
-    return NamedCauses(fit, change, causes, tested, false_alarm_rate)
+    technology = model.gyro.get('technology') if model else None
+    fit, _ = resolve_confounders(find_supported_effects(dwells, 0.65 * false_alarm_rate, model),
+                                 technology if technology in TECHNOLOGY_EFFECTS else None)
+    return NamedCauses.of(fit, model, false_alarm_rate, withdrawn)
 
 
-def significance_level(false_alarm_rate: float, is_nuisance: bool = False) -> float:
-    """
-    Return the p-value below which one cause is named.
-
-    Of the false-alarm rate, 65 % is for causes other than bias and scale factor, and 10 % for a
-    bias and a scale factor that differ from the model's.
-
-    """
-    if is_nuisance:
-        return 0.1 * false_alarm_rate / len(NUISANCE_EFFECTS)
-    return 0.65 * false_alarm_rate / (len(STATIC_EFFECTS) - len(NUISANCE_EFFECTS))
-
-
-def _refit(fit: Calibration, effects: Sequence[Effect]) -> Calibration:
-    return (fit if len(effects) == len(fit.effects)
-            else fit_effects(fit.dwells, effects, fit.scatter))
+def simulate_output(model: GyroModel, dwells: Dwells) -> Array:
+    """Return the output that a model has for the dwells, rad/s, shape (n,)."""
+    known = replace(model, terms=tuple(static_terms(model)))
+    return np.zeros(len(dwells)) + known.output_from_channels(
+        channels_of(dwells, model.reference_temperature))
 
 
 def _is_slope_by_origin(fit: Calibration) -> bool:
@@ -371,61 +314,17 @@ def _is_slope_by_origin(fit: Calibration) -> bool:
                 < np.ptp(temperature))
 
 
-def value_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
-    """Return the change of bias or scale factor error from the model, which may have none."""
-    found, own = ([term.values[-1] for term in each.terms if term.effect is effect]
-                  for each in (fit, model))
-    return float(sum(found) - sum(own))
-
-
-def _change_p_value(fit: Calibration, model: GyroModel, effect: Effect) -> float:
-    """Return the p-value of a change of bias or scale factor."""
-    column = sensitivity_columns(fit.used, [each for each in fit.terms if each.effect is effect])
-    return fit.p_value(effect, column[:, 0] * value_change(fit, model, effect),
-                       model_uncertainty(fit, model))
-
-
-def model_uncertainty(fit: Calibration, model: GyroModel) -> Array | None:
-    """Return the errors of dwells by 1-sigma errors of model values, rad/s, shape (n, m)."""
-    known = [term for term in visible_terms(model) if term.fitted_indices]
-    if model.covariance is None or not known:
-        return None
-    places = _covariance_indices(model.terms)
-    chosen = [place for term in known for place in places[term.effect.name]]
-    sizes, directions = np.linalg.eigh(model.covariance[np.ix_(chosen, chosen)])
-    channels = model_channels(model, fit.used)
-    rows = [row + np.zeros(len(fit.used)) for term in known for row in term.sensitivity(channels)]
-    return np.column_stack(rows) @ (directions * np.sqrt(np.maximum(sizes, 0.0)))
-
-
-# models
-
-def simulation_under_test(dwells: Dwells, model: GyroModel | None,
-                          named: NamedCauses) -> GyroModel:
-    """Return the simulation under test: the given model, or the best bias and scale factor."""
-    effects = [each for each in NUISANCE_EFFECTS if each in named.change_fit.effects]
-    if model is not None or not effects:
-        return model or GyroModel()
-    return fit_effects(dwells, effects, named.fit.scatter).model
-
-
-def assemble_model(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> GyroModel:
+def assemble_model(model: GyroModel | None, fit: Calibration) -> GyroModel:
     """Return a model with the values of a fit in place of its own, or in addition to them."""
     if model is None:
         return fit.model
-    new = {term.effect.name: term for term in fit.terms}
-    own = {term.effect for term in model.terms}
-    # the confounder of an effect of the model may stand in its place
-    kept_terms = [term for term in model.terms
-                  if term.effect in fit.effects or CONFOUNDERS.get(term.effect) in own
-                  or CONFOUNDERS.get(term.effect) not in fit.effects]
-    kept_names = [term.effect.name for term in kept_terms]
-    terms = (*(new.get(name, term) for name, term in zip(kept_names, kept_terms)),
-             *(term for name, term in new.items() if name not in kept_names))
-    temperatures = [] if dwells.temperature is None else [dwells.temperature]
+    new = {replaced_term(model, term.effect) or term: term for term in fit.terms}
+    terms = [new.pop(term, term) for term in model.terms]
+    terms += new.values()
+    temperatures = [] if fit.dwells.temperature is None else [fit.dwells.temperature]
     # A self-calibration belongs to the old bias and scale factor of the model.
-    return replace(model, terms=terms, covariance=_combined_covariance(model, fit, terms),
-                   rate_range=widen_range(model.rate_range, [dwells.output], True),
+    return replace(model, terms=tuple(terms), covariance=_combined_covariance(model, fit, terms),
+                   rate_range=widen_range(model.rate_range, [fit.dwells.output], True),
                    temperature_range=widen_range(model.temperature_range, temperatures, True),
                    origin=previous_origins(model), self_calibration=None)
 
@@ -433,23 +332,14 @@ def assemble_model(dwells: Dwells, model: GyroModel | None, fit: Calibration) ->
 def _combined_covariance(model: GyroModel, fit: Calibration,
                          terms: Sequence[Term]) -> Array | None:
     """Return the covariance of all fitted values: of model and of dwells, as if independent."""
-    found = fit.model.covariance
-    kept_terms = [term for term in terms if term.effect not in fit.effects and term.fitted_indices]
-    if found is None or (kept_terms and model.covariance is None):
+    found, known = fit.model.covariance, model.covariance
+    kept_terms = [term for term in terms if term not in fit.terms and term.fitted_indices]
+    if found is None or (kept_terms and known is None):
         return None
-    known = np.zeros((0, 0)) if model.covariance is None else model.covariance
-    both, places = block_diag(known, found), []
-    of_model, of_fit = _covariance_indices(model.terms), _covariance_indices(fit.terms, len(known))
-    for term in terms:
-        places += of_fit.get(term.effect.name, []) or of_model[term.effect.name]
+    owners = [*([] if known is None else value_owners(model.terms)), *value_owners(fit.terms)]
+    both = found if known is None else block_diag(known, found)
+    places = [place for term in terms for place, owner in enumerate(owners) if owner is term]
     return both[np.ix_(places, places)]
-
-
-def _covariance_indices(terms: Sequence[Term], first: int = 0) -> dict[str, list[int]]:
-    """Return the indices of the fitted values of each term in a covariance."""
-    ends = np.cumsum([first, *(len(term.fitted_indices) for term in terms)]).tolist()
-    return {term.effect.name: list(range(begin, end))
-            for term, begin, end in zip(terms, ends, ends[1:])}
 
 
 # structure without a name
@@ -458,7 +348,7 @@ def _covariance_indices(terms: Sequence[Term], first: int = 0) -> dict[str, list
 _MAX_CURVE_COLUMNS, _MIN_DWELLS_PER_COLUMN = 9, 4
 
 
-def find_structure(named: NamedCauses, false_alarm_rate: float,
+def find_structure(fit: Calibration, false_alarm_rate: float,
                    ) -> tuple[tuple[Unexplained, ...], dict[str, float]]:
     """
     Search for structure in the residual of a fit; errors by the model's values are none.
@@ -469,55 +359,20 @@ def find_structure(named: NamedCauses, false_alarm_rate: float,
     whitened squared residuals by each
 
     """
-    fit, by_model = named.fit, model_uncertainty(named.fit, named.model)
     curves = {name: columns
               for name, columns in _structure_curves(fit.used).items() if columns.shape[1]}
     known, curve_count = sensitivity_columns(fit.used, fit.terms), len(curves)
     found, gains = [], {}
     while curves:
-        best, gain = min((_test_curve(name, fit, known, columns, by_model)
-                          for name, columns in curves.items()),
-                         key=lambda each: (each[0].p_value, -each[1]))
-        chance = min(1.0, curve_count * best.p_value)
+        tests = {name: fit.test(columns, known) for name, columns in curves.items()}
+        name = min(tests, key=lambda each: (tests[each].p_value, -tests[each].gain))
+        chance = min(1.0, curve_count * tests[name].p_value)
         if chance >= false_alarm_rate:
             break
-        found.append(replace(best, p_value=chance))
-        gains[best.along] = gain
-        known = np.column_stack([known, curves.pop(best.along)])
+        found.append(Unexplained(name, tests[name].share, chance))
+        gains[name] = tests[name].gain
+        known = np.column_stack([known, curves.pop(name)])
     return tuple(found), gains
-
-
-def _test_curve(name: str, fit: Calibration, known: Array, columns: Array,
-                by_model: Array | None) -> tuple[Unexplained, float]:
-    """Return share, p-value and reduction of the misfit of a curve given the known columns."""
-    whitener, error = Whitener(fit.used, fit.scatter), fit.residual[fit.scatter.inliers]
-    known = whitener.whiten(known)
-    left, sizes, _ = np.linalg.svd(known / np.linalg.norm(known, axis=0), full_matrices=False)
-    known_basis = left[:, sizes > 1e-6 * sizes[0]]
-    white = whitener.whiten(error)
-    white = white - known_basis @ (known_basis.T @ white)
-    curve = whitener.whiten(columns)
-    curve = curve / np.maximum(np.linalg.norm(curve, axis=0), 1e-300)
-    left, sizes, _ = np.linalg.svd(curve - known_basis @ (known_basis.T @ curve),
-                                   full_matrices=False)
-    new_basis = left[:, sizes > 1e-3]  # what is new in the curve
-    count, freedom = new_basis.shape[1], len(white) - known_basis.shape[1] - new_basis.shape[1]
-    if not count or freedom < 3:
-        return Unexplained(name, 0.0, 1.0), 0.0
-    gain, total = float(np.sum((new_basis.T @ white) ** 2)), float(white @ white)
-    share = 1.0 - (total - gain) / freedom / (total / (freedom + count))
-    # Columns in their own unit, for the covariance of the dwells may be another one.
-    plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (known_basis, new_basis)]
-    # an F test over what the scatter may be, given the errors of the model
-    uncertain = Uncertainty.from_fit(fit.used, fit.scatter, np.column_stack(plain), error)
-    values, covariances = uncertain.offsets[:, -count:], uncertain.covariances[:, -count:, -count:]
-    if by_model is not None:
-        of_model = new_basis.T @ whitener.whiten(by_model)
-        covariances = covariances + of_model @ of_model.T
-    squares = np.einsum('ki,ki->k', values,
-                        np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
-    chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.dof))
-    return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
 
 
 def _structure_curves(dwells: Dwells) -> dict[str, Array]:
@@ -530,14 +385,19 @@ def _structure_curves(dwells: Dwells) -> dict[str, Array]:
             dwells.rate, min(_MAX_CURVE_COLUMNS, len(dwells) // _MIN_DWELLS_PER_COLUMN)),
         'single_rates': _rate_columns(dwells),
         'order_of_dwells': _spline_columns(np.arange(len(dwells)).astype(float), slow)}
-    if dwells.temperature is not None and np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD:
+    if dwells.temperature is not None and _shows_temperature(dwells):
         curves['temperature'] = _spline_columns(dwells.temperature, slow)
-        rate, temperature = (_scale_to_unit_range(each)
-                             for each in (dwells.rate, dwells.temperature))
+        rate, temperature = map(_scale_to_unit_range, (dwells.rate, dwells.temperature))
         curves['rate_times_temperature'] = np.column_stack(
             [np.zeros((len(dwells), 0)), *(rate ** i * temperature ** j for i in (1, 2, 3)
                                            for j in range(1, min(slow, 2) + 1))])
     return curves
+
+
+def _shows_temperature(dwells: Dwells) -> bool:
+    """Tell whether effects of temperature can be seen."""
+    return (dwells.temperature is not None
+            and bool(np.ptp(dwells.temperature) >= MIN_TEMPERATURE_SPREAD))
 
 
 def _scale_to_unit_range(values: Array) -> Array:
@@ -569,89 +429,60 @@ def _rate_columns(dwells: Dwells) -> Array:
 
 # findings
 
-def _misfit_reduction(named: NamedCauses, effect: Effect) -> float:
-    """Return the reduction of the sum of squares by a cause."""
-    if effect in NUISANCE_EFFECTS:
-        change = value_change(named.fit, named.model, effect)
-        return (change / named.fit.effect_deviation(effect)) ** 2
-    rest = _fit_without(named, effect)
-    return math.inf if rest is None else rest.misfit - named.change_fit.misfit
-
-
-def _fit_without(named: NamedCauses, effect: Effect) -> Calibration | None:
-    fit, change = named.change_fit, named.change_effect(effect)
-    return try_fit(fit, [each for each in fit.effects if each is not change])
-
-
 def _cause_finding(named: NamedCauses, effect: Effect) -> Finding:
     others, separate_by = find_alternatives(named.fit, effect)
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
-    own = _model_values(named, effect)
+    own = _given_values(named.fit, effect)
     # what is added to the model's values
     estimates = {parameter.name: Estimate.from_half_width(
         value - own[effect.parameters.index(parameter)], NORMAL_QUANTILE_975 * deviation,
         parameter.unit) for name, parameter, value, deviation in named.fit.model.estimates()
         if name == effect.name}
-    return make_finding(effect.name, estimates, named.p_value(effect), others,
+    rest = named.fit_without(effect)
+    evidence = '' if rest is None else (
+        f'without it, left-out sweeps are predicted to {rest.left_out_rms / DEGREE:.3g} deg/s, '
+        f'with it to {named.fit.left_out_rms / DEGREE:.3g} deg/s; '
+        f'{math.sqrt(max(named.misfit_reduction(effect), 0.0)):.1f} sigma from zero')
+    chance = min(1.0, named.fit.p_value(effect) * named.tested_count(effect))
+    return make_finding(effect.name, estimates, chance, others,
                         minimum_detectable=_minimum_detectable(named, effect),
-                        separate_by=separate_by, evidence=_evidence_sentence(named, effect),
-                        **along)
+                        separate_by=separate_by, evidence=evidence, **along)
 
 
-def _model_values(named: NamedCauses, effect: Effect) -> tuple[float, ...]:
-    """Return the values that the model has of an effect, 0 where it has none."""
-    return next((term.values for term in named.model.terms if term.effect is effect),
+def _given_values(fit: Calibration, effect: Effect) -> tuple[float, ...]:
+    """Return the values that the given model has of an effect, 0 where it has none."""
+    return next((term.values for term in fit.given.terms if term.effect is effect),
                 (0.0,) * len(effect.parameters))
 
 
 def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
-    """Return the minimum detectable size of an effect, in the unit of its first value."""
-    fit, change = named.change_fit, named.change_effect(effect)
-    level = significance_level(named.false_alarm_rate, effect in NUISANCE_EFFECTS)
-    if effect in NUISANCE_EFFECTS:
-        return _detectable_size(named.fit, effect, level)
-    if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):
-        return _detectable_size(fit, change, level)
-    # A small sine response equals -k² w³ / 6.
-    cubic = try_fit(fit, replace_effect(fit.effects, change, CUBIC_NONLINEARITY))
-    if cubic is None:
+    """
+    Return the size of an effect that is found with 95 %, in the unit of its first value.
+
+    That of a sine response is by the cubic: a small one equals -k² w³ / 6.
+
+    """
+    fit, fitted = named.fit, CUBIC_NONLINEARITY if effect is SINE_RESPONSE else effect
+    by_cubic = fit if fitted is effect else try_replace(fit, effect, fitted)
+    if by_cubic is None:
         return None
-    size, own = (_detectable_size(cubic, CUBIC_NONLINEARITY, level),
-                 _model_values(named, SINE_RESPONSE)[0])
-    return size if effect is CUBIC_NONLINEARITY else math.sqrt(own ** 2 + 6.0 * size) - own
-
-
-def _detectable_size(fit: Calibration, effect: Effect, level: float) -> float:
-    """Return the size of a value that is found with a probability of 95 %."""
-    place, uncertainty = fit.last_index(effect), fit.uncertainty
+    place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
     variance = np.tensordot(uncertainty.weights, uncertainty.covariances, axes=1)[place, place]
-    return float(uncertainty.half_width(1.0 - level)[place]
+    size = float(uncertainty.half_width(1.0 - named.level(effect))[place]
                  + norm.ppf(0.95) * math.sqrt(variance))
-
-
-def _evidence_sentence(named: NamedCauses, effect: Effect) -> str:
-    sigmas = f'{math.sqrt(max(_misfit_reduction(named, effect), 0.0)):.1f} sigma from zero'
-    if effect in NUISANCE_EFFECTS:
-        parameter = effect.parameters[-1]
-        change = format_amount(value_change(named.fit, named.model, effect), parameter.unit,
-                               parameter.name)
-        return f'it differs from that of the model by {change}; {sigmas}'
-    rest = _fit_without(named, effect)
-    if rest is None:
-        return ''
-    return (f'without it, left-out sweeps are predicted to {rest.left_out_rms / DEGREE:.3g} '
-            f'deg/s, with it to {named.change_fit.left_out_rms / DEGREE:.3g} deg/s; {sigmas}')
+    own = _given_values(fit, SINE_RESPONSE)[0]
+    return size if fitted is effect else math.sqrt(own ** 2 + 6.0 * size) - own
 
 
 # remarks
 
 
 def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
-             structures: Sequence[Unexplained], withdrawn: frozenset[str], gain: Gain | None,
+             structures: Sequence[Unexplained], withdrawn: Collection[Effect], gain: Gain | None,
              offered: bool) -> Iterator[str]:
     scatter = named.fit.scatter
     if withdrawn:
-        yield (f'Not named: {", ".join(sorted(withdrawn))}: along the same '
+        yield (f'Not named: {", ".join(sorted(each.name for each in withdrawn))}: along the same '
                'variable, much structure is left without a name.')
     if named.causes and not offered:
         yield ('The errors of the extended model for left-out dwells are larger than those of the '
@@ -667,7 +498,7 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
            f'{100.0 * scatter.sweep_scale:.2g} % in scale factor.')
     if model is None:
         return
-    known = visible_terms(model)
+    known = static_terms(model)
     unseen = [term.effect.name for term in model.terms if term not in known]
     if unseen:
         yield (f'Dwells without time do not show {", ".join(unseen)}; these effects of the model '
@@ -717,10 +548,9 @@ def _untestable_causes(dwells: Dwells) -> dict[str, str]:
 
 # curves
 
-def error_curves(dwells: Dwells, scatter: Scatter, before: GyroModel,
-                 after: GyroModel) -> tuple[Curve, ...]:
+def error_curves(fit: Calibration, before: GyroModel, after: GyroModel) -> tuple[Curve, ...]:
     """Return the errors of dwells, without outliers, along rate, temperature and their order."""
-    used = select_dwells(dwells, scatter.inliers)
+    used, scatter = fit.used, fit.scatter
     ones = np.ones(len(used))
     variables = [('rate', 'rad/s', used.rate, ones),
                  ('order_of_dwells', '', np.arange(1.0, len(used) + 1.0), ones)]
@@ -756,57 +586,41 @@ def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]
     experiment = CAUSES[effect.name].separate_by
     if effect in _ALWAYS_CONFOUNDED:
         return [_ALWAYS_CONFOUNDED[effect]], experiment
-    whitener, term = (Whitener(fit.used, fit.scatter),
-                      next(each for each in fit.terms if each.effect is effect))
-    inliers = fit.scatter.inliers
-    # the residual with what the effect explains
-    error = whitener.whiten(fit.residual[inliers] + term.error(channels_of(fit.used)))
-    known = whitener.whiten(
-        sensitivity_columns(fit.used, [each for each in fit.terms if each is not term]))
-    found = []
-    for name, columns in _alternative_columns(fit, effect):
-        misfits = []
-        for column in columns:
-            both = np.column_stack([known, whitener.whiten(column[inliers])])
-            lengths = np.linalg.norm(both, axis=0)
-            both = both / np.where(lengths > 0.0, lengths, 1.0)
-            left = error - both @ np.linalg.lstsq(both, error, rcond=None)[0]
-            misfits.append(float(left @ left))
-        sigmas = math.sqrt(max(min(misfits) - fit.misfit, 0.0))
-        if sigmas < MIN_DISTINGUISHING_SIGMAS:
-            found.append((sigmas, name))
-    names = [name for _, name in sorted(found)]
-    other = CONFOUNDERS.get(effect)
-    if other is not None and other.name in names:
-        swapped = try_fit(fit, replace_effect(fit.effects, effect, other))
+    others = [each for each in fit.terms if each.effect is not effect]
+    columns = dict(_alternative_columns(fit, effect))
+    gains = fit.gains(np.column_stack([fit.change(effect), *columns.values()]),
+                      sensitivity_columns(fit.used, others), fit.change(effect))
+    ends = np.cumsum([1, *(each.shape[1] for each in columns.values())])
+    lacks = {name: max(gains[0] - float(gains[begin:end].max()), 0.0)
+             for name, begin, end in zip(columns, ends, ends[1:])}
+    names = sorted((name for name, lack in lacks.items()
+                    if lack < MIN_DISTINGUISHING_SIGMAS ** 2), key=lambda name: lacks[name])
+    if effect in CONFOUNDERS and CONFOUNDERS[effect].name in names:
+        swapped = try_replace(fit, effect, CONFOUNDERS[effect])
         rate = None if swapped is None else distinguishing_rate(fit, swapped)
         if rate is not None:
             experiment = f'add two dwells each way at {rate / DEGREE:.0f} deg/s'
     return names, experiment if names else ''
 
 
-def _alternative_columns(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]]]:
-    """Give the causes that may stand for an effect, with columns of dwells tried one by one."""
-    dwells, channels = fit.dwells, channels_of(fit.dwells)
-    is_slope_of_curve = (effect is BIAS_TEMPERATURE
-                         and BIAS_TEMPERATURE_QUADRATIC in fit.effects)
-    for name, other in () if is_slope_of_curve else STATIC_EFFECTS.items():
-        if other in fit.effects or ('temperature' in other.inputs and (
-                dwells.temperature is None or np.ptp(dwells.temperature)
-                < MIN_TEMPERATURE_SPREAD)):
-            continue
-        shapes: list[list[float]] = [[]]
-        for shape in other.nonlinear_parameters:
-            shapes = ([[fit.model.reference_temperature]] if shape.default is not None
-                      else [[value] for value in np.geomspace(*shape.bounds, 60).tolist()])
-        yield name, [np.asarray(Term(other, (*shape, 1.0)).error(channels))
-                     + np.zeros(len(dwells)) for shape in shapes]
-    order = np.arange(len(dwells)) / len(dwells)
+def _alternative_columns(fit: Calibration, effect: Effect) -> Iterator[tuple[str, Array]]:
+    """Give the causes that may stand for an effect, with a column for each of their shapes."""
+    dwells, channels = fit.used, channels_of(fit.used)
+    fastest = float(np.abs(dwells.rate).max())
+    # a curve over temperature keeps its slope
+    names = [] if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects else [
+        name for name, other in STATIC_EFFECTS.items() if other not in fit.effects]
+    if not _shows_temperature(dwells):
+        names = [name for name in names if 'temperature' not in STATIC_EFFECTS[name].inputs]
     if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
-        yield 'rate_ramp', [order]
-        yield 'warm_up', [np.exp(-order / constant) for constant in (0.05, 0.1, 0.2, 0.5)]
+        names += ['rate_ramp', 'warm_up']
+    for other in map(CATALOGUE.__getitem__, names):
+        shapes = [[fit.given.reference_temperature] if shape.default is not None
+                  else np.geomspace(*shape.bounds, 60).tolist()
+                  for shape in other.nonlinear_parameters]
+        yield other.name, np.column_stack([
+            np.asarray(Term(other, (*shape, 1.0)).error(channels)) for shape in product(*shapes)])
     if effect in CONFOUNDERS:
-        assert SATURATION.distortion is not None
-        yield 'saturation', [
-            SATURATION.distortion(dwells.rate, order, limit) - dwells.rate
-            for limit in (np.abs(dwells.rate).max() * np.linspace(0.5, 0.98, 25)).tolist()]
+        yield 'saturation', np.column_stack([
+            np.clip(dwells.rate, -limit, limit) - dwells.rate
+            for limit in (fastest * np.linspace(0.5, 0.98, 25)).tolist()])

@@ -93,12 +93,12 @@ class Observations:
 
 @dataclass(frozen=True)
 class Interval:
-    """Estimates with standard deviations and 95 % bounds: each of shape (k,), or numbers."""
+    """Estimates with 95 % bounds and standard deviations: each of shape (k,), or numbers."""
 
     value: Any
-    deviation: Any
     low: Any
     high: Any
+    deviation: Any = math.nan
 
 
 def _sum_matrix(place: IntegerArray, terms: Array, size: int) -> Any:
@@ -210,15 +210,6 @@ def _log_variances(observed: Observations, variances: Mapping[str, Array]) -> Ar
     zeros = np.zeros(len(next(iter(variances.values()))))
     return np.asarray(variances.get(POWER_ONS, zeros)[:, None]
                       + variances.get(OWN_SHARE, zeros + 1.0)[:, None] * observed.deviation ** 2)
-
-
-@dataclass(frozen=True)
-class Component:
-    """A standard deviation: its REML estimate and the bounds that hold it with 95 %."""
-
-    estimate: float
-    low: float
-    high: float
 
 
 class PooledValue:
@@ -341,7 +332,7 @@ class PooledValue:
         return sample, weight / weight.sum()
 
     @cached_property
-    def components(self) -> dict[str, Component]:
+    def components(self) -> dict[str, Interval]:
         """Return the standard deviations by name, and the independent share of the errors."""
         found, likeliest, sample = ({}, self._variances_at(self._best_point[None]),
                                     self._variances_at(self._sample_points))
@@ -359,7 +350,7 @@ class PooledValue:
                     1.0, 2.0 * (without[0] - without[1]) > 3.841, 1.0]
             if name in SLOPES:
                 values = values / self._column_scales[1 + SLOPES.index(name)]
-            found[name] = Component(*values.tolist())
+            found[name] = Interval(*values.tolist())
         return found
 
     # estimates
@@ -398,7 +389,7 @@ class PooledValue:
         deviation = np.sqrt(self._sample_weights @ (variance + (mean - value) ** 2))
         low, high = (_mixture_quantile(mean, variance, self._sample_weights, chance)
                      for chance in (0.025, 0.975))
-        return Interval(value, deviation, low, high)
+        return Interval(value, low, high, deviation)
 
     def p_value(self, **wanted: Any) -> Array:
         """Return the two-sided p-values of linear functions against 0, shape (k,)."""

@@ -46,7 +46,6 @@ from gyro_calibration.diagnosis.words import (
 from gyro_calibration.files import to_printable
 from gyro_calibration.fleet.pooling import (
     Alarm,
-    Component,
     DRIVES,
     find_changes,
     find_outliers,
@@ -82,7 +81,7 @@ class ValueSummary:
     unit: str  # of the value, in SI
     is_slow: bool  # an effect that one log does not distinguish from the wander of the bias
     records: Sequence[Record]  # of the logs that hold it
-    components: Mapping[str, Component]  # standard deviations
+    components: Mapping[str, Interval]  # standard deviations
     mean: Interval  # of the type
     p_value: float  # of the mean against zero
     new_unit: Interval  # prediction for one more unit of the type
@@ -110,8 +109,7 @@ class ValueSummary:
         component = self.components[name]
         if component.low <= 0.0:
             return f'less than {format_amount(component.high, self.unit, self.name)}'
-        return str(format_quantity(Estimate(
-            component.estimate, (component.low, component.high), self.unit), self.name))
+        return self.format_interval(component)
 
 
 @dataclass(frozen=True)
@@ -199,7 +197,7 @@ def _summarize_value(name: str, slow: bool, records: Sequence[Record],
 
 def _by_name(names: Sequence[str], found: Interval) -> dict[str, Interval]:
     return {name: Interval(*map(float, parts)) for name, *parts in zip(
-        names, found.value, found.deviation, found.low, found.high)}
+        names, found.value, found.low, found.high, found.deviation)}
 
 
 def _covariates(records: Sequence[Record], unit: IntegerArray) -> dict[str, Array]:
@@ -251,7 +249,7 @@ def _describe_value(value: ValueSummary) -> Iterator[str]:
                 'between drives, and common to the units of a drive',
                 POWER_ONS: 'is not repeatable: most of its variance is between power-ons'}
     shares = {name: value.components[name] for name in meanings if name in value.components}
-    owner = max(shares, key=lambda name: shares[name].estimate, default='')
+    owner = max(shares, key=lambda name: shares[name].value, default='')
     if owner and shares[owner].low > 0.0 and not value.is_slow:
         yield f'{label} {meanings[owner]}'
     for alarms, who, differs, of in (
@@ -344,7 +342,7 @@ def _value_data(value: ValueSummary) -> dict[str, Any]:
             **{name: f'between_units_over_{over}' for name, over in zip(SLOPES, value.slopes)}}
     return {
         'unit': value.unit, 'slow': value.is_slow, 'logs': len(value.records),
-        **{keys[name]: {'estimate': part.estimate, 'ci95': [part.low, part.high]}
+        **{keys[name]: {'estimate': part.value, 'ci95': [part.low, part.high]}
            for name, part in value.components.items()},
         'type_mean': _interval_data(value.mean), 'new_unit': _interval_data(value.new_unit),
         'chance_of_zero_mean': value.p_value,
@@ -496,7 +494,7 @@ def _variance_table(summary: TypeSummary) -> Markup:
         rows.append([
             _cell(readable_name(each.name)), _interval_cell(each, each.mean),
             _interval_cell(each, each.new_unit),
-            *(_cell(each.format_component(name), each.components[name].estimate
+            *(_cell(each.format_component(name), each.components[name].value
                     if name in each.components else -1.0) for name in COMPONENT_LABELS),
             *([_cell(drift)] if drifts else [])])
     return _table(heads, rows)

@@ -119,6 +119,14 @@ def test_a_sine_with_its_zeros_at_the_rates_of_the_dwells_is_no_response():
         assert select_effects(table, 'open_loop_fog').calibration.min_non_monotonic_rate is None
 
 
+@pytest.mark.parametrize('technology', [None, 'open_loop_fog'])
+def test_a_sine_that_passes_through_evenly_spaced_rates_is_not_taken_for_a_cubic(technology):
+    """Rates of multiples of 20 deg/s do not distinguish k from 18 s - k, of the other sign."""
+    terms = (*LINEAR, Term(CUBIC_NONLINEARITY, (0.001,)))
+    table = measured(Table(sweeps=16, rates=11, dwell=0.01 * DEGREE), terms)
+    assert 'cubic_nonlinearity' in names(select_effects(table, technology))
+
+
 def test_every_effect_has_its_reason():
     selection = select_effects(measured(WANDERING, SINE), 'open_loop_fog')
     reasons = {choice.effect: choice for choice in selection.choices}

@@ -301,8 +301,8 @@ def test_balanced_data_give_the_variances_of_an_analysis_of_variance():
     rest = np.sum((values - units[:, None] - drives + values.mean()) ** 2) / 20.0
     for name, wanted in (('units', np.var(units, ddof=1) - rest / 5.0),
                          ('drives', np.var(drives, ddof=1) - rest / 6.0), ('power_ons', rest)):
-        assert found[name].estimate == pytest.approx(np.sqrt(wanted), rel=2e-3)
-        assert found[name].low < found[name].estimate < found[name].high
+        assert found[name].value == pytest.approx(np.sqrt(wanted), rel=2e-3)
+        assert found[name].low < found[name].value < found[name].high
 
 
 def test_the_interval_of_one_more_unit_is_that_of_student():
