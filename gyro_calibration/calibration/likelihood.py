@@ -91,9 +91,6 @@ class ScaleBiasFit:
     dof: float = 0.0
     # comparison of that with the noise; None where the noise is not known
     goodness: GoodnessOfFit | None = None
-    # error of the heading that repeats with the motion, rad, where the bias was fitted to windows
-    # because of it
-    repeatable_error: float = 0.0
     # standard deviation between the turns of a profile of the fraction that each lost, 1
     slip_deviation: float = 0.0
 
