@@ -11,8 +11,8 @@
 """
 Logs to a model: self-calibration, whole turns, rate table, encoder, course over ground.
 
-Reading order: `noise_grid`, `likelihood`, `fit_quality`, `run_faults`, `self_calibration`,
-`whole_turns`, `motion_design`, `dwells`, `scatter`, `rate_table`, `selection`,
-`reference_noise`, `heading_regression`, `encoder`.
+Reading order: `noise_grid`, `likelihood`, `run_faults`, `self_calibration`, `whole_turns`,
+`motion_design`, `dwells`, `scatter`, `rate_table`, `selection`, `reference_noise`,
+`heading_regression`, `encoder`.
 
 """

@@ -35,7 +35,6 @@ from gyro_calibration.calibration.dwells import (
     few_values_remedy,
     interpolate_reference,
 )
-from gyro_calibration.calibration.fit_quality import DRIVE_DURATION
 from gyro_calibration.calibration.heading_regression import (
     fit_course,
     is_noisy,
@@ -58,7 +57,12 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.calibration.reference_noise import is_course, MAX_ROUNDING_STEP
 from gyro_calibration.calibration.run_faults import refuse_unit_error
-from gyro_calibration.calibration.self_calibration import fit_rate, refuse_scale, RunLimits
+from gyro_calibration.calibration.self_calibration import (
+    DRIVE_DURATION,
+    fit_rate,
+    refuse_scale,
+    RunLimits,
+)
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.logs.quality import (

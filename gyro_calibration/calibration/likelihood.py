@@ -91,9 +91,6 @@ class ScaleBiasFit:
     dof: float = 0.0
     # comparison of that with the noise; None where the noise is not known
     goodness: GoodnessOfFit | None = None
-    # error of the heading that repeats with the motion, rad, where the bias was fitted to windows
-    # because of it
-    repeatable_error: float = 0.0
     # standard deviation between the turns of a profile of the fraction that each lost, 1
     slip_deviation: float = 0.0
 
@@ -481,6 +478,7 @@ class _Estimate:
     rate_variance: float
     noise: _IncrementCovariance
     influence: Array
+    log_likelihood: float
 
 
 #: Variance of a block's reference noise over what the rate noise adds from block to block.
@@ -489,83 +487,56 @@ _NOISE_RATIOS = np.geomspace(1e-3, 1e5, 25)
 
 def _solve_weighted(data: _Increments, noise: _IncrementCovariance, instrument: Array,
                     prior: Array) -> _Estimate:
-    """Solve the weighted normal equations."""
-    weighted = noise.solve(instrument)
-    matrix, vector = weighted.T @ data.columns, weighted.T @ data.gyro_increments
-    rate_variance = 0.0
+    """Solve the weighted normal equations, and compute the likelihood of noise and prior."""
+    weighted, count = noise.solve(instrument), len(data.gyro_increments)
+    matrix, known = weighted.T @ data.columns, np.isfinite(prior)
+    # of the deviations from a solution without priors, of which rounding leaves more digits
+    start = np.linalg.lstsq(matrix, weighted.T @ data.gyro_increments, rcond=1e-14)[0]
+    rest = data.gyro_increments - data.columns @ start
+    gradient, residual, dof = weighted.T @ rest, rest, count - len(prior) - 1.0
     for _ in range(3):
+        rate_variance = max(float(residual @ noise.solve(residual)) / dof,
+                            _min_rate_variance(data))
         precision = rate_variance / prior ** 2
         regular = matrix + np.diag(precision)
-        values = np.linalg.lstsq(regular, vector + precision * data.prior_mean, rcond=1e-14)[0]
-        inverse = np.linalg.pinv(regular, rcond=1e-14)
+        size = np.sqrt(np.abs(np.diag(regular)))
+        scaled = regular / np.outer(size, size) + 1e-14 * np.eye(len(prior))
+        inverse = np.linalg.inv(scaled) / np.outer(size, size)
+        change = inverse @ (gradient - precision * (start - data.prior_mean))
         # the values that the priors leave open, and the ratio of the noises
-        dof = len(data.gyro_increments) - 1.0 - float(np.trace(inverse @ matrix))
-        residual = data.gyro_increments - data.columns @ values
-        rate_variance = max(
-            float(residual @ noise.solve(residual)) / dof, _min_rate_variance(data))
-    return _Estimate(prior, values, dof / (dof - 2.0) * rate_variance * inverse, residual,
-                     dof, rate_variance, noise, residual[:, None] * (weighted @ inverse[:2].T))
+        dof = count - 1.0 - float(np.trace(inverse @ matrix))
+        residual = rest - data.columns @ change
+    values = start + change
+    log_likelihood = -0.5 * (
+        (count - len(prior) - 1.0) * math.log(rate_variance) + dof + noise.log_determinant
+        + np.sum(((values - data.prior_mean) / prior)[known] ** 2 + 2.0 * np.log(prior[known]))
+        + np.linalg.slogdet(scaled)[1] + 2.0 * np.log(size).sum())
+    return _Estimate(prior, values, dof / (dof - 2.0) * rate_variance * inverse, residual, dof,
+                     rate_variance, noise, residual[:, None] * (weighted @ inverse[:2].T),
+                     float(log_likelihood))
 
 
-@dataclass(frozen=True)
-class _ModelAverage:
-    """Estimates averaged over the sizes of both noises and of the priors, by likelihood."""
+def _average_over_noise(data: _Increments,
+                        prior_factors: Array) -> tuple[Array, Array, _Estimate]:
+    """
+    Return the average over all ratios of the noises and factors of the priors, (m, k).
 
-    # means of the values, shape (k,), and their covariance, shape (k, k)
-    values: Array
-    covariance: Array
-    # of the noises, and prior standard deviations, shape (k,), that are likeliest
-    ratio: float
-    prior_deviation: Array
+    Returns
+    -------
+    means of the values, shape (k,), their covariance, shape (k, k), and the likeliest estimate
 
-
-def _average_over_noise(data: _Increments, prior_factors: Array) -> _ModelAverage:
-    """Return the average over all ratios of the noises and factors of the priors, (m, k)."""
-    ratios = (_NOISE_RATIOS
-              * float(np.median(data.walk_variance) / np.median(data.reference_variance)))
-    priors, count, known = (data.prior_deviation * prior_factors, len(data.gyro_increments),
-                            np.isfinite(data.prior_deviation))
-    solutions = []
-    for ratio in ratios:
-        noise = _IncrementCovariance(data, ratio)
-        weighted = noise.solve(data.columns)
-        matrix = weighted.T @ data.columns
-        unregularized = np.linalg.lstsq(matrix, weighted.T @ data.gyro_increments, rcond=1e-14)[0]
-        residual_squares = data.gyro_increments - data.columns @ unregularized
-        solutions.append((matrix, unregularized, weighted.T @ residual_squares,
-                          residual_squares @ noise.solve(residual_squares), noise.log_determinant))
-    matrix, unregularized, gradient, squares, determinant = (
-        np.array(each)[:, None] for each in zip(*solutions))
-    min_variance, dof = _min_rate_variance(data), count - len(data.prior_deviation) - 1.0
-    variance = np.maximum(np.repeat(squares, len(prior_factors), axis=1) / dof, min_variance)
-    for _ in range(3):
-        precision = variance[..., None] / priors ** 2
-        regular = matrix + precision[..., None] * np.eye(len(data.prior_deviation))
-        size = np.sqrt(np.einsum('...ii->...i', regular))
-        scaled = (regular / size[..., None] / size[..., None, :]
-                  + 1e-14 * np.eye(len(data.prior_deviation)))
-        inverse = np.linalg.inv(scaled) / size[..., None] / size[..., None, :]
-        change = np.einsum('...ij,...j->...i', inverse,
-                           gradient - precision * (unregularized - data.prior_mean))
-        dof = count - 1.0 - np.einsum('...ij,...ji->...', inverse, matrix)
-        residual_squares = squares + np.einsum(
-            '...i,...i->...', change,
-            np.einsum('...ij,...j->...i', matrix, change) - 2.0 * gradient)
-        variance = np.maximum(residual_squares / dof, min_variance)
-    values = unregularized + change
-    logarithms = -0.5 * ((count - len(data.prior_deviation) - 1.0) * np.log(variance) + dof
-                         + determinant + (((values - data.prior_mean) / priors)[..., known] ** 2
-                                          + 2.0 * np.log(priors[:, known])).sum(axis=-1)
-                         + np.linalg.slogdet(scaled)[1] + 2.0 * np.log(size).sum(axis=-1)).ravel()
+    """
+    typical = float(np.median(data.walk_variance) / np.median(data.reference_variance))
+    noises = [_IncrementCovariance(data, ratio) for ratio in _NOISE_RATIOS * typical]
+    estimates = [_solve_weighted(data, noise, data.columns, data.prior_deviation * factors)
+                 for noise in noises for factors in prior_factors]
+    logarithms, values, covariances = (
+        np.array([getattr(each, name) for each in estimates])
+        for name in ('log_likelihood', 'values', 'covariance'))
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
-    # the variance is estimated too, so the values have Student's distribution, which is wider
-    within = np.einsum('g,gij->ij', weights * (variance * dof / (dof - 2.0)).ravel(),
-                       inverse.reshape(-1, *inverse.shape[2:]))
-    values = values.reshape(len(weights), -1)
-    ratio, part = divmod(int(weights.argmax()), len(prior_factors))
-    return _ModelAverage(weights @ values, within + np.cov(values.T, aweights=weights, ddof=0),
-                         float(ratios[ratio]), priors[part])
+    return (weights @ values, np.tensordot(weights, covariances, 1)
+            + np.cov(values.T, aweights=weights, ddof=0), estimates[int(weights.argmax())])
 
 
 def _min_rate_variance(data: _Increments) -> float:
@@ -624,15 +595,16 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
 
     """
     alignment = _RunAlignment(time, rate, motion, lag_deviation, slip_deviation)
-    offset, data, mixture, estimate = _fit_offset(alignment, largest_time_offset)
-    values, covariance = estimate.values[:2], mixture.covariance[:2, :2]
+    offset, data, averages, averaged_covariance, estimate = _fit_offset(
+        alignment, largest_time_offset)
+    values, covariance = estimate.values[:2], averaged_covariance[:2, :2]
     found, edges, inside, noise_deviation = _find_stretch_of_fit(estimate, data)
     if alignment.is_measured:
         # noise during turns only, such as slip of wheels, exceeds its robust estimate
         noise_deviation = max(noise_deviation,
                               math.sqrt(max(found.remaining_squares, 0.0) / (len(inside) - 4.0)))
     else:
-        values = mixture.values[:2]
+        values = averages[:2]
         probability, stretch_values, stretch_covariance = _weigh_stretch(
             estimate, data, found, inside, noise_deviation)
         change = stretch_values - values
@@ -641,7 +613,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         values = values + probability * change
     scale, bias = values.tolist()
     # with a slip, first the columns of the differences between turns, then of the ends of turns
-    slips = mixture.values[data.prior_deviation == slip_deviation]
+    slips = averages[data.prior_deviation == slip_deviation]
     slips = slips[:len(slips) // 2]
     slip = math.sqrt(np.mean(slips ** 2)) if slip_deviation and len(slips) else 0.0
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
@@ -656,23 +628,26 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         scale - 1.0, bias, covariance, offset, math.sqrt(estimate.rate_variance), reference_noise,
         (abs(found.excess_rate) * float(inside.sum()),
          math.sqrt(found.explained_squares) / noise_deviation),
-        math.sqrt(mixture.covariance[2, 2]),
+        math.sqrt(averaged_covariance[2, 2]),
         np.column_stack([estimate.influence, data.time[1:]]), (begin, end),
         *(_start_heading(data, estimate) if alignment.is_measured else (math.nan, math.nan)),
         residual_squares, dof, slip_deviation=slip)
 
 
 def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
-        float, _Increments, _ModelAverage, _Estimate]:
-    """Return the time offset, s, and the increments, the mean over the noise and the fit there."""
+        float, _Increments, Array, Array, _Estimate]:
+    """
+    Return the time offset, s, the increments there, and their fits.
+
+    First values and covariance averaged over the noise, then the estimate at the likeliest one.
+
+    """
     lag, largest_lag = 0.0, 0.0 if alignment.is_measured else MAX_TRACKING_LAG
     offset = alignment.find_coarse_offset(largest_time_offset + largest_lag)
     data = alignment.require_increments(offset, lag)
     for prior_factors in (data.prior_factors[:1], data.prior_factors, data.prior_factors):
         before = offset
-        mixture = _average_over_noise(data, prior_factors)
-        estimate = _solve_weighted(data, _IncrementCovariance(data, mixture.ratio), data.columns,
-                                   mixture.prior_deviation)
+        values, covariance, estimate = _average_over_noise(data, prior_factors)
         for _ in range(8):
             if alignment.is_measured:
                 estimate = _errors_in_variables(data, estimate)
@@ -687,7 +662,7 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
         if (len(prior_factors) == len(data.prior_factors)
                 and abs(offset - before) < _OFFSET_TOLERANCE):
             break
-    return offset, data, mixture, estimate
+    return offset, data, values, covariance, estimate
 
 
 #: The noise is estimated again where the offset changed by more than this, s.

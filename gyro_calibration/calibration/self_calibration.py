@@ -22,13 +22,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.fit_quality import (
-    add_asymmetry_variance,
-    refit_bias_by_windows,
-    refuse_no_improvement,
-    refuse_repeatable_error,
-)
 from gyro_calibration.calibration.likelihood import (
+    ASYMMETRY_DEVIATION,
     fit_likelihood,
     GoodnessOfFit,
     MAX_NOISE_SIGMAS,
@@ -76,8 +71,6 @@ class RunLimits:
     rest_duration: float = 2.0  # length of the check after the run, s
     # largest corrected rate at rest after the run, rad/s, unless the noise explains more
     max_rest_rate: float = 2e-4
-    # largest error of the heading that repeats with the motion, rad
-    max_repeatable_error: float = 1.0 * DEGREE
     # largest error of the heading after five minutes, rad, unless it was larger without the
     # calibration (`likelihood` only)
     max_heading_error: float = 15.0 * DEGREE
@@ -212,15 +205,30 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
                     slip_deviation: float) -> ScaleBiasFit:
-    """Fit on the stamps, or on an even grid if that leaves less, and check for slow errors."""
+    """Fit on the stamps, or on an even grid if that leaves less."""
     even_stamps = even_times(time)
     jitters = float(np.abs(even_stamps - time).max()) > 1e-3 * float(np.median(np.diff(time)))
-    fits = [(fit_likelihood(stamps, rate, motion, largest_time_offset,
-                            slip_deviation=slip_deviation), stamps)
-            for stamps in ([time, even_stamps] if jitters else [time])]
-    fit, stamps = min(fits, key=lambda found: np.linalg.det(found[0].covariance))
-    return fit if motion.rate is not None else add_asymmetry_variance(
-        refit_bias_by_windows(fit, stamps, rate, motion), rate)
+    fit = min((fit_likelihood(stamps, rate, motion, largest_time_offset,
+                              slip_deviation=slip_deviation)
+               for stamps in ([time, even_stamps] if jitters else [time])),
+              key=lambda found: float(np.linalg.det(found.covariance)))
+    return fit if motion.rate is not None else add_asymmetry_variance(fit, rate)
+
+
+def add_asymmetry_variance(fit: ScaleBiasFit, rate: Array) -> ScaleBiasFit:
+    """
+    Return the fit with the variance of a scale difference between both senses of turning added.
+
+    For measured headings; against a profile the fit includes it. Such an error is proportional to
+    the absolute value of the rate. The part of it that is proportional to the rate, or constant,
+    is indistinguishable from scale factor error and bias. In a swing without rests, the mean
+    absolute rate is indistinguishable from a bias.
+
+    """
+    columns = np.column_stack([rate, np.ones(len(rate))])
+    absorbed = np.linalg.lstsq(columns, np.abs(rate), rcond=None)[0]
+    return replace(
+        fit, covariance=fit.covariance + ASYMMETRY_DEVIATION ** 2 * np.outer(absorbed, absorbed))
 
 
 def _goodness_of_fit(fit: ScaleBiasFit, reference: ReferenceErrors,
@@ -320,8 +328,38 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
         raise DataRefused(f'the run is {fit.goodness.noise_ratio:.1f} times as noisy as the model '
                           f'states, at most {limits.max_noise_ratio:g} are allowed: fasten the '
                           'gyro, stop vibration, or measure the noise again (allan)')
-    refuse_repeatable_error(fit, limits.max_repeatable_error)
     refuse_no_improvement(fit, limits.max_heading_error)
+
+
+#: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
+#: is judged, s.
+DRIVE_DURATION = 300.0
+
+
+def refuse_no_improvement(fit: ScaleBiasFit, limit: float) -> None:
+    """
+    Refuse a calibration that by its own covariance makes a heading less accurate.
+
+    Parameters
+    ----------
+    limit : accepted standard deviation of the heading after a drive of five minutes and a whole
+        turn, rad, whatever it was before
+
+    Raises
+    ------
+    DataRefused : the standard deviation exceeds the limit, and the error without the calibration
+
+    """
+    error_with = math.sqrt(
+        (fit.covariance[1, 1] * DRIVE_DURATION + 2.0 * fit.covariance[0, 1] * math.tau)
+        * DRIVE_DURATION + fit.covariance[0, 0] * math.tau ** 2)
+    error_without = math.hypot(fit.bias * DRIVE_DURATION, fit.scale_factor_error * math.tau)
+    if error_with > max(limit, error_without):
+        raise DataRefused(f'the bias is known to {math.sqrt(fit.covariance[1, 1]) / DEGREE:.3f} '
+                          f'deg/s only, which lets a heading drift by {error_with / DEGREE:.0f} '
+                          'deg in five minutes; without the calibration it is '
+                          f'{error_without / DEGREE:.0f} deg: turn more slowly, with rests, or '
+                          'for longer')
 
 
 @dataclass(frozen=True)
