@@ -37,7 +37,6 @@ STEP = 2e-5  # rad/s from a sample to the next
 NEARLY = 0.3  # rad, in 1 s: as late as a busy machine may be at first; tested gaps are longer
 FIRST = 0.3  # rad/s
 DRIVER = {'protocol': 'csv', 'columns': '[gyro_rad_s]', 'sample_rate': RATE}
-WAITING = 1.0  # s; a publisher that waited for a subscriber would fall behind further and further
 MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 1.0e-5}\n'
 
 
