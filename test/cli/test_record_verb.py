@@ -213,7 +213,7 @@ def angles(link, rate=100.0):
     pytest.param(['--increments', 'never'], 2, 0.001, 1.0, marks=pytest.mark.evidence),
 ])
 def test_angles_at_another_rate_are_reported(run, tmp_path, options, seconds, rate, factor):
-    """Where there is no remark is tested in test_driver_report.py, without a port."""
+    """Where there is no remark is tested in test_driver_node.py, without a port."""
     with angles(tmp_path / 'gyro'):
         words = ['--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--seconds', seconds]
         code, out, error = run('record', *words, '--out', tmp_path / 'a.csv', '--json', *options)

@@ -158,12 +158,3 @@ def test_what_comes_is_recognized_or_explained(data, columns, name, words):
     recognition = recognize_protocol(data, settings)
     assert recognition.protocol is (name and find_protocol(name)), recognition.summary
     assert words in recognition.summary
-
-
-def test_a_gyro_that_counts_is_recognized_before_its_sensitivity_is_set():
-    for name in ('fizoptika', 'csv'):
-        settings = Settings(columns=('time_s', 'gyro_counts', 'temperature_degc'))
-        protocol = recognize_protocol(b''.join(frames(name, 5)), settings).protocol
-        assert protocol is find_protocol(name)
-        with pytest.raises(ValueError, match='sensitivity is not set'):
-            protocol.check_settings(settings)

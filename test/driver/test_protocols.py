@@ -167,14 +167,6 @@ def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
     assert [sample.missing for sample in decoder.feed(b''.join(frames))] == [0, 0, 0, 2, 0, 0]
 
 
-def test_samples_that_the_device_calls_invalid_are_missing_and_faults():
-    decoder = opened('kvh_dsp3000')
-    samples = decoder.feed(b''.join(b'       0.015733   %d\r\n' % (number not in (3, 4))
-                                    for number in range(7)))
-    assert [sample.missing for sample in samples] == [0, 0, 0, 2, 0]
-    assert (decoder.device_faults, decoder.discarded_bytes) == (2, 0)
-
-
 LENGTH = 300_000
 HOSTILE = {
     'noise': random.Random(6).randbytes(LENGTH),

@@ -34,7 +34,7 @@ FULL = GyroModel(TERMS, np.diag(np.arange(1.0, 8.0)) * 1e-8, (-1.7, 1.7), (20.0,
 
 def read(folder, text):
     path = folder / 'model.yaml'
-    path.write_bytes(text if isinstance(text, bytes) else text.encode('utf-8', 'surrogateescape'))
+    path.write_text(text)
     return read_model(path)
 
 
@@ -70,9 +70,7 @@ def test_a_model_is_read_back_as_it_was_written(tmp_path):
 BAD = {
     'a tolerance below zero': ('effects: {}\ntolerance: {bias: -1.0}', 'tolerance.bias is -1.0'),
     'empty': ('', 'the file is empty'),
-    'a list': ('[1, 2]', 'the file is [1, 2]'),
     'no YAML': ('effects: {bias: {bias: 0.01}\nvalid: [', 'cannot be read as YAML (line 2: '),
-    'binary': (b'\xff\xfe\x00\x01', 'cannot be read as YAML'),
     'a noise that vanishes when it is squared': (
         'effects: {}\nnoise: {angle_random_walk: 1.0e-300}', 'noise.angle_random_walk is 1e-300'),
     'other YAML': ('name: a robot\nwheels: 4\n', 'effects is empty'),

@@ -22,7 +22,6 @@ LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{
 
 REFUSED = {
     'ten to the nineteenth laughs': (LAUGHS, 'line 1: an anchor or alias is not read'),
-    'a list that holds itself': ('a: &a [*a]', 'anchor or alias'),
     'a call': ('a: !!python/object/apply:os.getcwd []', 'line 1: a tag is not read'),
     'twice the same': ('a: 1\nb: 2\na: 3', "line 3: 'a' is given twice; keep one of them"),
     'a list as name': ('? [1]\n: 2', 'a name is a list'),

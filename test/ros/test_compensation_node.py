@@ -11,9 +11,9 @@
 """
 The compensation node: its messages, parameters and services, and drives of a small robot.
 
-What it computes and decides is tested in test_pipeline.py and test_calibration_drive.py. Here are
-its messages, by a node that nobody spins, and what needs a process of its own on real DDS. Tests
-wait for events; a machine that delays samples by 0.25 s ends a drive, too, which they accept.
+What it computes and decides is tested in test_pipeline.py and test_calibration_session.py. Here
+are its messages, by a node that nobody spins, and what needs a process of its own on real DDS.
+Tests wait for events; they accept that a machine that delays samples by 0.25 s ends a drive.
 
 """
 

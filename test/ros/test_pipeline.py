@@ -149,22 +149,17 @@ def test_impossible_rates_in_a_row_are_in_the_variance(tmp_path, count):
 def test_a_gyro_that_repeats_one_value_is_an_error_and_the_heading_claims_nothing(
         tmp_path, reported, value, wheels):
     rig = rested(tmp_path, seconds=5.0, wheels=wheels)
-    begin, turns, still = len(rig.outputs) - 1, rig.robot.step, rig.robot.bias
+    begin, right, still = len(rig.outputs) - 1, rig.robot.distort, rig.robot.bias
     if value == 'in a turn':
         rig.robot.command(0.7)
         rig.go(3.0)
-
-    def step():
-        reading = turns()
-        output = {'at rest': still, 'in a turn': 0.7, 'saturated': min(reading.output, 0.3)}[value]
-        return type(reading)(reading.stamp, output, reading.heading, reading.rate)
-
-    rig.robot.step = step
+    rig.robot.distort = {'at rest': lambda _: still, 'in a turn': lambda _: 0.7,
+                         'saturated': lambda output: min(output, 0.3)}[value]
     rig.robot.command(0.0 if value == 'in a turn' else 0.7)
     rig.go(6.0)
     level, message, _ = reported(rig)
     assert level == ERROR and 'the gyro repeats' in message and 'it is dead' in message, message
-    rig.robot.step = turns
+    rig.robot.distort = right
     rig.go(3.0)
     error, deviation = rig.error(begin)
     assert abs(error) < 3.0 * deviation, (error, deviation)
@@ -689,8 +684,8 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
         tmp_path, reported, pace, warns):
     """What turns in the meantime is not what the stamps say."""
     rig = rested(tmp_path)
-    stamp, begin, first = rig.stamp, rig.clock.now, len(rig.outputs) - 1
-    rig.stamp = lambda reading: stamp(reading) + round(1e9 * (pace - 1) * (rig.clock.now - begin))
+    first = len(rig.outputs) - 1
+    rig.pace_stamps(pace)
     rig.robot.command(0.5)
     rig.go(17.0)
     reported(rig)
