@@ -18,7 +18,7 @@ import termios
 import threading
 import tty
 
-from fake_port import BEGIN, Reading, World
+from fake_port import BEGIN, damaged, Reading, SETTINGS, World
 from gyro_calibration.driver.connection import (
     Connection,
     Decimator,
@@ -30,7 +30,6 @@ from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import numpy as np
 import pytest
-from serial_faults import damaged, SETTINGS
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
 NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of the gyro'
@@ -86,7 +85,7 @@ def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_auto_finds_the_protocol_and_reports_it(name):
-    world = World(30.0, baud=find_protocol(name).baud)
+    world = World(15.0, baud=find_protocol(name).baud)
     world.gyro(name, settings=SETTINGS[name])
     reading = Reading(world, settings=SETTINGS[name])
     assert (reading.connection.protocol is find_protocol(name)

@@ -14,6 +14,7 @@ import itertools
 import math
 import random
 
+from fake_port import SETTINGS
 from gyro_calibration.driver.protocols import (
     BAUDS,
     find_protocol,
@@ -23,7 +24,6 @@ from gyro_calibration.driver.protocols import (
     Settings,
 )
 import pytest
-from serial_faults import SETTINGS
 
 ALL = sorted(PROTOCOLS)
 MOTIONS = {

@@ -22,10 +22,10 @@ from pathlib import Path
 import random
 import time
 
+from fake_port import SETTINGS
 from gyro_calibration.driver import protocols
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import pytest
-from serial_faults import SETTINGS
 
 ALL = sorted(PROTOCOLS)
 DPS = math.radians(1.0)
