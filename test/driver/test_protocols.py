@@ -297,14 +297,6 @@ def test_settings_that_do_not_fit_are_refused(name, values, message):
         find_protocol(name).decoder(replace(SETTINGS[name], **values))
 
 
-@pytest.mark.parametrize(
-    'name, near', [('kvh_dsp_3000', '; perhaps kvh_dsp3000 is meant'), ('', '')])
-def test_an_unknown_protocol_is_refused_with_the_known_ones(name, near):
-    known = ', '.join(PROTOCOLS)
-    with pytest.raises(ValueError, match=f'^protocol .*: choose one of {known}{near}$'):
-        find_protocol(name)
-
-
 # Listening
 
 
@@ -358,24 +350,18 @@ def test_every_format_is_recognized_from_five_samples_and_as_no_other(name):
 
 
 @pytest.mark.parametrize('name', ALL)
-def test_it_does_not_matter_where_the_bytes_begin_and_end(name):
-    data = b''.join(frames(name, 8))
-    generator = random.Random(1)
-    length = len(data) // 8
-    for _ in range(50):
-        recognition = recognize_protocol(
-            data[generator.randrange(2 * length):-generator.randrange(1, length)])
-        assert recognition.protocol is find_protocol(name), recognition.summary
-
-
-@pytest.mark.parametrize('name', ALL)
-def test_a_line_that_damages_a_byte_in_a_hundred_is_recognized(name):
+def test_bytes_are_recognized_wherever_they_begin_and_end_and_if_one_in_100_is_damaged(name):
     generator, data = random.Random(2), bytearray(b''.join(frames(name, 100)))
     for place in generator.sample(range(len(data)), len(data) // 100):
         data[place] ^= 1 << generator.randrange(8)
-    recognition = recognize_protocol(bytes(data))
-    assert (recognition.protocol is find_protocol(name)
-            and 0.5 < recognition.explained_share < 1.0), recognition.summary
+    few, length, shares = b''.join(frames(name, 8)), len(data) // 100, []
+    cuts = [slice(generator.randrange(2 * length), -generator.randrange(1, length))
+            for _ in range(50)]
+    for part in (bytes(data), *(few[cut] for cut in cuts)):
+        recognition = recognize_protocol(part)
+        assert recognition.protocol is find_protocol(name), recognition.summary
+        shares.append(recognition.explained_share)
+    assert 0.5 < shares[0] < 1.0 and min(shares) > 0.5
 
 
 @pytest.mark.parametrize('idle', [0, 30])

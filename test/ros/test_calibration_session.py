@@ -92,6 +92,10 @@ def faults():
         'stamps stand': (lambda rig: setattr(rig.robot, 'stamps_stand', True), 'no sample came'),
         'soft stop': (lambda rig: setattr(rig, 'other', 0.0), 'another node sent a command'),
         'teleop': (lambda rig: setattr(rig, 'other', 0.3), 'another node sent a command'),
+        'one command to drive ahead': (
+            lambda rig: rig.pipeline.add_command(
+                Velocity((0.2, 0.0, 0.0), (0.0, 0.0, rig.commands[-1][1]))),
+            'another node sent a command'),
         'no receiver': (lambda rig: setattr(rig, 'receivers', 0), 'no other node receives'),
         'two publishers': (lambda rig: rig.publishers.append('/other'), '2 publishers send'),
         'forbidden': (lambda rig: rig.set(calibration_drive=False), 'calibration.drive was set'),
@@ -166,15 +170,6 @@ def test_what_is_no_fault_does_not_keep_a_drive_from_its_calibration(tmp_path, g
     assert stored(rig).scale_factor_error == pytest.approx(SCALE, abs=5e-3)
 
 
-@pytest.mark.parametrize('linear, rate', [(0.0, 0.0), (0.0, 0.3), (0.2, None)],
-                         ids=['stop', 'turn', 'drive ahead'])
-def test_one_command_of_another_node_is_enough(tmp_path, linear, rate):
-    rig = driven(tmp_path)
-    rate = rig.commands[-1][1] if rate is None else rate
-    rig.pipeline.add_command(Velocity(linear=(linear, 0.0, 0.0), angular=(0.0, 0.0, rate)))
-    assert rig.ended and rig.commands[-1] == (rig.clock.now, 0.0)
-
-
 @pytest.mark.parametrize('interval, burst', [(0.01, 2), (0.1, 1), (0.01, 20), (0.2, 1)],
                          ids=['100 Hz', '10 Hz', 'bursts', '5 Hz'])
 def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
@@ -200,13 +195,17 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
     assert rig.stopped_after(begin) <= max(0.25, 4.0 * interval) + 2.1 * Drive.INTERVAL
 
 
-@pytest.mark.parametrize('simulated', [{}, {'ros': 1000.0}], ids=['no /clock', '/clock'])
-def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers(
-        tmp_path, simulated):
-    rig = driven(tmp_path, **simulated)
-    rig.pipeline.poll(1)
-    rig.clock.now += 0.4
-    rig.pipeline.poll(1)
+@pytest.mark.parametrize('ros', [None, 1000.0], ids=['no /clock', '/clock'])
+def test_a_pause_of_the_node_whose_messages_wait_behind_the_timers_keeps_no_drive_from_going_on(
+        tmp_path, ros):
+    def pause():
+        rig.pipeline.poll(1)
+        rig.clock.now += 0.4
+        rig.pipeline.poll(1)
+    rig = rested(tmp_path, calibration_drive=True, ros=ros)
+    pause()
+    rig.drive_to()
+    pause()
     rig.step()
     rig.pipeline.poll(1)
     assert not rig.ended
@@ -299,14 +298,6 @@ def test_a_drive_begins_only_when_the_robot_rests_and_is_free(tmp_path, given, p
     assert reason in rig.begin() and not rig.session.run
     rig.go(1.0)
     assert not rig.commands
-
-
-def test_a_drive_begins_after_a_pause_of_the_node_though_the_clock_waits_behind_it(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
-    rig.pipeline.poll(1)
-    rig.clock.now += 0.4
-    rig.pipeline.poll(1)
-    assert not rig.begin()
 
 
 def test_a_turn_that_only_the_gyro_shows_keeps_a_drive_from_beginning(tmp_path):
