@@ -49,6 +49,7 @@ def test_a_file_written_by_hand_is_enough(tmp_path):
                           'thermal_hysteresis: {thermal_hysteresis: -2E-5}}')
     assert [term.values for term in past.terms] == [(120.0, 1e-4), (10.0, 1e-3, -2e-5)]
     assert past.needs_history and not model.needs_history
+    assert past.rate(0.5, 25.0) == 0.5, 'without a history nothing lags'
     calibrated = read(tmp_path, 'effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: '
                       '0.2, standard_deviations: {bias: 0.003, scale_factor_error: 0.002}}')
     assert calibrated.self_calibration.standard_deviations == pytest.approx((0.002, 0.003))

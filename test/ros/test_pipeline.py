@@ -212,6 +212,14 @@ def test_while_the_gyro_repeats_one_value_nothing_is_driven_and_a_reset_shows_no
 # Rest
 
 
+def test_the_threshold_filter_deletes_rates_at_rest_until_it_is_switched_off(tmp_path):
+    rig = Rig(tmp_path, model='')
+    assert rig.feed(np.full(50, 0.1 * DEGREE))[-1].heading == 0.0
+    assert rig.pipeline.estimator.tracker.deleted_heading > 0.03 * DEGREE
+    rig.set(stationary_threshold=0.0)
+    assert rig.feed([0.1 * DEGREE] * 2)[-1].rate == pytest.approx(0.1 * DEGREE)
+
+
 @pytest.mark.parametrize('wheels', ['odom', 'both'])
 def test_wheels_decide_on_slow_turns(tmp_path, wheels):
     rig, slow = Rig(tmp_path, model=KNOWN, wheels=wheels), 0.05 * DEGREE
