@@ -32,7 +32,7 @@ from gyro_calibration.logs.log import DEGREE
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
-from serial_faults import damaged, SETTINGS  # noqa: E402, I100, I202
+from fake_port import damaged, SETTINGS  # noqa: E402, I100, I202
 
 SHARES = (0.001, 0.01, 0.1)
 FRAMES = 50_000

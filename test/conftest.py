@@ -241,12 +241,6 @@ def by_udp(monkeypatch):
         monkeypatch.setenv(name, value)
 
 
-@pytest.fixture
-def impatient():
-    """Return the environment of a process that loses messages as soon as on a robot."""
-    return {**os.environ, **_profile('impatient.xml')}
-
-
 class NodeProcess:
     """A node in a process of its own, as a robot starts it."""
 

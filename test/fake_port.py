@@ -8,17 +8,22 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""A serial port with devices behind it, and a clock that goes on while somebody waits."""
+"""A serial port with devices behind it, its faults, and a clock that goes on while it waits."""
 
 import heapq
 import itertools
 import math
 
 from gyro_calibration.driver.connection import Connection, PortError
-from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
+from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
+import numpy as np
 
 BEGIN = 100.0  # s
 STEP = 0.1  # s; what `SerialPort.read` waits for a first byte
+#: With what a format cannot be without: one unit of fizoptika has 27880 counts per deg/s.
+SETTINGS = {
+    name: Settings(sensitivity=np.radians(1.0 / 27880.0) if protocol.sensitivity is None else None)
+    for name, protocol in PROTOCOLS.items()}
 
 
 class World:
@@ -159,3 +164,13 @@ class Reading:
     def _on_change(self, state):
         self.states.append(state)
         self.times.append(self.world.now - BEGIN)
+
+
+def damaged(data, generator, lost=0.0, doubled=0.0, flipped=0.0):
+    """Return what arrives of bytes; each is lost, comes twice, or with one of its bits flipped."""
+    drawn = generator.random(len(data))
+    arrived = np.frombuffer(data, np.uint8).copy()
+    struck = (drawn >= lost + doubled) & (drawn < lost + doubled + flipped)
+    arrived[struck] ^= (1 << generator.integers(8, size=int(struck.sum()))).astype(np.uint8)
+    times = np.where(drawn < lost, 0, np.where(drawn < lost + doubled, 2, 1))
+    return np.repeat(arrived, times).tobytes()

@@ -34,6 +34,7 @@ import tempfile
 from typing import Any
 import zlib
 
+from fake_port import SETTINGS
 from gyro_calibration.cli.main import find_verbs, make_parser
 from gyro_calibration.cli.plan import read_limits, write_motion
 from gyro_calibration.cli.verb import UsageError
@@ -70,7 +71,6 @@ from gyro_calibration.model.motion import CALIBRATION_MOTION, MotionError, read_
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from recordings import channel, chunk, database, MCAP, record, text
-from serial_faults import SETTINGS
 
 #: Longest message of an error, in characters without the path; s that an input may take; bytes
 #: that a decoder may hold back.

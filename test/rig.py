@@ -88,6 +88,22 @@ class Rig:
         self._given.update({names[attribute]: value for attribute, value in parameters.items()})
         self.pipeline.use_parameters(parameter_values(PARAMETERS, self._given))
 
+    def pace_stamps(self, pace):
+        """Let the stamps go on from now at another pace than the clock."""
+        stamp, begin = self.stamp, self.clock.now
+        self.stamp = lambda reading: stamp(reading) + round(1e9 * (pace - 1)
+                                                            * (self.clock.now - begin))
+
+    def hold_up_samples(self, is_busy):
+        """Let samples wait while this computer is busy, and come together then."""
+        sample, waiting = self.sample, []
+
+        def late(*reading):
+            waiting.append(reading)
+            while waiting and not is_busy():
+                sample(*waiting.pop(0))
+        self.sample = late
+
     def stamp(self, reading):
         if self.clock.ros is not None:
             if not self.robot.stamps_stand:

@@ -54,7 +54,8 @@ class Robot:
     Errors of the gyro are in 1 and rad/s; the noise is the standard deviation of a sample. A
     command acts after the latency, with the time constant `lag` of the drives, s; the base stops
     when it has heard none for the timeout, s. A test sets that the gyro is `unplugged`, that
-    `stamps_stand`, or that the base is `deaf`: it goes on with what it did last.
+    `stamps_stand`, or that the base is `deaf`: it goes on with what it did last. `distort` makes
+    of the output what the gyro reports.
 
     """
 
@@ -62,6 +63,7 @@ class Robot:
                  timeout=math.inf, stamp=1000.0, seed=0):
         self.time = self.heading = self.rate = 0.0
         self.unplugged = self.stamps_stand = self.deaf = False
+        self.distort = lambda output: output
         self.scale_factor_error, self.bias, self.noise = scale_factor_error, bias, noise
         self._latency, self._lag, self._timeout = latency, lag, timeout
         self._stamp, self._random = stamp, random.Random(seed)
@@ -91,7 +93,8 @@ class Robot:
             self._stamp += INTERVAL
         output = ((1.0 + self.scale_factor_error) * self.rate + self.bias
                   + self._random.gauss(0.0, self.noise))
-        return Reading(self._stamp, None if self.unplugged else output, self.heading, self.rate)
+        return Reading(self._stamp, None if self.unplugged else self.distort(output), self.heading,
+                       self.rate)
 
 
 class RosRobot:

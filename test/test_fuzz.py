@@ -26,6 +26,7 @@ import sys
 from fuzzed import SECONDS, TARGETS
 import pytest
 
+hypothesis = pytest.importorskip('hypothesis', reason='hypothesis is not installed')
 FUZZER = Path(__file__).parents[1] / 'benchmarks' / 'fuzz.py'
 #: Target -> how many inputs hypothesis tries; YAML takes ten times as long as the rest.
 EXAMPLES = {'model': 40, 'bias table': 20, 'motion limits': 40, 'arguments': 40,
@@ -48,18 +49,6 @@ FOUND = {
 
 
 @pytest.fixture
-def hypothesis():
-    """Return the library, with which inputs are made up; skip where it is missing."""
-    return pytest.importorskip('hypothesis', reason='hypothesis is not installed')
-
-
-@pytest.fixture
-def atheris():
-    """Skip where atheris is missing: it has wheels for Linux on x86-64 alone."""
-    pytest.importorskip('atheris', reason='atheris is not installed')
-
-
-@pytest.fixture
 def target(name):
     """Return a target; those of the nodes are skipped without ROS 2."""
     if name not in TARGETS:
@@ -67,14 +56,7 @@ def target(name):
     return TARGETS[name]
 
 
-def try_out(hypothesis, strategy, claim, examples=60):
-    """Let hypothesis look for an input for which a claim does not hold."""
-    quietly = [hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.data_too_large]
-    hypothesis.settings(max_examples=examples, deadline=1000.0 * SECONDS, database=None,
-                        suppress_health_check=quietly)(hypothesis.given(strategy)(claim))()
-
-
-def damaged(hypothesis, seeds):
+def damaged(seeds):
     """Return a strategy for bytes: any, or a seed with parts cut, added, doubled, replaced."""
     some = hypothesis.strategies
     edits = some.lists(some.tuples(some.floats(0.0, 1.0), some.integers(0, 40),
@@ -91,10 +73,15 @@ def damaged(hypothesis, seeds):
 
 @pytest.mark.parametrize('name',
                          [*TARGETS, *(['parameters'] if 'parameters' not in TARGETS else [])])
-def test_any_bytes_are_survived(hypothesis, target, name):
+def test_any_bytes_are_survived(target, name):
+    @hypothesis.settings(max_examples=EXAMPLES.get(name, 80), deadline=1000.0 * SECONDS,
+                         database=None, suppress_health_check=[
+                             hypothesis.HealthCheck.too_slow,
+                             hypothesis.HealthCheck.data_too_large])
+    @hypothesis.given(damaged(target.seeds()))
     def survived(data):
         target.check(data)
-    try_out(hypothesis, damaged(hypothesis, target.seeds()), survived, EXAMPLES.get(name, 80))
+    survived()
 
 
 @pytest.mark.parametrize('name', TARGETS)
@@ -109,7 +96,8 @@ def test_what_was_found_once_is_survived(target, name, data):
 
 
 @pytest.mark.parametrize('seconds', [10, pytest.param(600, marks=pytest.mark.evidence)])
-def test_fuzzing_guided_by_coverage_finds_nothing(atheris, seconds):
+def test_fuzzing_guided_by_coverage_finds_nothing(seconds):
+    pytest.importorskip('atheris', reason='atheris, which has wheels for x86-64, is not installed')
     environment = {**os.environ, 'OPENBLAS_NUM_THREADS': '1'}
     process = subprocess.run([sys.executable, FUZZER, '--seconds', str(seconds), '--json'],
                              capture_output=True, text=True, timeout=2 * seconds + 180,

@@ -106,6 +106,19 @@ def test_every_launcher_is_the_same_and_can_be_executed():
     assert all(os.access(file, os.X_OK) for file in launchers)
 
 
+@pytest.mark.linter
+@pytest.mark.parametrize('name, arguments', [
+    pytest.param(name, arguments, marks=getattr(pytest.mark, name)) for name, arguments in {
+        'flake8': ['--config', '.flake8'], 'copyright': ['.'],
+        # the descriptions of parameters stand on the line of the name, where pep257 sees none
+        'pep257': ['--add-ignore', 'D417', '--', '.']}.items()])
+def test_what_ros_reviewers_run_finds_nothing(monkeypatch, name, arguments):
+    """Where it is installed; elsewhere `make style` runs the same checks."""
+    linter = pytest.importorskip(f'ament_{name}.main', reason=f'ament_{name} is not installed')
+    monkeypatch.chdir(ROOT)
+    assert linter.main(argv=arguments) == 0
+
+
 @needs_colcon
 def test_colcon_sees_a_ros_package(source, tmp_path):
     verbs = run(COLCON, '--log-base', tmp_path, '--help', folder=source)

@@ -44,7 +44,6 @@ FINITE = st.one_of(st.floats(allow_nan=False, allow_infinity=False), st.floats(-
                    st.sampled_from([0.0, 30.0, -30.0, 99.0, 500.0, -512.0, 1e16, -1e16, 1e155,
                                     1e200, -1e308, 1.7e308]))
 DEGC = st.one_of(st.floats(-20.0, 60.0), FINITE, st.none())
-FORCE = st.one_of(st.none(), st.floats(-20.0, 20.0), FINITE)
 
 
 def tries(examples):
@@ -138,30 +137,6 @@ def is_sound(live):
     return all(map(math.isfinite, shown)) and live.variance >= 0.0
 
 
-SAMPLES = st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, DEGC, FORCE),
-                   max_size=30)
-
-
-@tries(60)
-@hypothesis.given(models(), SAMPLES, st.sampled_from([0.0, 0.1]))
-def test_no_stream_leaves_an_estimator_with_something_that_is_no_number(
-        model, samples, false_alarms):
-    live, time = (estimator(model, false_alarms=false_alarms, threshold=Threshold(0.3 * DEGREE)),
-                  0.0)
-    for step, output, degc, force in samples:
-        time = time + step if math.isfinite(time + step) else step
-        if degc is not None:
-            live.add_temperature(time, degc)
-        live.add(time, output, NOW, force)
-        assert is_sound(live.tracker) and math.isfinite(live.corrected_rate)
-    live.update_table(NOW, ending=True)
-    begin = time if abs(time) < 1e9 else 0.0
-    for index in range(100):
-        live.add(begin + INTERVAL * (index + 1), 0.0, NOW)
-    live.reset()
-    assert is_sound(live.tracker) and abs(live.tracker.heading) < 1e-12
-
-
 ABSURD = st.one_of(
     st.floats(min_value=100.0, exclude_min=True, allow_infinity=False),
     st.floats(max_value=-100.0, exclude_max=True, allow_infinity=False),
@@ -249,6 +224,3 @@ def test_a_bias_table_stays_finite(rests, temperature, time):
     bias, variance = table.predict(temperature, time)
     assert math.isfinite(bias) and (variance >= 0.0 if table.entries else variance == math.inf)
     assert all(map(math.isfinite, table.bias_difference(temperature, 25.0, time)))
-
-
-# verbs

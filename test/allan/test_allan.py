@@ -192,8 +192,7 @@ def test_lost_samples_are_counted_and_do_not_change_the_figures():
                                  for each in (record.rate, rate)), rtol=0.05)
 
 
-@pytest.mark.parametrize('jitter', [0.0, 0.1])
-@pytest.mark.parametrize('share', [0.02, 0.05, 0.1, 0.19])
+@pytest.mark.parametrize('share, jitter', [(0.02, 0.1), (0.1, 0.0), (0.19, 0.1)])
 def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
     generator = np.random.default_rng(int(1000 * share))
     rate = simulate_noise(WHITE, 60_000, INTERVAL, generator)
@@ -253,7 +252,7 @@ def moved(kind):
     time = stamps(50_000)
     return {'turn': (time, rate + 0.02 * ((time > 200.0) & (time < 230.0))),
             'jolt': (time, rate + 0.2 * np.sin(40.0 * time) * ((time > 200.0) & (time < 200.5))),
-            'swing': (time[:20_000], (rate + np.sin(time))[:20_000]),
+            'swing': (time[:6000], (rate + np.sin(time))[:6000]),
             'dead': (time, np.full(50_000, 0.01)),
             'dies': (time, np.where(time > 400.0, 0.01, rate)),
             'few': (time[:99], rate[:99]),
@@ -274,6 +273,9 @@ def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
         record = build_rest_record(*moved(kind))
         fit_noise(record.rate, record.interval)
+
+
+def test_a_fit_without_noise_or_without_windows_is_refused():
     with pytest.raises(DataRefused, match='lowest Allan deviation 0 rad/s'):
         fit_noise(np.ones(1000), INTERVAL)
     with pytest.raises(DataRefused, match='wanted 4 octaves'):
@@ -323,15 +325,6 @@ def test_recordings_of_one_kind_of_gyro_agree(data, number):
     assert not any(fit.figures[symbol].value for symbol in 'QR')
 
 
-def test_a_recording_in_bursts_is_taken_by_the_gyros_clock(data):
-    log = read_log(data / 'mems_static/mpu6050_host_clock.csv.gz')
-    record = build_rest_record(log.time, log.output)
-    assert 'bursts' in record.remarks[0] and record.interval == pytest.approx(0.01007, rel=0.001)
-    fit = fit_noise(record.rate, record.interval)
-    assert (fit.figures['N'].value / DEGREE == pytest.approx(0.0097, rel=0.1)
-            and not fit.figures['B'].value and not fit.is_floor_reached)
-
-
 @pytest.fixture
 def log(tmp_path):
     path = tmp_path / 'rest.csv'
@@ -341,12 +334,13 @@ def log(tmp_path):
     return path
 
 
-def test_the_verb_says_the_figures_in_units_of_people_and_in_si(log, run):
+def test_the_verb_says_the_figures_in_units_of_people_and_in_si(log, tmp_path, run):
+    """The bias instability is that of the fit, which has no N and K: a model adds them itself."""
     code, text, _ = run('allan', log)
     # 1e-3 rad/√s is 3.44 deg/√h
     assert (code == 0 and 'Angle random walk N: 3.4' in text and 'deg/√h, 95 %:' in text
             and 'rad/√s' in text and 'Rate random walk K: ' in text and 'deg/h/√h' in text)
-    answer = json.loads(run('allan', log, '--json')[1])
+    answer = json.loads(run('allan', log, '--out', tmp_path / 'model.yaml', '--json')[1])
     walk = answer['angle_random_walk']
     assert walk['lower'] < walk['value'] < walk['upper'] and answer['samples'] == 20_000
     assert walk['value'] == pytest.approx(1e-3, rel=0.05)
@@ -354,6 +348,12 @@ def test_the_verb_says_the_figures_in_units_of_people_and_in_si(log, run):
                for name in ('angle_random_walk', 'rate_random_walk', 'rate_ramp'))
     assert (len({len(values) for values in answer['chart'].values()}) == 1
             and answer['interval_s'] == pytest.approx(INTERVAL))
+    value = answer['bias_instability']['value']
+    assert (read_model(tmp_path / 'model.yaml').noise.bias_instability == value
+            != pytest.approx(answer['floor']['deviation'] / ALLAN_FLOOR_RATIO, rel=0.05))
+    assert f'Bias instability B: {value / DEGREE * 3600.0:.4g} deg/h,' in text
+    labels = figure_labels(fit_noise(read_log(log).output, INTERVAL))
+    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in labels['B']
 
 
 def test_the_verb_puts_the_figures_into_a_model_and_loses_nothing_else(log, tmp_path, run):
@@ -386,16 +386,3 @@ def test_what_the_verb_refuses_is_reported(log, tmp_path, run, words, code, said
     found, _, error = run('allan', *({'LOG': log, 'SHORT': short}.get(word, word)
                                      for word in words))
     assert found == code and said in error
-
-
-def test_text_data_picture_and_model_have_one_bias_instability(tmp_path, run):
-    """It is that of the fit: the lowest deviation also holds N and K, which a model adds to it."""
-    path, out = tmp_path / 'rest.csv', tmp_path / 'model.yaml'
-    rate = simulate_noise(Noise(3e-4, 1e-4, 3e-5), 100_000, INTERVAL, np.random.default_rng(19))
-    write_log(path, Log(time=stamps(100_000), output=rate))
-    answer = json.loads(run('allan', path, '--out', out, '--json')[1])
-    value = answer['bias_instability']['value']
-    assert read_model(out).noise.bias_instability == value < answer['floor']['deviation'] / 0.664
-    text = f'{value / DEGREE * 3600.0:.4g} deg/h'
-    assert f'Bias instability B: {text},' in run('allan', path)[1]
-    assert f'{value / DEGREE * 3600.0:.3g} deg/h' in figure_labels(fit_noise(rate, INTERVAL))['B']

@@ -114,12 +114,17 @@ def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, run)
             and not (tmp_path / 'out.csv').exists())
 
 
-def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(tmp_path, small_blocks, run):
+@pytest.mark.parametrize('time, output, interval', [
+    # a gap of 3 s, then only every other sample
+    (np.cumsum([0.0, *np.full(499, 0.01), 3.0, *np.full(500, 0.02)]), np.zeros(1001), 0.01),
+    # a table writes a row at 100 Hz, and the gyro has a value in one of ten
+    (np.arange(2000) / 100.0, np.where(np.arange(2000) % 10, np.nan, 0.0), 0.1)],
+    ids=['gaps', 'rows of others'])
+def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(
+        tmp_path, small_blocks, run, time, output, interval):
     (tmp_path / 'model.yaml').write_text('effects: {}\nnoise: {angle_random_walk: 7.3e-4}')
-    # A gap of 3 s, then only every other sample.
-    time = np.cumsum([0.0, *np.full(499, 0.01), 3.0, *np.full(500, 0.02)])
-    write_log(tmp_path / 'log.csv', Log(output=np.zeros(len(time)), time=time))
+    write_log(tmp_path / 'log.csv', Log(output=output, time=time))
     assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
                '--out', tmp_path / 'out.csv')[0] == 0
     deviation = np.array(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'], float)
-    assert deviation == pytest.approx(np.full(len(time), 7.3e-4 / math.sqrt(0.01)), rel=1e-9)
+    assert deviation[np.isfinite(output)] == pytest.approx(7.3e-4 / math.sqrt(interval), rel=1e-9)

@@ -27,13 +27,7 @@ import subprocess
 import sys
 import tracemalloc
 
-from gyro_calibration.files import (
-    describe_error,
-    InputError,
-    read_bytes,
-    to_printable,
-    write_atomically,
-)
+from gyro_calibration.files import InputError, to_printable, write_atomically
 from gyro_calibration.heading.bias_table import BiasTable, Prior
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.tracker import Settings
@@ -99,10 +93,12 @@ each_kind = pytest.mark.parametrize('kind', KINDS)
 ], ids=['log', 'packed log', 'log in blocks', 'model', 'motion', 'mcap', 'packed mcap', 'db3'])
 def test_what_is_no_file_is_not_read(read, error, name, kind, tmp_path):
     KINDS[kind](tmp_path / name)
+    before = len(os.listdir('/proc/self/fd'))
     with pytest.raises(error) as raised:
         read(tmp_path / name)
     assert str(tmp_path / name) in str(raised.value)
     assert kind in str(raised.value) or name.endswith('3') or kind == 'a folder', raised.value
+    assert len(os.listdir('/proc/self/fd')) == before, 'it was left open'
 
 
 @each_kind
@@ -199,21 +195,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     with pytest.raises(OSError, match='No space left'):
         write_atomically(path, b'new')
     assert path.read_bytes() == b'old' and os.listdir(tmp_path) == ['model.yaml']
-
-
-@pytest.mark.parametrize('kind', ['folder', 'pipe'])
-def test_what_is_no_regular_file_is_refused_and_not_left_open(tmp_path, kind):
-    (os.mkdir if kind == 'folder' else os.mkfifo)(tmp_path / 'a')
-    before = os.listdir('/proc/self/fd')
-    with pytest.raises(OSError) as raised:
-        read_bytes(tmp_path / 'a', 10)
-    assert describe_error(raised.value) == f'it is a {kind}, where a file is wanted'
-    assert len(os.listdir('/proc/self/fd')) == len(before)
-
-
-def test_the_folder_is_made(tmp_path):
-    write_atomically(tmp_path / 'a' / 'b' / 'model.yaml', b'x')
-    assert (tmp_path / 'a' / 'b' / 'model.yaml').read_bytes() == b'x'
 
 
 def test_a_folder_that_takes_no_file_is_reported_by_the_name_that_was_given():
@@ -313,29 +294,6 @@ def test_messages_are_one_printable_line():
     assert (to_printable(to_printable('\x1b')) == to_printable('\x1b')
             and to_printable('a\nb', allowed='\n') == 'a\nb')
     assert to_printable('Größe 1°, \udcff') == 'Größe 1°, \\udcff'
-
-
-# The calibration of a robot
-
-
-STORED = 'self_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
-
-
-@pytest.mark.parametrize('model, calibration, hint', [
-    ('', 'effects: {}\n', 'the file has none'),
-    ('effects: {}\n' + STORED, 'effects: {}\n', 'the file has none'),
-    ('', 'effects: {}\nself_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias'),
-    ('', '', 'the file'),
-])
-def test_a_calibration_that_is_not_used_is_reported(model, calibration, hint, tmp_path):
-    """One that the model file itself has is kept then."""
-    (tmp_path / 'model.yaml').write_text(model or 'effects: {}\n')
-    (tmp_path / 'calibration.yaml').write_text(calibration)
-    store = StateStore(str(tmp_path / 'model.yaml'), tmp_path / 'calibration.yaml',
-                       tmp_path / 'biases.yaml', Prior())
-    assert (hint in store.calibration_hint and 'not used' in store.calibration_hint
-            and 'calibrate again' in store.calibration_hint)
-    assert (store.model.self_calibration is not None) == ('self_calibration' in model)
 
 
 @pytest.mark.parametrize('ahead, known',
@@ -458,20 +416,12 @@ ODD = {
     **{name: ('time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc\n' + ''.join(
         f'{k * step!r},{rate(k)},{rate(k)},{k % 60}\n' for k in range(600))).encode()
        for name, step, rate in (
-           ('all zero', 0.01, lambda k: 0), ('all equal', 0.01, lambda k: 5),
-           ('huge', 0.01, lambda k: 1e19), ('tiny', 0.01, lambda k: 1e-300),
-           ('one huge', 0.01, lambda k: 1e19 if k == 300 else 0), ('signs', 0.01, lambda k: -1e19),
+           ('all zero', 0.01, lambda k: 0), ('all equal', 0.01, lambda k: -1e19),
+           ('tiny', 0.01, lambda k: 1e-300), ('one huge', 0.01, lambda k: 1e19 * (k == 300)),
            ('nan', 0.01, lambda k: 'nan'), ('half nan', 0.01, lambda k: 1 if k % 2 else 'nan'),
            ('fast', 1e-9, lambda k: 1), ('slow', 1e17, lambda k: 1))},
-    'semicolons': b'time_s;gyro_dps\n0;1\n1;1\n',
-    'commas as points': b'time_s;gyro_dps\n0,0;1,5\n0,1;1,5\n',
-    'utf-16': 'time_s,gyro_dps\n0,1\n1,1\n'.encode('utf-16'),
-    'latin-1': 'time_s,gyro_dps,ä\n0,1,ö\n1,1,ü\n'.encode('latin-1'),
-    'zero bytes': b'time_s,gyro_dps\n0,1\0\n1,1\n', 'quotes': b'time_s,gyro_dps\n"0,1\n1,1\n',
-    'not packed': b'\x1f\x8b\x08abc',
-    'tabs': b'time_s\tgyro_dps\n0\t1\n1\t1\n', 'counts': b'time_s,gyro_counts\n0,1\n1,2\n2,1\n',
-    'bom and crlf': b'\xef\xbb\xbftime_s,gyro_dps\r\n0,1\r\n1,2\r\n2,1\r\n',
-    'cr': b'time_s,gyro_dps\r0,1\r1,2\r2,1\r',
+    'zero bytes': b'time_s,gyro_dps\n0,1\0\n1,1\n', 'not packed': b'\x1f\x8b\x08abc',
+    'counts': b'time_s,gyro_counts\n0,1\n1,2\n2,1\n',
     **{name: f'{columns}\n{"".join(map(row, range(500)))}'.encode() for name, columns, row in (
         ('values of 1e300', 'time_s,gyro_dps,reference_rate_dps',
          lambda k: f'{k / 10},{1e300 * (k % 3)},{k % 3}\n'),

@@ -105,7 +105,6 @@ PICTURES = {
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
     'headings': draw_drive, 'encoder': draw_encoder, 'run': draw_calibration_run,
     'motion': lambda path: draw_motion(path, CALIBRATION_MOTION, 1.0)}
-each_picture = pytest.mark.parametrize('draw', PICTURES.values(), ids=PICTURES)
 
 
 @pytest.fixture(scope='module')
@@ -115,38 +114,14 @@ def pyplot():
     return pyplot
 
 
-@pytest.fixture(scope='module')
-def drawn(pyplot, tmp_path_factory):
-    """Return a function from one that draws to the figure, as it is on paper, and the file."""
-    found, folder = {}, tmp_path_factory.mktemp('pictures')
-
-    def drawn(draw):
-        if draw not in found:
-            path = folder / f'{len(found)}.png'
-            figure = draw(path)
-            figure.draw_without_rendering()  # the boxes below are in its dots, not the file's
-            found[draw] = figure, path
-        return found[draw]
-    return drawn
-
-
 @pytest.fixture
-def figure_of(drawn):
-    """Return a function from one that draws to the figure."""
-    return lambda draw: drawn(draw)[0]
-
-
-@each_picture
-def test_every_axis_has_a_unit_and_a_line_below_the_picture_says_what_to_see(figure_of, draw):
-    figure = figure_of(draw)
-    assert figure.get_supxlabel().endswith('.')
-    panels = [axes for axes in figure.axes if axes.get_label() != '<colorbar>']
-    assert panels and all('[' in axes.get_ylabel() for axes in panels)
-    assert all('[' in axes.get_xlabel()
-               for axes in panels if axes.xaxis.get_tick_params()['labelbottom'])
-    bars = [axes.get_xlabel() or axes.get_ylabel()
-            for axes in figure.axes if axes.get_label() == '<colorbar>']
-    assert all('[' in label for label in bars)
+def figure_of(pyplot, tmp_path):
+    """Return a function from one that draws to the figure, as it is on paper."""
+    def figure_of(draw):
+        figure = draw(tmp_path / 'picture.png')
+        figure.draw_without_rendering()  # boxes are in its dots, not the file's
+        return figure
+    return figure_of
 
 
 def texts(figure):
@@ -164,17 +139,24 @@ def texts(figure):
     return boxes + [('legend', legend.get_window_extent()) for legend in legends]
 
 
-@each_picture
-def test_no_text_covers_another_or_leaves_the_paper(figure_of, draw):
+@pytest.mark.parametrize('draw', PICTURES.values(), ids=PICTURES)
+def test_every_axis_has_a_unit_a_line_says_what_to_see_and_no_text_covers_another_or_is_cut_off(
+        figure_of, draw):
     figure = figure_of(draw)
+    assert figure.get_supxlabel().endswith('.')
+    panels = [axes for axes in figure.axes if axes.get_label() != '<colorbar>']
+    assert panels and all('[' in axes.get_ylabel() for axes in panels)
+    assert all('[' in axes.get_xlabel()
+               for axes in panels if axes.xaxis.get_tick_params()['labelbottom'])
+    assert all('[' in (axes.get_xlabel() or axes.get_ylabel())
+               for axes in figure.axes if axes.get_label() == '<colorbar>')
     boxes = texts(figure)
     assert len(boxes) > 3
-    overlaps = [(first, second) for number, (first, a) in enumerate(boxes)
+    assert not [(first, second) for number, (first, a) in enumerate(boxes)
                 for second, b in boxes[number + 1:] if a.overlaps(b)]
-    assert not overlaps
-    outside = [text for text, box in boxes
-               if box.x0 < 0 or box.y0 < 0 or box.x1 > figure.bbox.x1 or box.y1 > figure.bbox.y1]
-    assert not outside
+    assert not [text for text, box in boxes
+                if box.x0 < 0 or box.y0 < 0 or box.x1 > figure.bbox.x1
+                or box.y1 > figure.bbox.y1], 'it leaves the paper'
 
 
 def test_a_picture_is_svg_where_its_name_says_so_and_does_not_stay_in_memory(pyplot, tmp_path):
@@ -185,24 +167,19 @@ def test_a_picture_is_svg_where_its_name_says_so_and_does_not_stay_in_memory(pyp
     assert pyplot.get_fignums() == before
 
 
-def test_outlying_dwells_are_marked_and_do_not_set_the_scale(figure_of):
-    outlying = np.flatnonzero(~warm().scatter.inliers)
+def test_residuals_are_those_of_the_calibration_and_outlying_ones_do_not_set_the_scale(figure_of):
+    figure, kept = figure_of(lambda path: draw_residuals(path, warm())), warm().scatter.inliers
+    outlying = np.flatnonzero(~kept)
     assert set(outlying) >= {20, 50}
-    for axes in figure_of(lambda path: draw_residuals(path, warm())).axes[:4]:
+    for axes in figure.axes[:4]:
         assert axes.get_legend().get_texts()[0].get_text().startswith(f'{len(outlying)} outlying')
         assert max(map(abs, axes.get_ylim())) < 10.0, (
             'the scale is that of a dwell that is off by 30 deg/s')
-
-
-def test_the_residuals_drawn_are_those_of_the_calibration(figure_of):
-    figure = figure_of(lambda path: draw_residuals(path, warm()))
-    kept = warm().scatter.inliers
-    after = figure.axes[2].collections[0].get_offsets()
-    np.testing.assert_allclose(after,
-                               np.column_stack([MEASURED.rate, warm().residual])[kept] / DEGREE)
-    before = figure.axes[1].collections[0].get_offsets()
+    before, after = (figure.axes[place].collections[0].get_offsets() for place in (1, 2))
     np.testing.assert_allclose(before, np.column_stack(
         [MEASURED.temperature, (MEASURED.output - MEASURED.rate) / DEGREE])[kept])
+    np.testing.assert_allclose(after,
+                               np.column_stack([MEASURED.rate, warm().residual])[kept] / DEGREE)
 
 
 def test_the_curves_of_the_surface_are_what_the_model_takes_off(figure_of):

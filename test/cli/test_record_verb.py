@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Recording with real processes: from a port and from topics, interrupted, killed, disk full."""
+"""Recording: files that others read, and real processes interrupted, killed, on a full disk."""
 
 import contextlib
 import json
@@ -24,13 +24,16 @@ import time
 
 from gyro_calibration.cli import main as command_line
 from gyro_calibration.cli import record as record_verb
+from gyro_calibration.cli.record import CsvRecorder, McapRecorder
+from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.logs.log import read_log
 from gyro_calibration.logs.recording import read_recording, Topics
 import numpy as np
 import pytest
-from recordings import rosbags
+from recordings import BEGIN, rosbags
 
 RATE = 200.0
 KINDS = ['a.csv', 'a.csv.gz', 'a.mcap']
@@ -129,6 +132,111 @@ def is_unbroken(log):
     return bool(np.isin(steps, (1, -9999)).all())
 
 
+# What is written
+
+
+def notes():
+    return {'port': '/dev/ttyUSB0', 'protocol': 'csv'}
+
+
+def samples(count=300):
+    return [(BEGIN + 10_000_000 * number,
+             Sample(0.01 * number, 20.0 + 0.001 * number, specific_force=9.8))
+            for number in range(count)]
+
+
+def recorders(folder):
+    logs = [CsvRecorder(str(folder / name), notes) for name in ('a.csv', 'a.csv.gz')]
+    return *logs, McapRecorder(str(folder / 'a.mcap'), notes)
+
+
+def test_each_kind_of_file_holds_the_samples_and_says_where_they_came_from(tmp_path):
+    """Every piece can be read before the recording ends."""
+    pytest.importorskip('mcap', reason='mcap is not installed')
+    for recorder, name in zip(recorders(tmp_path), KINDS):
+        for number, (stamp, sample) in enumerate(samples()):
+            recorder.add_sample(stamp, sample)
+            if number % 50 == 49:
+                recorder.flush()
+                assert number < 150 or len(read(tmp_path / name)) == number + 1, name
+        recorder.close()
+        log = read(tmp_path / name)
+        np.testing.assert_array_equal(log.output, [sample.output for _, sample in samples()])
+        np.testing.assert_array_equal(log.temperature,
+                                      [sample.temperature for _, sample in samples()])
+        np.testing.assert_array_equal(log.specific_force, 9.8)
+        np.testing.assert_array_equal(log.time, np.arange(300) * 10_000_000 / 1e9)
+        assert {'port: /dev/ttyUSB0', 'protocol: csv'} <= set(log.notes)
+
+
+def test_rosbags_and_mcap_read_what_is_recorded(tmp_path):
+    reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
+    rosbag2, typesys = rosbags()
+    recorder = McapRecorder(str(tmp_path / 'a.mcap'), notes)
+    for number, (stamp, sample) in enumerate(samples()):
+        recorder.add_sample(stamp, sample)
+        if number % 100 == 0:
+            recorder.flush()
+    recorder.close()
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    with rosbag2.Reader(tmp_path / 'a.mcap') as reader:
+        for connection in reader.connections:
+            store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        found = [
+            store.deserialize_cdr(data, connection.msgtype)
+            for connection, _, data in reader.messages() if connection.topic == '/imu/data_raw']
+        assert reader.message_count == 600
+    assert [message.angular_velocity.z for message in found] == [
+        sample.output for _, sample in samples()]
+    last = found[-1]
+    assert last.header.frame_id == 'gyro' and last.linear_acceleration.z == 9.8
+    assert last.orientation_covariance[0] == -1.0
+    for covariance, deviation in ((last.angular_velocity_covariance, ASSUMED_NOISE),
+                                  (last.linear_acceleration_covariance, ASSUMED_FORCE_NOISE)):
+        assert covariance.tolist() == [1e6, 0.0, 0.0, 0.0, 1e6, 0.0, 0.0, 0.0, deviation ** 2]
+    times = [stamp for stamp, _ in samples()]
+    with open(tmp_path / 'a.mcap', 'rb') as file:
+        reader = reading.NonSeekingReader(file, validate_crcs=True)
+        assert [message.log_time for _, channel, message in reader.iter_messages()
+                if channel.topic == '/imu/temperature'] == times
+        file.seek(0)
+        reader = reading.SeekingReader(file, validate_crcs=True)
+        said = reader.get_summary().statistics
+        assert (said.message_count, said.chunk_count, said.message_start_time,
+                said.message_end_time) == (600, 4, times[0], times[-1])
+        assert reader.get_header().profile == 'ros2'
+        metadata, = reader.iter_metadata()
+        assert metadata.metadata == notes()
+        assert [message.log_time
+                for *_, message in reader.iter_messages(['/imu/data_raw'])] == times
+
+
+def test_a_file_that_is_there_is_never_written_to(tmp_path):
+    (tmp_path / 'a.mcap').write_text('precious')
+    with pytest.raises(UsageError, match='exists already'):
+        recorders(tmp_path)
+    assert (tmp_path / 'a.mcap').read_text() == 'precious'
+
+
+def test_a_recording_of_nothing_leaves_no_file(tmp_path):
+    for recorder in recorders(tmp_path):
+        recorder.flush()
+        recorder.close()
+    assert not list(tmp_path.iterdir())
+
+
+def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
+    recorder = CsvRecorder(str(tmp_path / 'a.csv'), notes)
+    for number in range(400):
+        health = {10: {'supply_v': 5.0}, 200: {'supply_v': 4.9},
+                  350: {'source_current_a': 0.1}}.get(number, {})
+        recorder.add_sample(BEGIN + 10_000_000 * number, Sample(0.0, health=health))
+        recorder.flush()
+    recorder.close()
+    np.testing.assert_array_equal(read_log(tmp_path / 'a.csv').supply, 200 * [5.0] + 200 * [4.9])
+    assert recorder.late_columns == {'source_current_a'}
+
+
 # From the port
 
 
@@ -213,7 +321,7 @@ def angles(link, rate=100.0):
     pytest.param(['--increments', 'never'], 2, 0.001, 1.0, marks=pytest.mark.evidence),
 ])
 def test_angles_at_another_rate_are_reported(run, tmp_path, options, seconds, rate, factor):
-    """Where there is no remark is tested in test_driver_report.py, without a port."""
+    """Where there is no remark is tested in test_driver_node.py, without a port."""
     with angles(tmp_path / 'gyro'):
         words = ['--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--seconds', seconds]
         code, out, error = run('record', *words, '--out', tmp_path / 'a.csv', '--json', *options)
@@ -334,8 +442,10 @@ class Robot:
         self._ros, self._publishers = ros, {}
 
     def offer(self, *topics, quality=None):
-        """Publish on some topics from now on."""
+        """Publish on some topics from now on, anew where it did already."""
         for topic in topics:
+            if topic in self._publishers:
+                self._ros.node.destroy_publisher(self._publishers[topic])
             self._publishers[topic] = self._ros.publisher(
                 self.kinds[topic], topic, quality or reliable())
 
@@ -406,7 +516,7 @@ def test_a_log_and_a_recording_of_the_same_topics_hold_the_same(ros, record, wai
     np.testing.assert_allclose(log.reference_heading, recording.reference_heading, atol=1e-9)
 
 
-def test_publishers_that_come_late_or_with_another_quality_are_received(
+def test_publishers_that_come_late_or_again_with_another_quality_are_received(
         ros, record, wait_until, tmp_path):
     from gyro_calibration.ros.runner import SENSOR_QOS
     from rclpy.qos import DurabilityPolicy
@@ -425,6 +535,10 @@ def test_publishers_that_come_late_or_with_another_quality_are_received(
     wait_until(robot.is_heard, what='the recorder')
     robot.drive(4.0, 6.0)
     wait_until(lambda: holds(tmp_path / 'a.mcap', 490), what='the last piece')
+    robot.offer('imu/data_raw', quality=SENSOR_QOS)
+    wait_until(robot.is_heard, what='the recorder')
+    robot.drive(10.0, 2.0)
+    wait_until(lambda: holds(tmp_path / 'a.mcap', 520), what='samples of the new publisher')
     code, out, error = recording.end(signal.SIGTERM)
     answer, log = json.loads(out), read(tmp_path / 'a.mcap', reference='pose')
     assert code == 0, error
@@ -489,32 +603,6 @@ def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(
                               '--seconds', 2).end()
     assert (code, out) == (2, '') and sentence in error and error.count('\n') == 1
     assert not (tmp_path / 'a.csv').exists()
-
-
-def test_a_publisher_that_starts_again_with_another_quality_is_received(ros_domain, wait_until):
-    from gyro_calibration.ros.recorder_node import RecorderNode
-    from gyro_calibration.ros.runner import SENSOR_QOS
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-    from std_msgs.msg import String
-    context, found = rclpy.Context(), []
-    rclpy.init(args=[], context=context)
-    node = RecorderNode(['note'], False, lambda message, _: found.append(message), context)
-    robot, executor = rclpy.create_node('robot', context=context), SingleThreadedExecutor(
-        context=context)
-    executor.add_node(node)
-    for quality in (reliable(), SENSOR_QOS, reliable()):
-        publisher, count = robot.create_publisher(String, 'note', quality), len(found)
-
-        def is_received(publisher=publisher, count=count):
-            publisher.publish(String(data='said'))
-            executor.spin_once(0.05)
-            return len(found) > count
-        wait_until(is_received, what='a message')
-        robot.destroy_publisher(publisher)
-    robot.destroy_node()
-    node.destroy_node()
-    rclpy.shutdown(context=context)
 
 
 def test_topics_without_a_publisher_are_reported(ros_domain, record, tmp_path):

@@ -18,7 +18,7 @@ import termios
 import threading
 import tty
 
-from fake_port import BEGIN, Reading, World
+from fake_port import BEGIN, damaged, Reading, SETTINGS, World
 from gyro_calibration.driver.connection import (
     Connection,
     Decimator,
@@ -30,7 +30,6 @@ from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import numpy as np
 import pytest
-from serial_faults import damaged, SETTINGS
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
 NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of the gyro'
@@ -86,7 +85,7 @@ def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_auto_finds_the_protocol_and_reports_it(name):
-    world = World(30.0, baud=find_protocol(name).baud)
+    world = World(15.0, baud=find_protocol(name).baud)
     world.gyro(name, settings=SETTINGS[name])
     reading = Reading(world, settings=SETTINGS[name])
     assert (reading.connection.protocol is find_protocol(name)
@@ -166,12 +165,6 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     doubling = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
     assert waits == pytest.approx([*doubling, *5 * [5.0], *doubling, 5.0])
     assert reading.connection.waited_duration == pytest.approx(31.3 + 10.0, abs=0.2)
-
-
-def test_a_protocol_that_is_not_known_is_refused():
-    with pytest.raises(ValueError,
-                       match="protocol 'bogus' is not known: .*, or auto to find it by listening"):
-        Connection('/dev/null', 'bogus')
 
 
 # Silence
@@ -277,17 +270,6 @@ def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps()
     numbers = np.round([1e4 * sample.output for sample in reading.samples])
     assert counts.lost_samples == numbers[-1] - numbers[0] + 1 - counts.samples > 100
     assert reading.steps[5000:] == pytest.approx(1e-3 * np.diff(numbers)[5000:], abs=1e-6)
-
-
-def test_invalid_and_refused_samples_are_counted_and_leave_a_gap():
-    lines = {10: b'       0.015733   0\r\n', 20: b'     999.000000   1\r\n'}
-    world = World(5.0)
-    world.send(lines.get(number % 100, b'       0.015733   1\r\n') for number in itertools.count())
-    reading = Reading(world, 'kvh_dsp3000')
-    counts = reading.connection.counts()
-    assert (counts.device_faults, counts.refused_samples, counts.discarded_bytes) == (5, 5, 0)
-    assert (sum(step == pytest.approx(0.02, abs=1e-3) for step in reading.steps)
-            == counts.lost_samples == 10)
 
 
 @pytest.mark.parametrize('share', [0.001, 0.1])

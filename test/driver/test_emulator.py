@@ -16,11 +16,11 @@ import math
 import os
 import time
 
+from fake_port import SETTINGS
 from gyro_calibration.driver.connection import PortError, SerialPort
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find_protocol, PROTOCOLS, Sample, Settings
 import pytest
-from serial_faults import SETTINGS
 
 
 def samples(count=None, rate=100.0):

@@ -24,7 +24,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from gyro_calibration.driver.connection import Connection, SampleMean
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find_protocol, Sample, Settings
+from gyro_calibration.ros.compensation_node import CompensationNode
 from gyro_calibration.ros.driver_node import (
+    DriverNode,
     DriverReport,
     PARAMETERS,
     SampleMessages,
@@ -32,6 +34,7 @@ from gyro_calibration.ros.driver_node import (
 )
 from gyro_calibration.ros.inputs import parameter_values
 from gyro_calibration.ros.runner import ERROR, OK, WARN
+from rclpy.clock import ClockType
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
@@ -199,6 +202,30 @@ def test_listening_is_a_warning_and_what_was_recognized_is_reported():
     assert reports[0][:2] == (WARN, 'listening for a protocol')
     assert (reports[-1][2]['protocol'] == 'kvh_ecore'
             and 'kvh_ecore explains' in reports[-1][2]['detected'])
+
+
+@pytest.mark.parametrize('node_class, name, parameters, words', [
+    (DriverNode, 'driver_node: gyro', {'port': '/nonexistent/gyro'}, 'does not exist'),
+    (CompensationNode, 'compensation_node: heading', {'use_sim_time': 'true'},
+     'ROS time stands still')], ids=['driver', 'compensation'])
+def test_a_node_reports_in_its_namespace_also_without_gyro_samples_and_clock(
+        hold_node, wait_until, tmp_path, node_class, name, parameters, words):
+    if node_class is CompensationNode:
+        parameters = {**parameters, 'calibration_file': tmp_path / 'calibration.yaml'}
+    held = hold_node(node_class, parameters, {'__ns': '/robot'})
+
+    def reported():
+        held.tick()
+        return [status for array in held.sent['/diagnostics'] for status in array.status
+                if status.level == status.ERROR and words in status.message]
+    wait_until(reported, what=words)
+    assert {(status.name, status.hardware_id) for status in reported()} == {
+        (f'/robot/{name}', parameters.get('port', 'none'))}
+    values = {pair.key: pair.value for pair in reported()[-1].values}
+    assert float(values['rate_hz']) == 0.0
+    stamp = held.sent['/diagnostics'][-1].header.stamp
+    assert (stamp.sec > 0) == (node_class is DriverNode), 'the time of a simulation stands at 0'
+    assert all(timer.clock.clock_type == ClockType.STEADY_TIME for timer in held.node.timers)
 
 
 # As a robot runs it: its own process, a pseudo-terminal for the gyro, and DDS

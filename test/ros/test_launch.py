@@ -83,13 +83,6 @@ class TestGraph(unittest.TestCase):
             self.executor.spin_once(timeout_sec=0.01)
         return condition()
 
-    def test_both_nodes_are_in_the_namespace(self):
-        def names():
-            return {f'{namespace}/{name}'
-                    for name, namespace in self.node.get_node_names_and_namespaces()}
-        assert self.spin_until(
-            lambda: {'/robot/driver_node', '/robot/compensation_node'} <= names()), names()
-
     def test_a_launch_argument_goes_before_the_file(self):
         from rcl_interfaces.srv import GetParameters
         client = self.node.create_client(GetParameters, '/robot/driver_node/get_parameters')

@@ -149,22 +149,17 @@ def test_impossible_rates_in_a_row_are_in_the_variance(tmp_path, count):
 def test_a_gyro_that_repeats_one_value_is_an_error_and_the_heading_claims_nothing(
         tmp_path, reported, value, wheels):
     rig = rested(tmp_path, seconds=5.0, wheels=wheels)
-    begin, turns, still = len(rig.outputs) - 1, rig.robot.step, rig.robot.bias
+    begin, right, still = len(rig.outputs) - 1, rig.robot.distort, rig.robot.bias
     if value == 'in a turn':
         rig.robot.command(0.7)
         rig.go(3.0)
-
-    def step():
-        reading = turns()
-        output = {'at rest': still, 'in a turn': 0.7, 'saturated': min(reading.output, 0.3)}[value]
-        return type(reading)(reading.stamp, output, reading.heading, reading.rate)
-
-    rig.robot.step = step
+    rig.robot.distort = {'at rest': lambda _: still, 'in a turn': lambda _: 0.7,
+                         'saturated': lambda output: min(output, 0.3)}[value]
     rig.robot.command(0.0 if value == 'in a turn' else 0.7)
     rig.go(6.0)
     level, message, _ = reported(rig)
     assert level == ERROR and 'the gyro repeats' in message and 'it is dead' in message, message
-    rig.robot.step = turns
+    rig.robot.distort = right
     rig.go(3.0)
     error, deviation = rig.error(begin)
     assert abs(error) < 3.0 * deviation, (error, deviation)
@@ -689,8 +684,8 @@ def test_stamps_that_leave_the_clock_are_a_warning_and_the_heading_claims_nothin
         tmp_path, reported, pace, warns):
     """What turns in the meantime is not what the stamps say."""
     rig = rested(tmp_path)
-    stamp, begin, first = rig.stamp, rig.clock.now, len(rig.outputs) - 1
-    rig.stamp = lambda reading: stamp(reading) + round(1e9 * (pace - 1) * (rig.clock.now - begin))
+    first = len(rig.outputs) - 1
+    rig.pace_stamps(pace)
     rig.robot.command(0.5)
     rig.go(17.0)
     reported(rig)
@@ -761,12 +756,17 @@ event = st.one_of(
     st.tuples(st.sampled_from(['command', 'reset']), st.just(0), finite, finite))
 
 
+ANY = {'cubic': PLAIN | {'cubic_nonlinearity': {'cubic_nonlinearity': 1e-3}},
+       'negative': PLAIN | {'cubic_nonlinearity': {'cubic_nonlinearity': -1e-3}},
+       'past': PLAIN | PAST | {'acceleration_sensitivity': {'acceleration_sensitivity': 1e-3}}}
+
+
 @settings(max_examples=60, derandomize=True, deadline=None,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(events=st.lists(event, max_size=20), cubic=st.sampled_from([0.0, 1e-3, -1e-3]))
-def test_no_value_leaves_a_heading_that_is_no_number_or_no_variance(tmp_path, events, cubic):
-    effect = f', cubic_nonlinearity: {{cubic_nonlinearity: {cubic:f}}}}}'
-    rig = Rig(tmp_path, model=KNOWN.replace('}}', '}' + effect, 1))
+@given(events=st.lists(event, max_size=20), name=st.sampled_from([*ANY]))
+def test_no_value_leaves_a_heading_that_is_no_number_or_no_variance(tmp_path, events, name):
+    rig = Rig(tmp_path, model=yaml.safe_dump(
+        {'effects': ANY[name], 'noise': {'angle_random_walk': NOISE, 'bias_instability': 1e-5}}))
     assert not rig.pipeline.store.problem
     rig.feed(noisy(4.0), SLOW)
     pipeline, published = rig.pipeline, []

@@ -92,22 +92,27 @@ def test_a_folder_that_cannot_be_written_to_is_reported_and_not_tried_each_secon
     assert memory.model.self_calibration == SelfCalibration(0.01)
 
 
+STORED = '\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
 SEVEN, EIGHT = (f'gyro: {{serial_number: "{number}"}}' for number in '78')
 ONE, OTHER = 'effects: {}\n', 'effects: {bias: {bias: 0.1}}\n'
 
 
 @pytest.mark.parametrize('model, calibration, hint', [
-    (ONE + SEVEN, ONE + SEVEN, ''),
-    (ONE + SEVEN, ONE + EIGHT, 'and the model to 7; calibrate again'),
-    (ONE + SEVEN, ONE, 'and the model to 7; calibrate again'),
-    (ONE, ONE + EIGHT, 'and the model to one without; calibrate again'),
-    (OTHER, ONE, 'belongs to another model')])
-def test_a_calibration_of_another_gyro_or_model_is_not_used(remember, model, calibration, hint):
-    memory = remember(
-        model,
-        calibration=f'{calibration}\nself_calibration: {{scale_factor_error: 0.2, bias: 0.3}}')
-    assert (memory.model.self_calibration is None) == bool(hint) == bool(memory.calibration_hint)
+    (ONE + SEVEN, ONE + SEVEN + STORED, ''),
+    (ONE + SEVEN, ONE + EIGHT + STORED, 'and the model to 7; calibrate again'),
+    (ONE + SEVEN, ONE + STORED, 'and the model to 7; calibrate again'),
+    (ONE, ONE + EIGHT + STORED, 'and the model to one without; calibrate again'),
+    (OTHER, ONE + STORED, 'belongs to another model'),
+    ('', ONE, 'the file has none'), (ONE + STORED, ONE, 'the file has none'),
+    ('', '\n', 'the file'),
+    ('', ONE + 'self_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias')])
+def test_a_calibration_that_cannot_be_used_is_reported_and_that_of_the_model_is_kept(
+        remember, model, calibration, hint):
+    memory = remember(model, calibration=calibration)
+    assert bool(hint) == bool(memory.calibration_hint) == ('calibrate again'
+                                                           in memory.calibration_hint)
     assert hint in memory.calibration_hint
+    assert (memory.model.self_calibration is None) == (bool(hint) and STORED not in model)
 
 
 def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path):
