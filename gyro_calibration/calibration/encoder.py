@@ -191,7 +191,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         _heading_residual(on_reference, (output - fit.bias) / (1.0 + fit.scale_factor_error),
                           motion),
         0 if lost is None else int(lost.sum()),
-        tuple(_list_remarks(fit.scale_factor_error, method, technology)))
+        tuple(_list_remarks(fit, method, technology)))
 
 
 def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
@@ -420,8 +420,13 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidu
     return HeadingResidual(error - error.mean())
 
 
-def _list_remarks(s: float, method: str, technology: str) -> Iterator[str]:
+def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[str]:
+    s = fit.scale_factor_error
     if method == 'course':
+        if fit.reference_drift is not None:
+            rate, half = (each / DEGREE for each in fit.reference_drift)
+            yield (f'in motion the reference drifts by {rate:.3f} +- {half:.3f} deg/s (95 %) '
+                   'against the rests in which it stands; the bias is that of the rests')
         yield ('what the drive leaves open of scale factor error and bias is drawn towards zero, '
                f'as of a gyro of the technology {technology} (--technology); '
                'the intervals hold that')

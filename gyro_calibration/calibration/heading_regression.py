@@ -21,10 +21,11 @@ integrals of the most likely rate ``w`` given both (with a course, that of the g
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
 with the integrals ``J``. A point is the mean over some samples; the observations are the
-differences between points, so that a gap of the reference is a long span. A rest in a gap, as of
-a vehicle whose course is lost then, is one more observation: a turn by 0. What differs between the
-kinds of references is in `ReferenceTreatment`. The computing time is proportional to the number of
-spans.
+differences between points, so that a gap of the reference is a long span. A rest is one more
+observation: a turn by 0; the spans do not contain it. It is in a gap, as of a vehicle whose course
+is lost then, or the reference stands, as odometry does, which may drift in motion; then the drift
+is one more value, and the rests determine the bias. What differs between the kinds of references
+is in `ReferenceTreatment`. The computing time is proportional to the number of spans.
 
 A course over ground, the direction of travel by satellites, differs from the heading by the side
 slip. It is smoothed, late or early against the gyro, lost below some speed, and in bursts of some
@@ -53,6 +54,7 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.calibration.reference_noise import (
     drop_held_values,
+    find_rests,
     heading_difference,
     MAX_ROUNDING_STEP,
     rate_noise_share,
@@ -79,7 +81,7 @@ from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
-from scipy.ndimage import binary_erosion, median_filter
+from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
@@ -168,8 +170,9 @@ class Spans:
     # time, heading: of the points, s and rad, shape (n + 1,)
     time: Array
     heading: Array
-    # first and last row of each rest in a gap of the reference, shape (r, 2)
+    # first and last row of each rest, shape (r, 2), and whether the reference is known there
     rests: NDArray[np.intp]
+    stands: Mask
     treatment: ReferenceTreatment  # of the kind of the reference
     # the angle random walk by the white noise of the samples, with that of a reference rate, and
     # by the difference of gyro and reference over a second, the smaller first, rad/√s
@@ -213,6 +216,31 @@ class Spans:
         keys = np.append(2.0 * sector + (np.diff(middle) > 0.0), np.zeros(len(self.rests)))
         return np.unique(keys, return_inverse=True)[1].astype(np.intp)
 
+    def all_causes(self, causes: Sequence[CauseTerm]) -> list[CauseTerm]:
+        """Return causes, after the drift of a reference that stands, which is always fitted."""
+        own = [CauseTerm('reference_drift')] * bool(self.stands.any())
+        return [*dict.fromkeys([*own, *causes])]
+
+    @property
+    def is_in_motion(self) -> Mask:
+        """Tell which samples are not in a rest."""
+        found = np.ones(len(self.log), dtype=bool)
+        for first, last in self.rests:
+            found[first:last + 1] = False
+        return found
+
+    @property
+    def time_in_motion(self) -> Array:
+        """Return the time without the rests, s, shape (m,)."""
+        assert self.log.time is not None
+        return integrate(self.log.time, self.is_in_motion.astype(float))
+
+    @property
+    def rest_durations(self) -> Array:
+        """Return the length of each rest, s, shape (r,)."""
+        assert self.log.time is not None
+        return np.diff(self.log.time[self.rests])[:, 0]
+
     def point_means(self, values: Array) -> Array:
         """Return the means of a signal at the points, corrected for the delay, shape (n + 1,)."""
         assert self.log.time is not None
@@ -222,8 +250,10 @@ class Spans:
     def span_integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         assert self.log.time is not None
-        whole = integrate_with_curvature(self.log.time, np.broadcast_to(rate, self.log.time.shape))
-        return self.is_measured * np.append(np.diff(self.point_means(whole)),
+        rate = np.broadcast_to(rate, self.log.time.shape)
+        whole, in_motion = (integrate_with_curvature(self.log.time, each)
+                            for each in (rate, rate * self.is_in_motion))
+        return self.is_measured * np.append(np.diff(self.point_means(in_motion)),
                                             np.diff(whole[self.rests])[:, 0])
 
     def span_changes(self, values: Array) -> Array:
@@ -258,6 +288,8 @@ class Spans:
         if cause.cause == 'reference_once_per_rev':
             return np.column_stack([self.span_changes(np.sin(heading)),
                                     self.span_changes(np.cos(heading))])
+        if cause.cause == 'reference_drift':
+            return self.span_changes(self.time_in_motion)[:, None]
         if cause.cause == 'reference_slip':
             return self.span_changes((time >= cause.shapes[0]).astype(float))[:, None]
         if cause.cause == 'bandwidth':
@@ -269,7 +301,7 @@ class Spans:
     def with_corrected_rate(self, values: Array) -> Spans:
         """Return the spans with the rate corrected for scale factor error, bias and delay."""
         assert self.log.output is not None and self.log.time is not None
-        rate: Array = (self.log.output - values[1]) / (1.0 + values[0])
+        rate: Array = self.is_in_motion * (self.log.output - values[1]) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]))
         turned = integrate_with_curvature(self.log.time, rate)
         # the heading of the reference, between its points that of the gyro
@@ -319,6 +351,8 @@ class Spans:
         omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
         rest_times = np.clip(self.log.time[self.rests], begin, end)[:, :, None] - begin
         rows = np.diff(np.sin(omega * rest_times) / omega, axis=1)[:, 0]
+        around = np.searchsorted(self.time - begin, rest_times.mean(axis=(1, 2))) - 1
+        np.subtract.at(waves, np.clip(around, 0, len(waves) - 1), rows)
         waves = np.concatenate([waves, rows])
         if self.treatment.is_fine:
             return waves, parts
@@ -346,8 +380,8 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     gyro is known.
 
     """
-    treatment = _TREATMENTS.get(kind, COURSE_TREATMENT)
-    if treatment is COURSE_TREATMENT:
+    treatment, given = _TREATMENTS.get(kind, COURSE_TREATMENT), log.reference_heading
+    if not treatment.is_fine:
         log = drop_held_values(log)
     assert log.time is not None and log.output is not None
     if prior is not None:
@@ -378,7 +412,14 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
         at = np.append(0.5 * (time[1:] + time[:-1]), time[-1])
         reference = np.append(np.where(np.diff(reference) != 0.0,
                                        0.5 * (reference[1:] + reference[:-1]), np.nan), np.nan)
-    known = np.flatnonzero(np.isfinite(reference))
+    rests, stands = find_rests(
+        time, output, reference if treatment.is_fine or given is None else given)
+    if treatment.is_fine:
+        rests, stands = rests[~stands], stands[~stands]
+    in_rests = np.zeros(len(time), dtype=bool)
+    for first, last in rests[stands]:
+        in_rests[first:last + 1] = True
+    known = np.flatnonzero(np.isfinite(reference) & ~in_rests)
     stamps = at[known]
     length = max(treatment.min_span, float(stamps[-1] - stamps[0]) / treatment.max_spans,
                  2.0 * float(np.median(np.diff(time))))
@@ -394,22 +435,9 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
     channels = replace(channels_from_log(log), rate=output, time=time,
                        heading=integrate(time, output))
     return Spans(log, channels, at[known], place, np.bincount(place, at[known]) / count,
-                 np.bincount(place, reference[known]) / count,
-                 _find_rests(time, output, known), treatment,
+                 np.bincount(place, reference[known]) / count, rests, stands, treatment,
                  (max(min(walks), 1e-9), max(*walks, 1e-9)), noisier, by_code,
                  find_holes(time[np.isfinite(measured)], length))
-
-
-def _find_rests(time: Array, output: Array, known: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return first and last row of 3 s and more of a quiet gyro in gaps of the reference."""
-    second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
-    blocks = len(output) // second
-    scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
-    is_lost = np.bincount(known // second, minlength=blocks)[:blocks] == 0
-    is_still = (binary_erosion(is_lost, border_value=1)
-                & (scatter <= 2.0 * scatter.min(initial=math.inf) + 1e-12))
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], is_still, [0]]))).reshape(-1, 2)
-    return np.asarray(ends[ends[:, 1] - ends[:, 0] >= 3] * second - [0, 1], dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -459,6 +487,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     separated from errors of the reference; its interval is that of the prior.
 
     """
+    causes = spans.all_causes(causes)
     prior = np.array(spans.treatment.prior)
     free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
@@ -470,15 +499,14 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
         if spans.treatment.is_fine:
             values = _robust_least_squares(design, delayed.observed, free)[0]
         else:
-            values, error = _fit_headings(design[:count], delayed.observed[:count],
-                                          point_variances, free)
+            values, error = _fit_headings(delayed, design, point_variances, free)
             point_variances = _burst_variance(delayed.time, error)
         delayed = delayed.with_corrected_rate(values)
         if spans.treatment.is_fine:
             values[2] = 0.0
             left = delayed.observed - design_matrix(delayed, causes) @ values
             point_variances = _point_variances(left[:count])
-    if len(spans.rests):
+    if not spans.stands.all():
         delayed = _drop_contradicted_rests(delayed, causes, point_variances)
     return _fit_with_noise(delayed, causes, point_variances)
 
@@ -503,7 +531,8 @@ def find_delay(spans: Spans) -> float:
 
 def design_matrix(spans: Spans, causes: Sequence[CauseTerm]) -> Array:
     """Return the columns of scale factor error, bias and delay, and those of causes."""
-    return np.column_stack([spans.base_columns(), *(spans.cause_columns(each) for each in causes)])
+    return np.column_stack([spans.base_columns(), *(spans.cause_columns(each)
+                                                    for each in spans.all_causes(causes))])
 
 
 def _robust_least_squares(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
@@ -525,24 +554,30 @@ def _drop_contradicted_rests(spans: Spans, causes: Sequence[CauseTerm],
                              point_variances: Array) -> Spans:
     """Return the spans without rests whose rate is not the bias that the course shows."""
     assert spans.log.output is not None
-    by_course = _fit_with_noise(replace(spans, rests=spans.rests[:0]), causes, point_variances)
+    by_course = _fit_with_noise(replace(spans, rests=spans.rests[spans.stands],
+                                        stands=spans.stands[spans.stands]), causes,
+                                point_variances)
     rates = np.array([spans.log.output[first:last].mean() for first, last in spans.rests])
-    agree = np.abs(rates - by_course.values[1]) < by_course.half_width(1)
-    return replace(spans, rests=spans.rests[agree])
+    agree = spans.stands | (np.abs(rates - by_course.values[1]) < by_course.half_width(1))
+    return replace(spans, rests=spans.rests[agree], stands=spans.stands[agree])
 
 
-def _fit_headings(design: Array, observed: Array, point_variances: Array,
+def _fit_headings(spans: Spans, design: Array, point_variances: Array,
                   prior: Array) -> tuple[Array, Array]:
     """Return values by weighted least squares of the headings, and the error of each point."""
-    columns = np.pad(np.cumsum(design, axis=0), ((1, 0), (0, 0)))
+    count, observed = len(point_variances) - 1, spans.observed
+    columns = np.pad(np.cumsum(design[:count], axis=0), ((1, 0), (0, 0)))
     columns = np.column_stack([columns, np.ones(len(columns))])
-    error = heading = np.append(0.0, np.cumsum(observed))
-    own = np.diag(np.append(1.0 / prior, 0.0))
+    error = heading = np.append(0.0, np.cumsum(observed[:count]))
+    # the prior, and rests in which the reference stands
+    noise = spans.walk_bounds[1] * np.sqrt(spans.rest_durations[spans.stands])
+    own = np.vstack([np.diag(1.0 / prior), design[count:][spans.stands] / noise[:, None]])
+    own = np.pad(own, ((0, 0), (0, 1)))
+    known = np.append(np.zeros(len(prior)), observed[count:][spans.stands] / noise)
     for _ in range(3):
         weight = 1.0 / np.sqrt(point_variances) / (robust_deviation(error) + 1e-9)
-        values = np.linalg.lstsq(
-            np.vstack([columns * weight[:, None], own]),
-            np.append(heading * weight, np.zeros(len(own))), rcond=None)[0]
+        values = np.linalg.lstsq(np.vstack([columns * weight[:, None], own]),
+                                 np.append(heading * weight, known), rcond=None)[0]
         error = heading - columns @ values
     return values[:-1], error
 
@@ -571,15 +606,17 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
     columns, (least, most) = design_matrix(spans, causes), spans.walk_bounds
     low, high = spans.treatment.walk_range
     rates = spans.point_means(np.asarray(spans.channels.rate))
-    assert spans.log.time is not None
-    durations = np.diff(spans.log.time[spans.rests])[:, 0]
+    in_motion = spans.point_means(spans.time_in_motion)
+    durations = spans.rest_durations
     prior = spans.treatment.prior
     deviation = np.append(prior, np.full(columns.shape[1] - len(prior), np.inf))
     observed, (waves, shared) = spans.observed, spans.bias_wander()
 
     def fit_with(correlation: Array | None = None, **options: Any) -> GridFit:
-        parts = heading_noise(spans.time, rates, point_variances, correlation=correlation,
+        parts = heading_noise(in_motion, rates, point_variances, correlation=correlation,
                               angle_random_walk=(low * least, high * most))
+        if spans.stands.any():  # odometry adds up its errors
+            parts[2] = replace(parts[0], name='reference_walk', size_range=parts[1].size_range)
         parts = [replace(part, diagonal=np.append(part.diagonal, of_rests),
                          off_diagonal=None if part.off_diagonal is None
                          else np.append(part.off_diagonal, 0.0 * durations))
@@ -753,17 +790,70 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
                           'does not follow the course. Check that both belong to one drive, and '
                           'check axis, sign, units, and that the gyro responds')
     # intervals of a normal distribution, as wide as those of Student's
-    deviations = np.array([fit.half_width(place) for place in range(3)]) / NORMAL_QUANTILE_975
+    deviations = np.array([fit.half_width(place)
+                           for place in range(len(fit.values))]) / NORMAL_QUANTILE_975
     widening = deviations / np.sqrt(np.diag(fit.covariance))
     covariance = fit.covariance * np.outer(widening, widening)
-    scale, bias, delay = fit.values.tolist()
+    scale, bias, delay, *drifts = fit.values.tolist()
+    drift = (drifts[0], fit.half_width(len(BASE_VALUES))) if drifts else None
     return ScaleBiasFit(scale, bias, covariance[:2, :2], delay, fit.fit.size('angle_random_walk'),
-                        fit.fit.size('reference'), time_offset_deviation=float(deviations[2]))
+                        fit.fit.size('reference'), time_offset_deviation=float(deviations[2]),
+                        reference_drift=drift)
+
+
+def find_drift(log: Log) -> tuple[float, float] | None:
+    """
+    Return how a reference drifts in motion, and half the interval of 95 %, rad/s.
+
+    The bias that the motion shows is compared with that of the rests in which the reference
+    stands. Either may change steadily with time, and what depends on the rate is not of the
+    reference. None without such rests, or where both agree (Welch's test, at 1 %).
+
+    """
+    spans = lay_out_spans(log)
+    rests = spans.rests[spans.stands]
+    if len(rests) < 2:
+        return None
+    time, output = np.asarray(spans.log.time), np.asarray(spans.log.output)
+    halves = [half for first, last in rests
+              for half in np.array_split(np.arange(first, last + 1), 2)]
+    middle, means = 0.5 * time[-1], np.array([output[half].mean() for half in halves])
+    spans = spans.with_corrected_rate(np.array([0.0, means.mean(), 0.0]))
+    rows = np.column_stack([spans.observed, design_matrix(
+        spans, [CauseTerm('rate_ramp'), CauseTerm('scale_factor_asymmetry')])])
+    rows = -rows[:len(spans.time) - 1]
+    rows = rows[rows[:, 2] > 0.0]
+    in_motion = np.insert(rows[:, [2, 1, 3, 6]], 1, rows[:, 5] - middle * rows[:, 2], axis=1)
+    at_rest = np.array([(1.0, time[half].mean() - middle) for half in halves])
+    found = []
+    for columns, observed, weights in (
+            (in_motion, rows[:, 0], 1.0 / rows[:, 2]),
+            (at_rest, means, np.array([len(half) for half in halves], dtype=float))):
+        root, freedom = np.sqrt(weights), len(columns) - columns.shape[1]
+        inverse = np.linalg.pinv(root[:, None] * columns)
+        values = inverse @ (root * observed)
+        left = root * (observed - columns @ values)
+        if freedom < 1:
+            return None
+        found.append((values[0], left @ left / freedom * inverse[0] @ inverse[0], freedom))
+    (of_motion, *one), (of_rests, *other) = found
+    variance = one[0] + other[0]
+    freedom = variance ** 2 / (one[0] ** 2 / one[1] + other[0] ** 2 / other[1] + 1e-300)
+    drift, deviation = of_rests - of_motion, math.sqrt(variance)
+    return ((drift, float(student.ppf(0.975, freedom)) * deviation)
+            if abs(drift) > student.ppf(0.995, freedom) * deviation else None)
 
 
 def is_noisy(log: Log) -> bool:
-    """Tell whether a heading without steps is as noisy as a course from span to span."""
+    """
+    Tell whether a heading errs like a course.
+
+    It has no steps and is as noisy from span to span, or it drifts in motion.
+
+    """
     assert log.reference_heading is not None
+    if find_drift(log) is not None:
+        return True
     if quantization_step(log.reference_heading[np.isfinite(log.reference_heading)]
                          ) > MAX_ROUNDING_STEP:
         return False

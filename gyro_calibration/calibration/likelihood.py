@@ -93,6 +93,9 @@ class ScaleBiasFit:
     goodness: GoodnessOfFit | None = None
     # standard deviation between the turns of a profile of the fraction that each lost, 1
     slip_deviation: float = 0.0
+    # drift of a reference in motion against the rests in which it stands, and half its interval of
+    # 95 %, rad/s; None without such rests
+    reference_drift: tuple[float, float] | None = None
 
 
 #: Limit of significance, standard deviations: noise does not exceed it in 10 000 stretches a run,

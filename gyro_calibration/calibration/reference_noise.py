@@ -21,12 +21,14 @@ from gyro_calibration.logs.log import Array, Log, Mask
 from gyro_calibration.logs.quality import (
     bridge_gaps,
     encoder_step,
+    find_runs,
     quantization_step,
     white_noise_deviation,
 )
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import binary_erosion, uniform_filter1d
 
 #: Span over which the errors of gyro and reference are compared, s.
 _COMPARISON_SPAN = 1.0
@@ -78,6 +80,29 @@ def drop_held_values(log: Log) -> Log:
         return log
     return replace(log, reference_heading=np.where(np.diff(heading, prepend=np.nan) == 0.0, np.nan,
                                                    heading))
+
+
+def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np.intp], Mask]:
+    """
+    Return rests of 3 s and more: first and last row, shape (r, 2), and where the reference stands.
+
+    The gyro is quiet, and the reference is lost, or stands: it is known and does not change.
+
+    """
+    second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
+    blocks = len(output) // second
+    scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
+    is_quiet = scatter <= 2.0 * scatter.min(initial=math.inf) + 1e-12
+    known = np.flatnonzero(np.isfinite(reference))
+    changed = known[np.diff(reference[known], prepend=np.nan) != 0.0]
+    is_lost, is_same = (np.bincount(rows // second, minlength=blocks)[:blocks] == 0
+                        for rows in (known, changed))
+    rests = [(second * run.start, second * run.stop - 1, stands)
+             for stands, each in enumerate((binary_erosion(is_lost, border_value=1),
+                                            is_same & ~is_lost))
+             for run in find_runs(is_quiet & each) if run.stop - run.start >= 3]
+    ends = np.array(rests, dtype=np.intp).reshape(-1, 3)
+    return ends[:, :2], ends[:, 2] == 1
 
 
 def step_evenness(log: Log, step: float) -> float:

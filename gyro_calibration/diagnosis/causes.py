@@ -74,6 +74,9 @@ _OTHER_CAUSES = (
      'time reference', 'rate', _LOG_EXPERIMENTS['scale_factor_error']),
     ('reference_slip', 'The reference slipped: it shows a rotation that the gyro did not make.',
      'rad', 'reference', 'time reference', 'rate_change', ''),
+    ('reference_drift', 'The reference drifts in motion, and stands at rest, as odometry does.',
+     'rad/s', 'reference', 'time reference_heading', 'time',
+     CATALOGUE['vibration_rectification'].experiment),
     ('reference_quantization', 'The reference heading is quantized, so that its rate between '
      'samples is coarse.', 'rad', 'reference', 'time reference_heading', 'heading', ''),
     ('unit_error', 'The output has another unit, or the other sign, than its name states.', '1',

@@ -33,6 +33,7 @@ from gyro_calibration.calibration.dwells import (
     interpolate_reference,
     require_output,
 )
+from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.reference_noise import (
     heading_difference,
     is_course,
@@ -702,6 +703,9 @@ def classify_reference(log: Log, stated_kind: str | None = None) -> Reference:
         lost = 100.0 * float(find_lost_reference(np.isfinite(heading)).mean())
         return Reference('course', f'the heading is lost for {lost:.2g} % of the log, as '
                          'for a course at low speed, and its errors exceed those of the gyro')
+    if (drift := find_drift(log)) is not None:
+        return Reference('odometry', 'it stands in the rests, and in motion drifts by '
+                         f'{drift[0] / DEGREE:.2g} +- {drift[1] / DEGREE:.2g} deg/s against them')
     step = encoder_step(heading)
     if step >= MAX_ROUNDING_STEP or step and not _is_decimal(step):
         return Reference('encoder', f'the heading comes in steps of {step / DEGREE:.3g} deg')
@@ -721,7 +725,7 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return (log.reference_rate is not None
                 and rate_noise_share(log) > _MAX_RATE_NOISE_SHARE)
-    if reference.kind == 'course' or reference.evidence == 'as given':
+    if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
     # the rounding error of an encoder does not show while its shaft rests

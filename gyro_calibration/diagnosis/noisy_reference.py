@@ -148,7 +148,8 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     motion_variance = noise['motion'] ** 2 * float(np.mean(rates ** 2))
     of_heading = heading_error_shares([(parts, time)],
                                       2.0 * (noise['reference'] ** 2 + motion_variance))
-    findings = [*_value_findings(extended, model, false_alarm_rate, reference), *record.findings,
+    findings = [*_value_findings(extended, model, false_alarm_rate, reference),
+                *_drift_findings(extended, false_alarm_rate), *record.findings,
                 *(each for cause in found for each in [_cause_finding(cause, extended)]
                   if not each.parameters[each.effect].contains_zero)]
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
@@ -217,6 +218,22 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
                            max(chance, MIN_PROBABILITY), confounders,
                            minimum_detectable=DETECTION_SIGMAS * deviation,
                            evidence=f'evidence from {effective:.0f} stretches', **known)
+
+
+def _drift_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
+    """Give the drift of a reference in motion against the rests in which it stands."""
+    name, place = 'reference_drift', len(BASE_VALUES)
+    if name not in {each.cause for each in fit.causes}:
+        return
+    deviation = math.sqrt(fit.covariance[place, place])
+    chance = float(2.0 * student.sf(abs(fit.values[place]) / deviation, fit.freedom[place]))
+    if chance < false_alarm_rate:
+        yield make_finding(
+            name, {name: Estimate.from_half_width(float(fit.values[place]), fit.half_width(place),
+                                                  CAUSES[name].unit)},
+            max(chance, MIN_PROBABILITY), ['vibration_rectification'],
+            minimum_detectable=DETECTION_SIGMAS * deviation,
+            evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias')
 
 
 def _is_lag_possible(fit: SpanFit, delay: float) -> bool:
@@ -360,7 +377,7 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
 
 def _untestable_causes(plain: SpanFit) -> dict[str, str]:
     """Return the reason for each cause that was not searched for."""
-    seen = {each.cause for each in propose_terms(plain)} | _ALWAYS_TESTED
+    seen = {each.cause for each in (*propose_terms(plain), *plain.causes)} | _ALWAYS_TESTED
     missing = {channel for channel in ('temperature', 'specific_force', 'supply')
                if getattr(plain.spans.log, channel) is None}
     shown = {}
@@ -372,6 +389,8 @@ def _untestable_causes(plain: SpanFit) -> dict[str, str]:
         elif plain.lacks_turns and _follows_the_rate(name):
             reason = ('fewer than three stretches turn, which do not distinguish it from a scale '
                       'factor error')
+        elif name == 'reference_drift':
+            reason = 'the reference is known in no rest'
         elif name == 'reference_once_per_rev':
             reason = 'a course over ground has no shaft'
         else:

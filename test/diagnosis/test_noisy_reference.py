@@ -13,7 +13,13 @@
 from dataclasses import replace
 
 from diagnosed import judge_findings, log_of
-from gyro_calibration.calibration.heading_regression import CauseTerm, fit_spans, lay_out_spans
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.heading_regression import (
+    CauseTerm,
+    find_drift,
+    fit_spans,
+    lay_out_spans,
+)
 from gyro_calibration.calibration.reference_noise import rate_noise_share
 from gyro_calibration.diagnosis.gates import classify_reference, is_reference_limiting
 from gyro_calibration.diagnosis.noisy_reference import search_causes
@@ -377,3 +383,47 @@ def test_odometry_that_begins_after_the_gyro_is_no_course(begins, ends):
     assert np.isnan(log.reference_heading[[0, -1]]).all()
     reference = classify_reference(log)
     assert reference.kind == 'motion_capture' and 'lost' not in reference.evidence
+
+
+def odometry(seed, drift, asymmetry=0.0, warming=0.0):
+    """Return a log of motions and rests of 5 to 30 s, with odometry that slips, and the bias."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, 240.0, 0.02)
+    moves, end, smooth = np.zeros(len(time)), 0.0, np.hanning(31) / np.hanning(31).sum()
+    while end < time[-1]:
+        begin = end + generator.uniform(5.0, 30.0)
+        end = begin + generator.uniform(8.0, 40.0)
+        moves[(time >= begin) & (time < end)] = 1.0
+    knots = np.arange(0.0, 242.0, 2.0)
+    speeds, rates = generator.uniform(0.4, 1.6, len(knots)), generator.normal(0.0, 0.4, len(knots))
+    speed, rate = (np.convolve(moves * np.interp(time, knots, each), smooth, 'same')
+                   for each in (speeds, rates))
+    slip = 0.02 * drift * speed + 0.1 * abs(drift) * np.sqrt(0.02 * speed) * generator.normal(
+        size=len(time))
+    bias = generator.normal(0.0, 0.4) * DEGREE + warming * np.exp(-time / 60.0) + np.cumsum(
+        generator.normal(0.0, 1e-6, len(time)))
+    output = 1.005 * rate + asymmetry * np.abs(rate) + bias + generator.normal(
+        0.0, 1.2e-3, len(time))
+    return Log(time=time, output=output, reference_heading=np.cumsum(0.99 * 0.02 * rate + slip)
+               ), float(bias.mean())
+
+
+@pytest.mark.parametrize('seed, drift', [(0, 0.3), (1, -1.0), (2, 3.0)])
+def test_rests_determine_the_bias_beside_odometry_that_drifts_in_motion(seed, drift):
+    log, bias = odometry(seed, drift * DEGREE)
+    fit = calibrate_encoder(log)
+    assert abs(fit.fit.bias - bias) < 2.0 * np.sqrt(fit.fit.covariance[1, 1]) < 0.1 * DEGREE
+    assert 'against the rests' in fit.remarks[0]
+    found = diagnosed(log)
+    assert found.reference.kind == 'odometry' and 'drifts' in found.reference.evidence
+    named = {each.effect: each for each in found.findings if each.status == 'established'}
+    assert {*named} <= {'reference_drift', 'time_offset'}, terminal_lines(found)
+    size = named['reference_drift'].parameters['reference_drift']
+    assert size.estimate == pytest.approx(drift * DEGREE, rel=0.2)
+    assert abs(value(found.model, 'bias') - bias) < 0.1 * DEGREE
+
+
+@pytest.mark.parametrize('hidden', [{}, {'asymmetry': 0.02}, {'warming': 1e-3}], ids=str)
+def test_what_the_gyro_does_in_motion_is_no_drift_of_the_reference(hidden):
+    drifts = [find_drift(odometry(seed, 0.01 * DEGREE, **hidden)[0]) for seed in range(10)]
+    assert sum(each is not None for each in drifts) <= 1
