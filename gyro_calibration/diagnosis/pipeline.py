@@ -17,7 +17,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwells import require_output
+from gyro_calibration.calibration.dwells import Dwells, find_dwells, require_output
+from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
     common_channels,
@@ -70,6 +71,7 @@ from gyro_calibration.diagnosis.gates import (
     refuse_unusable,
 )
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
+from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.regression import (
     average_filtered_noise,
     build_problem,
@@ -108,7 +110,7 @@ from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import mannwhitneyu, norm
 
 #: Probability that an effect of the minimum detectable size is found.
 _DETECTION_POWER = 0.95
@@ -200,6 +202,12 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
     if averaged is not search.problem.replays:
         search = start_search(averaged, SEARCH_ALARM_SHARE * rate, on_progress)
         everything = search_causes(search)
+    if (len(logs) == 1 and logs[0].reference_rate is not None
+            and (settled := _settled_dwells(logs[0], fit_causes(search.problem, everything),
+                                            rate))):
+        dwells, of_changes = settled
+        table = diagnose_table(dwells, model, rate, on_progress)
+        return replace(table, unexplained=(*table.unexplained, of_changes))
     selection = confirm_causes(search, everything)
     found = fit_causes(search.problem, selection.named)
     out = unmergeable_causes(model or GyroModel(), found)
@@ -248,6 +256,45 @@ def _diagnose_by_exact_reference(logs: Sequence[Log], generator: np.random.Gener
                      heading_error_curve(left, shown), allan_curves(found, noise, simulated),
                      tuple(_remarks(quality, names, found, selection, out, gain, model)),
                      rate, heading_shares=of_heading)
+
+
+def _settled_dwells(log: Log, fit: RegressionFit,
+                    false_alarm_rate: float) -> tuple[Dwells, Unexplained] | None:
+    """
+    Return the dwells of a log whose residual is larger between them, and that; otherwise None.
+
+    The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
+    with dynamics that no cause describes. The mean squares of the whitened residual are compared
+    stretch by stretch (Mann and Whitney), and have to be twice as large between dwells.
+
+    """
+    try:
+        dwells = find_dwells(log)
+    except DataRefused:
+        return None
+    time = fit.problem.replays[0].channels.time
+    within = np.zeros(len(time), dtype=bool)
+    for rows in dwells.rows:
+        within[rows[0]:rows[-1] + 1] = True
+    white, valid = fit.whitened_series()[0], fit.problem.replays[0].valid
+    at = time[valid][0] + fit.problem.replays[0].point_interval * np.arange(len(white))
+    inside = within[np.clip(np.searchsorted(time, at), 0, len(time) - 1)]
+    begin = np.concatenate([[0], np.flatnonzero(np.diff(inside)) + 1])
+    squares = np.add.reduceat(white ** 2, begin) / np.diff(np.append(begin, len(white)))
+    steady, between = squares[inside[begin]], squares[~inside[begin]]
+    if (min(len(steady), len(between)) < MIN_STRETCHES
+            or np.median(between) < 2.0 * np.median(steady)):
+        return None
+    chance = float(mannwhitneyu(between, steady, alternative='greater').pvalue)
+    if chance > VALUE_ALARM_SHARE * false_alarm_rate:
+        return None
+    excess = white[~inside] ** 2 - np.median(steady)
+    found = Unexplained('rate_change', float(max(excess.sum(), 0.0) / (white @ white)), chance)
+    return replace(dwells, remarks=(
+        *dwells.remarks, 'between the dwells, gyro and reference differ by more than the causes '
+        'explain, as where a robot follows its command with a lag and overshoot; the log is '
+        f'diagnosed by its {len(dwells)} dwells alone: use a measured rate or heading as the '
+        'reference to see more')), found
 
 
 def _cause_findings(search: Search, fit: RegressionFit, selection: Selection) -> Iterator[Finding]:
