@@ -233,16 +233,14 @@ def test_an_example_runs_and_says_something(ran, name):
     assert ran(name)[1].strip()
 
 
-def test_the_written_model_can_be_read(ran):
-    folder, _ = ran('write_a_model.py')
-    model = read_model(folder / 'model.yaml')
+def test_the_examples_leave_the_files_that_they_name(ran):
+    model, calibrated = (read_model(ran(name)[0] / 'model.yaml')
+                         for name in ('write_a_model.py', 'self_calibrate_a_log.py'))
     assert model.temperature_range == (25.0, 45.0) and model.uses_channel('temperature')
-
-
-def test_the_self_calibration_is_in_the_written_model(ran):
-    folder, _ = ran('self_calibrate_a_log.py')
-    calibration = read_model(folder / 'model.yaml').self_calibration
+    calibration = calibrated.self_calibration
     assert abs(calibration.scale_factor_error + 0.1) < 4 * calibration.standard_deviations[0]
+    compensated = read_log(ran('compensate_a_log.py')[0] / 'compensated.csv')
+    assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(compensated.others)
 
 
 def test_the_rate_table_gives_a_model_that_knows_the_true_rate(ran):
@@ -271,9 +269,3 @@ def test_the_diagnosed_gyro_lags_behind_its_thermometer_and_another_drive_gains(
             if term.effect.name == 'thermal_lag')
     assert abs(lag[0] / 120.0 - 1.0) < 0.2 and abs(lag[1] / 2e-4 - 1.0) < 0.2
     assert off[1] < 0.3 * off[0] and (folder / 'report.html').exists()
-
-
-def test_the_compensated_log_has_a_heading(ran):
-    folder, _ = ran('compensate_a_log.py')
-    assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(
-        read_log(folder / 'compensated.csv').others)

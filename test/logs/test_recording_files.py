@@ -53,9 +53,9 @@ def gyro(make, time, rate, **how):
 
 
 def measured(data):
-    """Return 20 s of a gyro on a turntable, with a reference heading."""
+    """Return 800 samples of a gyro on a turntable, with a reference heading."""
     log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
-    return replace(log, **{name: values[:2000] for name, values in vars(log).items()
+    return replace(log, **{name: values[:800] for name, values in vars(log).items()
                            if isinstance(values, np.ndarray)})
 
 

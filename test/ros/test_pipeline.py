@@ -24,7 +24,14 @@ from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import simulate_gyro_output
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import REST
-from gyro_calibration.ros.inputs import Velocity
+from gyro_calibration.ros.inputs import (
+    COASTING_DURATION,
+    COMMAND,
+    MAX_VELOCITY_AGE,
+    ODOMETRY,
+    Velocity,
+    Wheels,
+)
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -267,6 +274,57 @@ def test_odometry_that_turns_without_a_rate_is_a_warning_and_shows_no_standstill
     assert rig.pipeline.wheels.is_moving(rig.clock.now) is None
     error, deviation = rig.error(begin)
     assert abs(error) < 4.0 * deviation, (error, deviation)
+
+
+# What odometry and commands of the last second show of the wheels
+
+
+def wheels(*received):
+    """Return wheels of which came: source, velocity ahead, yaw rate, time."""
+    made = Wheels()
+    for source, ahead, turning, time in received:
+        made.add(source, Velocity((ahead, 0.0, 0.0), (0.0, 0.0, turning)), time)
+    return made
+
+
+OLD = 10.0 + MAX_VELOCITY_AGE
+STOPPED = (COMMAND, 1.0, 0.0, 10.0), (COMMAND, 0.0, 0.0, 10.1)
+CASES = {  # what was received, when it is asked, whether the robot moves
+    'nothing': ([], 10.0, None),
+    'zero': ([(ODOMETRY, 0.0, 0.0, 10.0)], 10.5, False),
+    'below the limits': ([(ODOMETRY, 9e-4, 1e-4, 10.0)], 10.5, False),
+    'back': ([(ODOMETRY, -0.01, 0.0, 10.0)], 10.5, True),
+    '0.05 deg/s': ([(ODOMETRY, 0.0, -9e-4, 10.0)], 10.5, True),
+    'a second old': ([(ODOMETRY, 1.0, 0.3, 10.0)], OLD, True),
+    'older': ([(ODOMETRY, 1.0, 0.3, 10.0)], OLD + 0.01, None),
+    'one of two': ([(ODOMETRY, 0.0, 0.0, 10.0), (COMMAND, 1.0, 0.0, 10.0)], 10.1, True),
+    'an old one of two': ([(COMMAND, 1.0, 0.0, 10.0), (ODOMETRY, 0.0, 0.0, 11.5)], 11.6, False),
+    'coasting after the last command to move': (STOPPED, 10.0 + 0.9 * COASTING_DURATION, True),
+    'no longer': (STOPPED, 10.01 + COASTING_DURATION, False),
+    'odometry, which shows coasting itself': (
+        [(ODOMETRY, 1.0, 0.0, 10.0), (ODOMETRY, 0.0, 0.0, 10.1)], 10.2, False),
+    'not a number': ([(ODOMETRY, math.nan, 0.0, 10.0)], 10.1, None),
+    'infinite': ([(ODOMETRY, math.inf, 0.0, 10.0)], 10.1, None),
+    'finite before': ([(ODOMETRY, 1.0, 0.0, 10.0), (ODOMETRY, 0.0, math.nan, 10.1)], 10.2, True),
+}
+
+
+@pytest.mark.parametrize('received, now, moving', CASES.values(), ids=CASES)
+def test_velocities_of_the_last_second_show_whether_the_robot_moves(received, now, moving):
+    assert wheels(*received).is_moving(now) is moving
+
+
+def test_age_and_yaw_rate_are_those_of_the_last_second():
+    turning = wheels((ODOMETRY, 1.0, 0.3, 10.0), (ODOMETRY, 0.0, math.inf, 10.3))
+    assert turning.age(10.5) == 0.5 and turning.turn_rate(OLD) == 0.3
+    assert turning.turn_rate(OLD + 0.01) == 0.0
+    assert wheels().age(10.0) == math.inf and wheels().turn_rate(10.0) == 0.0
+
+
+def test_only_the_sources_that_are_asked_count():
+    both = wheels((ODOMETRY, 0.0, 0.0, 10.0), (COMMAND, 1.0, 0.0, 10.0))
+    assert both.is_moving(10.1, (ODOMETRY,)) is False and both.is_moving(10.1, (COMMAND,)) is True
+    assert both.is_moving(10.1, ()) is None
 
 
 # Several publishers
