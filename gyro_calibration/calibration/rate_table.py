@@ -126,6 +126,10 @@ class Calibration:
         return select_dwells(self.dwells, self.scatter.inliers)
 
     @cached_property
+    def _whitener(self) -> Whitener:
+        return Whitener(self.used, self.scatter)
+
+    @cached_property
     def uncertainty(self) -> Uncertainty:
         """Return the distribution of the fitted values, of more dwells than there are values."""
         return Uncertainty.from_fit(self.used, self.scatter, *_linearize_output(
@@ -197,9 +201,7 @@ class Calibration:
         unexplained : error in addition to the residual, rad/s, shape (n,)
 
         """
-        whitener, error = Whitener(self.used, self.scatter), (
-            self.residual[self.scatter.inliers] + unexplained)
-        known_basis, white, new = _beside(*map(whitener.whiten, (known, error, columns)))
+        known_basis, white, new = self._whiten_beside(known, unexplained, columns)
         # a sine may have its zeros at the rates of all dwells
         new_basis = _orthonormal_columns(new, 1.0 / MAX_CONDITION_NUMBER)
         count, freedom = new_basis.shape[1], len(white) - known_basis.shape[1] - new_basis.shape[1]
@@ -208,9 +210,10 @@ class Calibration:
         gain, total = float(np.sum((new_basis.T @ white) ** 2)), float(white @ white)
         share = 1.0 - (total - gain) / freedom / max(total / (freedom + count), 1e-300)
         # Columns in their own unit, for the covariance of the dwells may be another one.
-        plain = whitener.restore(np.column_stack([known_basis, new_basis]))
-        uncertain = Uncertainty.from_fit(self.used, self.scatter, plain, error)
-        of_model = new_basis.T @ whitener.whiten(self.given_errors)
+        plain = self._whitener.restore(np.column_stack([known_basis, new_basis]))
+        uncertain = Uncertainty.from_fit(self.used, self.scatter, plain,
+                                         self.residual[self.scatter.inliers] + unexplained)
+        of_model = new_basis.T @ self._whitener.whiten(self.given_errors)
         values = uncertain.offsets[:, -count:]
         covariances = uncertain.covariances[:, -count:, -count:] + of_model @ of_model.T
         squares = np.einsum('ki,ki->k', values,
@@ -218,14 +221,23 @@ class Calibration:
         chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.dof))
         return ColumnTest(chance, gain, min(max(share, 0.0), 1.0))
 
-    def gains(self, columns: Array, known: Array, unexplained: Array) -> Array:
-        """Return the gain of each column alone, shape (m,), with the arguments of `test`."""
-        whitener, error = Whitener(self.used, self.scatter), (
-            self.residual[self.scatter.inliers] + unexplained)
-        _, white, new = _beside(*map(whitener.whiten, (known, error, columns)))
+    def largest_gain(self, columns: Array, known: Array, unexplained: Array) -> float:
+        """Return the gain of the best of several columns, with the arguments of `test`."""
+        _, white, new = self._whiten_beside(known, unexplained, columns)
         lengths = np.linalg.norm(new, axis=0)
         new = new / np.where(lengths > 1.0 / MAX_CONDITION_NUMBER, lengths, math.inf)
-        return np.asarray((new.T @ white) ** 2)
+        return float(((new.T @ white) ** 2).max())
+
+    def _whiten_beside(self, known: Array, unexplained: Array | float,
+                       columns: Array) -> tuple[Array, Array, Array]:
+        """Return a basis of known columns, the rest of the errors, and of columns of length 1."""
+        known, error, columns = map(self._whitener.whiten, (
+            known, self.residual[self.scatter.inliers] + unexplained, columns))
+        known = _orthonormal_columns(
+            known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), 1e-6)
+        columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        return (known, error - known @ (known.T @ error),
+                columns - known @ (known.T @ columns))
 
     @cached_property
     def given_errors(self) -> Array:
@@ -478,13 +490,6 @@ def _factor_columns(dwells: Dwells, terms: Sequence[Term],
     if not np.linalg.cond(triangle) < MAX_CONDITION_NUMBER:
         raise _unidentifiable_error(terms, triangle)
     return orthogonal, triangle, lengths
-
-
-def _beside(known: Array, error: Array, columns: Array) -> tuple[Array, Array, Array]:
-    """Return a basis of known columns, and the rest of errors, and of columns of length one."""
-    known = _orthonormal_columns(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), 1e-6)
-    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    return known, error - known @ (known.T @ error), columns - known @ (known.T @ columns)
 
 
 def _orthonormal_columns(columns: Array, tolerance: float) -> Array:

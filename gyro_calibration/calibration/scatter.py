@@ -331,24 +331,17 @@ class Uncertainty:
                    inverses[likely] * size[:, None, None] / np.outer(lengths, lengths), dof,
                    np.sqrt(weights @ squares))
 
-    @property
-    def deviations(self) -> Array:
-        """Return the scales of the distributions of each value, shape (k, m)."""
-        return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
-
-    def probability_below(self, change: Array | float) -> Array:
-        """Return the probability that each value is below the fitted plus a change, shape (m,)."""
-        return np.asarray(
-            self.weights @ student.cdf((change - self.offsets) / self.deviations, self.dof))
-
     def half_width(self, probability: float) -> Array:
         """Return half of the intervals about the fitted values of a probability, shape (m,)."""
+        deviations = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
         low = np.zeros(self.offsets.shape[1])
         high = (2.0 * student.ppf(0.5 + 0.5 * probability, self.dof)
-                * (self.deviations + np.abs(self.offsets)).max(axis=0))
+                * (deviations + np.abs(self.offsets)).max(axis=0))
         for _ in range(25):
             half = 0.5 * (low + high)
-            narrow = self.probability_below(half) - self.probability_below(-half) < probability
+            below, above = (student.cdf((end - self.offsets) / deviations, self.dof)
+                            for end in (-half, half))
+            narrow = self.weights @ (above - below) < probability
             low, high = np.where(narrow, half, low), np.where(narrow, high, half)
         return high
 

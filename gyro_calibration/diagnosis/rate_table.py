@@ -53,7 +53,7 @@ from gyro_calibration.calibration.selection import (
     try_fit,
     try_replace,
 )
-from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding
+from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, REFERENCES
 from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
     gain_from_squares,
@@ -511,38 +511,23 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
 
 # what cannot be shown
 
-_AVERAGED_REASON = 'a dwell is a mean at a constant rate; record samples with their time'
-_NO_TIME_REASON = 'a table without time does not show what changes with time; record a log in time'
-#: Cause, or the variable along which it shows -> why a table does not show it.
-_UNTESTABLE_REASONS = {
-    'dead_zone': _AVERAGED_REASON, 'saturation': _AVERAGED_REASON,
-    'reference_scale':
-        'only a second reference separates the scale of the first from that of the gyro',
-    'rate_change':
-        'at constant rates a delay has no effect; record fast reversals with their time',
-    'temperature_rate': _NO_TIME_REASON, 'time': _NO_TIME_REASON,
-    'frequency': _AVERAGED_REASON, 'output': _AVERAGED_REASON,
-    'heading':
-        'whole turns average over all headings; record reference_heading_deg in time',
-    **dict.fromkeys(('specific_force', 'vibration'),
-                    'only rates and temperatures of a table are evaluated; record '
-                    'acceleration_mps2 in several poses, with time'),
-    'supply': 'only rates and temperatures of a table are evaluated; record supply_v with time'}
-
-
 def _untestable_causes(dwells: Dwells) -> dict[str, str]:
     """Return the causes that the table cannot show, with the reasons."""
-    found = {name: _UNTESTABLE_REASONS.get(name) or _UNTESTABLE_REASONS[cause.along]
-             for name, cause in CAUSES.items()
-             if name not in {*STATIC_EFFECTS, 'outliers', 'unit_error'}}
-    thermal = [name for name, effect in STATIC_EFFECTS.items() if 'temperature' in effect.inputs]
-    if dwells.temperature is None:
-        return {**found, **dict.fromkeys(
-            thermal, 'the table holds no temperature; record temperature_degc')}
-    if np.ptp(dwells.temperature) < MIN_TEMPERATURE_SPREAD:
-        return {**found, **dict.fromkeys(
-            thermal, f'the temperature varies by {np.ptp(dwells.temperature):.2g} K only; repeat '
-            'the rates at another temperature')}
+    found = {}
+    for name, cause in CAUSES.items():
+        if name in {*STATIC_EFFECTS, 'outliers', 'unit_error'}:
+            continue
+        more = cause.required_channels - {'time', 'temperature', *REFERENCES, 'reference'}
+        columns = ' and '.join(['time', *sorted(more)]).replace('_', ' ')
+        found[name] = f'means at constant rates do not show it; record samples with {columns}'
+    found['reference_scale'] = ('only a second reference separates the scale of the first from '
+                                'that of the gyro')
+    if not _shows_temperature(dwells):
+        reason = ('the table holds no temperature; record temperature_degc'
+                  if dwells.temperature is None else 'the temperature varies by '
+                  f'{np.ptp(dwells.temperature):.2g} K only; repeat the rates at another one')
+        found |= {name: reason for name, effect in STATIC_EFFECTS.items()
+                  if 'temperature' in effect.inputs}
     return found
 
 
@@ -586,15 +571,13 @@ def find_alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]
     experiment = CAUSES[effect.name].separate_by
     if effect in _ALWAYS_CONFOUNDED:
         return [_ALWAYS_CONFOUNDED[effect]], experiment
-    others = [each for each in fit.terms if each.effect is not effect]
-    columns = dict(_alternative_columns(fit, effect))
-    gains = fit.gains(np.column_stack([fit.change(effect), *columns.values()]),
-                      sensitivity_columns(fit.used, others), fit.change(effect))
-    ends = np.cumsum([1, *(each.shape[1] for each in columns.values())])
-    lacks = {name: max(gains[0] - float(gains[begin:end].max()), 0.0)
-             for name, begin, end in zip(columns, ends, ends[1:])}
-    names = sorted((name for name, lack in lacks.items()
-                    if lack < MIN_DISTINGUISHING_SIGMAS ** 2), key=lambda name: lacks[name])
+    others, change = [each for each in fit.terms if each.effect is not effect], fit.change(effect)
+    known = sensitivity_columns(fit.used, others)
+    lacks = {name: fit.largest_gain(change[:, None], known, change)
+             - fit.largest_gain(columns, known, change)
+             for name, columns in _alternative_columns(fit, effect)}
+    names = sorted((name for name in lacks if lacks[name] < MIN_DISTINGUISHING_SIGMAS ** 2),
+                   key=lambda name: max(lacks[name], 0.0))
     if effect in CONFOUNDERS and CONFOUNDERS[effect].name in names:
         swapped = try_replace(fit, effect, CONFOUNDERS[effect])
         rate = None if swapped is None else distinguishing_rate(fit, swapped)
