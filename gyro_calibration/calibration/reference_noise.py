@@ -43,8 +43,9 @@ _WHITE_CORRELATION_RATIO = -0.5
 #: Noise of a reference rate that is not white is detected from so many standard deviations on, in
 #: this quietest share of the log, in blocks of so many samples.
 _DETECTION_SIGMAS, _QUIET_SHARE, _BLOCK_SAMPLES = 3.0, 0.03, 25
-#: A reference that is lost for this part of the time is taken for a course; one in steps of more
-#: than this, rad, for an encoder, whose errors are at most so many times its rounding error.
+#: A reference that is lost for this part of the time may lie on straight lines between slow fixes;
+#: one in steps of more than this, rad, is taken for an encoder, whose errors are at most so many
+#: times its rounding error.
 MIN_LOST_SHARE, MAX_ROUNDING_STEP, MAX_ROUNDING_RATIO = 0.003, 2e-4, 1.5
 #: Least ratio of the errors of a course to the noise of the gyro, also for a course that is
 #: straight between fixes (measured in drives: 4.6 to 920, all below 8 on straight lines between
@@ -86,7 +87,8 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     """
     Return rests of 3 s and more: first and last row, shape (r, 2), and where the reference stands.
 
-    The gyro is quiet, and the reference is lost, or stands: it is known and does not change.
+    The gyro is quiet, and the reference is lost, or stands: it is known and does not change. Where
+    it stands and the gyro is not quiet all the time, something moves, and there is no rest.
 
     """
     second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
@@ -97,9 +99,11 @@ def find_rests(time: Array, output: Array, reference: Array) -> tuple[NDArray[np
     changed = known[np.diff(reference[known], prepend=np.nan) != 0.0]
     is_lost, is_same = (np.bincount(rows // second, minlength=blocks)[:blocks] == 0
                         for rows in (known, changed))
+    is_standing = is_same & ~is_lost
+    for run in find_runs(is_standing):
+        is_standing[run] &= is_quiet[run][1:-1].all()
     rests = [(second * run.start, second * run.stop - 1, stands)
-             for stands, each in enumerate((binary_erosion(is_lost, border_value=1),
-                                            is_same & ~is_lost))
+             for stands, each in enumerate((binary_erosion(is_lost, border_value=1), is_standing))
              for run in find_runs(is_quiet & each) if run.stop - run.start >= 3]
     ends = np.array(rests, dtype=np.intp).reshape(-1, 3)
     return ends[:, :2], ends[:, 2] == 1
@@ -227,13 +231,15 @@ def is_course(log: Log) -> bool:
     log = drop_held_values(log)
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     known = np.isfinite(log.reference_heading)
-    if find_lost_reference(known).mean() <= MIN_LOST_SHARE:
+    lost = float(find_lost_reference(known).mean())
+    if lost == 0.0:
         return False
     walk = white_noise_deviation(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
     bent = np.abs(np.diff(log.reference_heading, 2))
     # a heading between slower fixes lies on straight lines
     usual, large = (np.nanquantile(bent, [0.9, 0.99]) if np.isfinite(bent).any() else (0.0, 0.0))
-    larger = _FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large else _COURSE_NOISE_RATIO
+    larger = (_FIX_NOISE_RATIO if usual < _MAX_STRAIGHT_RATIO * large and lost > MIN_LOST_SHARE
+              else _COURSE_NOISE_RATIO)
     # an encoder errs by the rounding of its steps, of which the difference in a second has 3 times
     # the variance
     rounding = quantization_step(log.reference_heading[known]) / 2.0
