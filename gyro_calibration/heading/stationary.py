@@ -53,8 +53,8 @@ _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
     [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(4)
                         for shared in (0.0, 0.25, 0.5) for fast in (0.0, 1.0, 4.0))]).T
-#: The same of sums of many means, relative to that of white noise.
-_SUM_RATIOS = SCATTER_RATIOS * (1.0 + 2.0 * SCATTER_CORRELATIONS)
+#: The same of sums of many means, relative to that of white noise, for a process of first order.
+_SUM_RATIOS = SCATTER_RATIOS * (1.0 + SCATTER_CORRELATIONS) / (1.0 - SCATTER_CORRELATIONS)
 #: Prior numbers of rests, 3, and of straight drives that pass for rests, 1; largest total.
 _PRIOR_COUNTS = np.append(3.0, np.full(len(SCATTER_RATIOS) - 1, 1.0 / (len(SCATTER_RATIOS) - 1)))
 _MAX_STRETCHES = 20.0
