@@ -51,6 +51,8 @@ class RateIntegral:
     extra_noise_variance : additional variance of the noise by lost samples, rad²
     wander_variance : variance of the rotation during a detected rest that may be a straight drive,
         rad²
+    block_count, block_square_sum : number of blocks, and sum of their squared angles over their
+        durations, rad²/s
     is_unobserved : there were no rates: the heading is constant, and errors of rates do not affect
         it; not to be added to others
 
@@ -62,6 +64,8 @@ class RateIntegral:
     lost_variance: float = 0.0
     extra_noise_variance: float = 0.0
     wander_variance: float = 0.0
+    block_count: int = 0
+    block_square_sum: float = 0.0
     is_unobserved: bool = False
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
@@ -69,14 +73,23 @@ class RateIntegral:
         return RateIntegral(self.duration + other.duration, self.angle + other.angle,
                             self.sensitivity + other.sensitivity,
                             self.lost_variance + other.lost_variance,
-                            self.extra_noise_variance + other.extra_noise_variance)
+                            self.extra_noise_variance + other.extra_noise_variance,
+                            block_count=self.block_count + other.block_count,
+                            block_square_sum=self.block_square_sum + other.block_square_sum)
 
     def __sub__(self, other: RateIntegral) -> RateIntegral:
         """Return the rest of this integral after another with which it begins."""
         return RateIntegral(self.duration - other.duration, self.angle - other.angle,
                             self.sensitivity - other.sensitivity,
                             self.lost_variance - other.lost_variance,
-                            self.extra_noise_variance - other.extra_noise_variance)
+                            self.extra_noise_variance - other.extra_noise_variance,
+                            block_count=self.block_count - other.block_count,
+                            block_square_sum=self.block_square_sum - other.block_square_sum)
+
+    @property
+    def block_scatter(self) -> float:
+        """Return the sum of squared deviations of the blocks from their mean, rad²/s."""
+        return self.block_square_sum - self.angle ** 2 / self.duration
 
 
 @dataclass(frozen=True)

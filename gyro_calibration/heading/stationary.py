@@ -47,13 +47,14 @@ _MIN_WINDOW_SAMPLES = 8
 #: the model.
 _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
-#: to it, and correlations of neighbours: first those of a rest, then those of straight drives.
-#: With a larger variance, most means over 1 s are beyond the limit of `mean_threshold_sigmas`.
-SCATTER_RATIOS, SCATTER_CORRELATIONS = np.array(
-    [(0.0, 0.0), *((ratio, shared) for ratio in 4.0 ** np.arange(4)
-                   for shared in (0.0, 0.25, 0.5))]).T
-#: The same of sums of many means, relative to that of white noise.
-_SUM_RATIOS = SCATTER_RATIOS * (1.0 + 2.0 * SCATTER_CORRELATIONS)
+#: to it, correlations of neighbours, and the variances of blocks about these means: first those of
+#: a rest, then those of straight drives. With larger variances, most means over 1 s are beyond the
+#: limit of `mean_threshold_sigmas`, and most windows beyond that of the energy.
+SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
+    [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(4)
+                        for shared in (0.0, 0.25, 0.5) for fast in (0.0, 1.0, 4.0))]).T
+#: The same of sums of many means, relative to that of white noise, for a process of first order.
+_SUM_RATIOS = SCATTER_RATIOS * (1.0 + SCATTER_CORRELATIONS) / (1.0 - SCATTER_CORRELATIONS)
 #: Prior numbers of rests, 3, and of straight drives that pass for rests, 1; largest total.
 _PRIOR_COUNTS = np.append(3.0, np.full(len(SCATTER_RATIOS) - 1, 1.0 / (len(SCATTER_RATIOS) - 1)))
 _MAX_STRETCHES = 20.0

@@ -45,6 +45,7 @@ from gyro_calibration.heading.kalman import (
 from gyro_calibration.heading.stationary import (
     Block,
     BLOCK_DURATION,
+    BLOCK_RATIOS,
     EnergyDetector,
     Epoch,
     EvenSamples,
@@ -356,8 +357,7 @@ class HeadingTracker:
         if self._detects_rest:
             self._detect_motion(interval, last[1], wheels)
         elif self._block_integral.duration >= BLOCK_DURATION - TIME_TOLERANCE:
-            self._open_integral += self._block_integral
-            self._block_integral, self._open_variance = self._new_integral(), None
+            self._close_block()
             if self._open_integral.duration >= _STEP_DURATION - TIME_TOLERANCE:
                 self._advance_state()
         self.rate = (0.0 if self.is_resting or filtered != rate
@@ -564,9 +564,7 @@ class HeadingTracker:
 
     def _decide_rest(self, quiet: bool | None, wheels: bool | None) -> None:
         """Decide on rest or motion at the end of a block."""
-        part, self._block_integral = self._block_integral, self._new_integral()
-        self._open_variance = None
-        self._open_integral += part
+        part = self._close_block()
         if self.is_resting:
             self._rest_blocks.append(part)
             self._wheels_stand = wheels is False
@@ -590,6 +588,15 @@ class HeadingTracker:
             self._enter_rest()
             self._adopt_state()
             self._rest_blocks.extend([*self._recent_blocks][1:])
+
+    def _close_block(self) -> RateIntegral:
+        """Add the integral of the block to the open one, and return it."""
+        part, self._block_integral = self._block_integral, self._new_integral()
+        if part.duration > 0.0:
+            part.block_count, part.block_square_sum = 1, part.angle ** 2 / part.duration
+        self._open_integral += part
+        self._open_variance = None
+        return part
 
     def _hold_block(self, part: RateIntegral) -> None:
         """Hold the last blocks, which may be the begin of a rest."""
@@ -789,8 +796,7 @@ class HeadingTracker:
 
     def _advance_to_last_sample(self) -> None:
         """Propagate the state to the last sample."""
-        self._open_integral += self._block_integral
-        self._block_integral = self._new_integral()
+        self._close_block()
         if not self.is_resting:
             self._enter_motion(self._quiet_duration)
         self._advance_state()
@@ -820,8 +826,13 @@ class HeadingTracker:
         shared = SCATTER_CORRELATIONS * wander
         gain = shared / (before.variance + wander)
         spread = variance + share * wander - gain * shared
+        blocks = turn.block_scatter * turn.duration / (
+            self._energy.noise_factor ** 2 * self._model_noise.angle_random_walk ** 2
+            * turn.duration + turn.extra_noise_variance + turn.lost_variance)
         likelihood = before.log_likelihood - 0.5 * (
-            (innovation - gain * before.innovation) ** 2 / spread + np.log(spread / variance))
+            (innovation - gain * before.innovation) ** 2 / spread + np.log(spread / variance)
+            + (turn.block_count - 1) * np.log1p(BLOCK_RATIOS)
+            - blocks * BLOCK_RATIOS / (1.0 + BLOCK_RATIOS))
         scatter, median = self._rest_scatter.mean_and_median(likelihood)
         turn.wander_variance = 0.0 if self._wheels_stand else scatter * white
         self._propagate_state(turn,
