@@ -12,9 +12,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 import math
+import textwrap
 from typing import Any
 
 
@@ -153,3 +154,29 @@ class Reproduction:
         return {'title': self.title, 'assumed': list(self.assumed),
                 'comparisons': [each.data() for each in self.comparisons],
                 'contradictions': [each.data() for each in self.contradictions]}
+
+
+_TABLE_HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
+
+
+def render_page(reproduction: Reproduction) -> str:
+    """Return title, assumptions, table and contradictions in Markdown."""
+    parts = [f'## {reproduction.title}', _bullet_list('Assumed:', reproduction.assumed),
+             _table(reproduction.comparisons), _bullet_list('What does not hold:', [
+                 contradiction.sentence for contradiction in reproduction.contradictions])]
+    return '\n\n'.join(parts)
+
+
+def _bullet_list(heading: str, sentences: Iterable[str]) -> str:
+    items = [textwrap.fill(sentence, 130, initial_indent='* ', subsequent_indent='  ',
+                           break_on_hyphens=False) for sentence in sentences]
+    return '\n'.join([heading, '', *items])
+
+
+def _table(comparisons: Iterable[Comparison]) -> str:
+    rows = [_TABLE_HEADER, *(comparison.cells() for comparison in comparisons)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_TABLE_HEADER))]
+    lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |'
+             for row in rows]
+    return '\n'.join([lines[0], '|' + '|'.join('-' * (width + 2) for width in widths) + '|',
+                      *lines[1:]])

@@ -17,12 +17,11 @@ import math
 from pathlib import Path
 
 from gyro_calibration.cli.main import main
-from gyro_calibration.cli.reproduce import render_page
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.motion import CALIBRATION_MOTION
 from gyro_calibration_reproduction import bot_thoughts, hong_park, SOURCES
 from gyro_calibration_reproduction import ojeda_chung_borenstein as ojeda
-from gyro_calibration_reproduction.finding import Comparison
+from gyro_calibration_reproduction.finding import Comparison, render_page
 import numpy as np
 import pytest
 

@@ -156,12 +156,12 @@ def _refuse_turning(time: Array, output: Array, heading: Array) -> None:
 def _refuse_dead(time: Array, output: Array) -> None:
     """Refuse an output that is constant over a tenth of the record."""
     _refuse_few(len(output), 'samples at rest with an output')
-    changes = np.nonzero(np.concatenate([[True], np.diff(output) != 0.0, [True]]))[0]
-    longest = int(np.argmax(np.diff(changes)))
-    count = int(np.diff(changes)[longest])
+    same = max(find_runs(np.diff(output) == 0.0), key=lambda run: run.stop - run.start,
+               default=slice(0, 0))
+    count = same.stop - same.start + 1
     if count > max(len(output) // 10, 50):
         raise DataRefused(f'the gyro gives the same value {count} times in a row from '
-                          f'{time[changes[longest]]:g} s on: it is dead or its steps are coarser '
+                          f'{time[same.start]:g} s on: it is dead or its steps are coarser '
                           'than its noise; check it, and record again')
 
 

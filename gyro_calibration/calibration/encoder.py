@@ -60,6 +60,7 @@ from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION,
     fit_rate,
+    refuse_one_speed,
     refuse_scale,
     RunLimits,
 )
@@ -198,7 +199,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
                  technology: str) -> tuple[ScaleBiasFit, dict[str, tuple[float, float]]]:
     """Return the fit by a method, or refuse it, and the bounds of its noise that are known."""
     limits = RunLimits(max_time_offset=MAX_ENCODER_OFFSET)
-    _refuse_one_speed(motion, limits)
+    refuse_one_speed(motion, limits)
     refuse_dead(output)
     _refuse_turn_in_hole(time, output, motion)
     # the gyro's lag is assumed to be about that of a filter of 20 ms
@@ -256,7 +257,8 @@ def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
                               f'at least {fewest} are needed: {remedy}')
     start = log.time[reference_known][0]
-    motion = motion_from_headings(log.time[reference_known], heading[reference_known])
+    motion = replace(motion_from_headings(log.time[reference_known], heading[reference_known]),
+                     name='reference')
     if motion.duration < 10.0:
         raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: '
                           'record longer')
@@ -281,17 +283,6 @@ def _refuse_turn_in_hole(time: Array, output: Array, motion: Motion) -> None:
                 f'the gyro has no samples for {end - begin:.1f} s from {begin:.1f} s on, in which '
                 f'the reference turns by {turned / DEGREE:.0f} deg: use --method course, or fit '
                 'the log before or after it (--to, --from)')
-
-
-def _refuse_one_speed(motion: Motion, limits: RunLimits) -> None:
-    points = np.arange(0.0, motion.duration, 0.5)
-    spread = float(np.std(np.diff(motion.heading_at(points)) / 0.5))
-    if spread < limits.min_rate_spread:
-        mean = motion.heading[-1] / motion.duration
-        raise DataRefused(f'the reference turns at one speed, {mean / DEGREE:.1f} deg/s '
-                          f'(it varies by {spread / DEGREE:.2f} deg/s), so scale and bias cannot '
-                          'be separated: turn in both senses, or at another speed too, '
-                          'or with a rest')
 
 
 def _fit_by_rate(time: Array, output: Array, motion: Motion) -> ScaleBiasFit:

@@ -269,6 +269,16 @@ def refuse_scale(scale_factor_error: float, reference: str, remedy: str) -> None
                           f'(scale {1 + scale_factor_error:.2f}): {remedy}')
 
 
+def refuse_one_speed(motion: Motion, limits: RunLimits) -> None:
+    """Refuse a motion whose rate varies too little to separate scale and bias."""
+    headings = motion.heading_at(np.arange(0.0, motion.duration, 0.5))
+    spread = float(np.std(np.diff(headings) / 0.5))
+    if spread < limits.min_rate_spread:
+        raise DataRefused(f'the {motion.name} turns at one speed (its rate varies by '
+                          f'{spread / DEGREE:.2f} deg/s), so scale and bias cannot be separated: '
+                          'turn in both senses, or at another speed too, or with a rest')
+
+
 def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) -> None:
     """Refuse a run that is not the whole profile, another unit or sign, or one speed alone."""
     if not np.isfinite(motion.heading).all():
@@ -284,11 +294,7 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
         refuse_unit_error(scale, motion.name)
         refuse_scale(scale - 1.0, motion.name,
                      "give or omit --invert, or set the driver's parameter invert")
-    rate_spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
-    if rate_spread < limits.min_rate_spread:
-        raise DataRefused(f'the {motion.name} turns at one speed (its rate varies by '
-                          f'{rate_spread / DEGREE:.2f} deg/s): scale and bias cannot be '
-                          'separated; turn both ways, with stops')
+    refuse_one_speed(motion, limits)
     if unexplained > MAX_UNEXPLAINED_SHARE:
         if np.std(run.gyro_angle) < 0.1 * np.std(run.reference_angle(motion)):
             refuse_scale(scale - 1.0, motion.name, '')

@@ -20,17 +20,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from itertools import count
-import textwrap
 from typing import Any
 
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, show_progress
 from gyro_calibration.logs.log import Progress
 from gyro_calibration_reproduction import SOURCES
-from gyro_calibration_reproduction.finding import Comparison, Reproduction
+from gyro_calibration_reproduction.finding import render_page
 import numpy as np
-
-TABLE_HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -64,26 +61,3 @@ def _make_progress(name: str, on_progress: Callable[[float | None, str], None]) 
             yield item
 
     return report_runs
-
-
-def render_page(reproduction: Reproduction) -> str:
-    """Return title, assumptions, table and contradictions in Markdown."""
-    parts = [f'## {reproduction.title}', _bullet_list('Assumed:', reproduction.assumed),
-             _table(reproduction.comparisons), _bullet_list('What does not hold:', [
-                 contradiction.sentence for contradiction in reproduction.contradictions])]
-    return '\n\n'.join(parts)
-
-
-def _bullet_list(heading: str, sentences: Iterable[str]) -> str:
-    items = [textwrap.fill(sentence, 130, initial_indent='* ', subsequent_indent='  ',
-                           break_on_hyphens=False) for sentence in sentences]
-    return '\n'.join([heading, '', *items])
-
-
-def _table(comparisons: Iterable[Comparison]) -> str:
-    rows = [TABLE_HEADER, *(comparison.cells() for comparison in comparisons)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(TABLE_HEADER))]
-    lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |'
-             for row in rows]
-    return '\n'.join([lines[0], '|' + '|'.join('-' * (width + 2) for width in widths) + '|',
-                      *lines[1:]])

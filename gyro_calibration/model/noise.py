@@ -77,14 +77,14 @@ class Noise:
                      if self.bias_instability else _FLICKER_TIME_CONSTANTS[:0])
         return constants, self.bias_instability ** 2 * math.log(10.0) / math.pi
 
-    def drift_variance(self, duration: Number) -> Number:
+    def heading_variance(self, duration: Number) -> Number:
         """
-        Return the variance, rad², of a heading after `duration` s without white noise.
+        Return the variance, rad², of a heading after `duration` s.
 
         The bias is estimated as its mean over the `BIAS_AVERAGING_TIME` s before.
 
         """
-        variance = (self.rate_random_walk ** 2
+        variance = (self.angle_random_walk ** 2 * duration + self.rate_random_walk ** 2
                     * (duration ** 3 + BIAS_AVERAGING_TIME * duration ** 2) / 3.0)
         constants, of_each = self.flicker_processes()
         for constant in constants:
@@ -93,10 +93,6 @@ class Noise:
             variance = variance + of_each * (2.0 * constant * (duration - decayed) + duration ** 2
                                              * within - 2.0 * duration * decayed * shared)
         return variance
-
-    def heading_variance(self, duration: Number) -> Number:
-        """Return the variance, rad², of a heading as in `drift_variance`, with white noise."""
-        return self.angle_random_walk ** 2 * duration + self.drift_variance(duration)
 
 
 def averaged_process_moments(time_constant: Number) -> tuple[Number, Number]:
