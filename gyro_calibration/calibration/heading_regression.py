@@ -83,6 +83,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
 from scipy.stats import t as student
+from scipy.stats import ttest_1samp
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
 TECHNOLOGY_PRIORS = {
@@ -484,10 +485,11 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
     A scale factor error that is determined by fewer than `MIN_STRETCHES` stretches cannot be
-    separated from errors of the reference; its interval is that of the prior.
+    separated from errors of the reference; its interval is that of the prior. Rests that the
+    motion contradicts are left out where no causes are given.
 
     """
-    causes = spans.all_causes(causes)
+    given, causes = causes, spans.all_causes(causes)
     prior = np.array(spans.treatment.prior)
     free = np.concatenate([prior, np.full(design_matrix(spans, causes).shape[1] - 3, np.inf)])
 
@@ -506,7 +508,7 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
             values[2] = 0.0
             left = delayed.observed - design_matrix(delayed, causes) @ values
             point_variances = _point_variances(left[:count])
-    if not spans.stands.all():
+    if not (given or spans.stands.all()):
         delayed = _drop_contradicted_rests(delayed, causes, point_variances)
     return _fit_with_noise(delayed, causes, point_variances)
 
@@ -807,7 +809,8 @@ def find_drift(log: Log) -> tuple[float, float] | None:
 
     The bias that the motion shows is compared with that of the rests in which the reference
     stands. Either may change steadily with time, and what depends on the rate is not of the
-    reference. None without such rests, or where both agree (Welch's test, at 1 %).
+    reference. None without such rests, or where both agree (Welch's test, at 1 %), as a whole or
+    in the ways from rest to rest, each compared with the rests around it: the bias may wander.
 
     """
     spans = lay_out_spans(log)
@@ -836,10 +839,22 @@ def find_drift(log: Log) -> tuple[float, float] | None:
         if freedom < 1:
             return None
         found.append((values[0], left @ left / freedom * inverse[0] @ inverse[0], freedom))
+        if columns is in_motion:
+            off = in_motion[:, :2] @ values[:2] + left / root
     (of_motion, *one), (of_rests, *other) = found
     variance = one[0] + other[0]
     freedom = variance ** 2 / (one[0] ** 2 / one[1] + other[0] ** 2 / other[1] + 1e-300)
     drift, deviation = of_rests - of_motion, math.sqrt(variance)
+    # in the ways between rests
+    at, duration = in_motion[:, 1] / in_motion[:, 0] + middle, in_motion[:, 0]
+    between = 0.5 * (time[rests[:-1, 1]] + time[rests[1:, 0]])
+    way = np.searchsorted(time[rests[:, 0]], at) - 1
+    inside = (way >= 0) & (way < len(between))
+    total = np.bincount(way[inside], duration[inside], len(between))
+    shown = np.bincount(way[inside], off[inside], len(between))[total > 0.0] / total[total > 0.0]
+    around = 0.5 * (means.reshape(-1, 2).mean(axis=1)[1:] + means.reshape(-1, 2).mean(axis=1)[:-1])
+    if len(shown) < 3 or ttest_1samp(shown - around[total > 0.0], 0.0).pvalue > 0.01:
+        return None
     return ((drift, float(student.ppf(0.975, freedom)) * deviation)
             if abs(drift) > student.ppf(0.995, freedom) * deviation else None)
 

@@ -135,6 +135,8 @@ def mark_suspected(found: Finding) -> Finding:
     return replace(found, status='suspected', remedy=remedy)
 
 
+#: Remedy of an event that is not added to a model.
+SINGLE_EVENT_REMEDY = 'find its cause; it occurs in this log alone, and is not added to the model'
 _REMEDIES = {
     'gyro': 'add it to the model of the gyro',
     'reference': 'repair or replace the reference, or keep it out of calibrations',

@@ -41,7 +41,13 @@ from gyro_calibration.calibration.heading_regression import (
     WhitenedRegression,
 )
 from gyro_calibration.diagnosis.candidates import lasting_shapes, MIN_CHANNEL_RANGE
-from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, mark_suspected
+from gyro_calibration.diagnosis.causes import (
+    add_remedies,
+    CAUSES,
+    make_finding,
+    mark_suspected,
+    SINGLE_EVENT_REMEDY,
+)
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
     add_terms,
@@ -101,8 +107,8 @@ _METHOD_TEXT = (
     'fit on some stretches predict the others; else it is suspected. Only established causes are '
     'in the model. Intervals are of 95 %.')
 #: Causes that are not candidates, because they are tested in each log.
-_ALWAYS_TESTED = {*BASE_VALUES, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_error',
-                  'quantization', 'saturation'}
+_ALWAYS_TESTED = {*BASE_VALUES, 'bias_step', 'outliers', 'stuck_samples', 'dropped_samples',
+                  'unit_error', 'quantization', 'saturation'}
 #: Largest number of parts of a log for cross-fitting.
 FOLD_COUNT = 5
 #: Largest effect along the rate that is established, as a share of the rate: two standard
@@ -132,8 +138,11 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     extended, found = search_causes(plain, SEARCH_ALARM_SHARE * false_alarm_rate,
                                     on_progress)
     on_progress(None, 'cross-validation')
-    gain = _cross_validated_gain(plain, extended)
-    model_fit = extended
+    lasting_terms = [each for each in extended.causes if not each.is_single_event]
+    lasting = (extended if len(lasting_terms) == len(extended.causes)
+               else fit_spans(plain.spans, lasting_terms))
+    gain = _cross_validated_gain(plain, lasting)
+    model_fit = lasting
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
         # causes that do not improve the prediction are not added to the model
         model_fit = plain
@@ -155,7 +164,8 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     of_record = {each.effect for each in record.findings}
     changed = any(each.status == 'established' and CAUSES[each.effect].origin == 'gyro'
-                  and each.effect not in {'time_offset', *of_record} for each in findings)
+                  and each.effect not in {'time_offset', 'bias_step', *of_record}
+                  for each in findings)
     # between two clocks a delay is no property of the gyro
     clock_delay = next((each for each in findings if each.effect == 'time_offset'
                         and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
@@ -272,10 +282,14 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
         [other for other in found_cause.probability if other != term.cause],
         minimum_detectable=(DETECTION_SIGMAS * within / NORMAL_QUANTILE_975
                             if len(values) == 1 else None),
-        evidence=f'it adds {found_cause.prediction_gain:.1f} to the log-likelihood of held-out '
-        f'stretches, and is selected in {100.0 * found_cause.selection_share:.0f} % of the folds',
+        evidence=(f'{NORMAL_QUANTILE_975 * abs(size) / within:.3g} sigma from zero'
+                  if found_cause.is_established and term.is_single_event else
+                  f'it adds {found_cause.prediction_gain:.1f} to the log-likelihood of held-out '
+                  f'stretches, and is selected in {100.0 * found_cause.selection_share:.0f} % of '
+                  'the folds'),
         probability=found_cause.probability,
-        where=((term.shapes[0], float(fit.spans.time[-1])) if term.is_single_event else None))
+        where=((term.shapes[0], float(fit.spans.time[-1])) if term.is_single_event else None),
+        remedy=SINGLE_EVENT_REMEDY if term.is_single_event else '')
     return shown if found_cause.is_established else mark_suspected(shown)
 
 
@@ -332,7 +346,8 @@ def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
     found = {name: columns[:, place]
              for place, name in enumerate(BASE_VALUES) if name != 'time_offset'}
     for cause in fit.causes:
-        found[cause.cause] = columns[:, fit.value_slice(cause)].sum(axis=1)
+        found[cause.cause] = found.get(cause.cause, 0.0) + columns[:, fit.value_slice(cause)].sum(
+            axis=1)
     found['left'] = fit.spans.observed - columns.sum(axis=1)
     return {name: part[:len(fit.spans.time) - 1] for name, part in found.items()}
 
@@ -466,9 +481,10 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
            if getattr(log, name) is not None and np.ptp(getattr(log, name)) > least}
     terms = [CauseTerm(*each) for each in lasting_shapes(
         has, float(time[-1] - time[0]), np.asarray(fit.spans.channels.temperature))]
-    terms += [CauseTerm(name, (moment,))
-              for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist()
-              for name in ('bias_step', 'reference_slip')[:1 if fine else 2]]
+    if not fine:
+        terms += [CauseTerm(name, (moment,))
+                  for moment in np.linspace(time[0], time[-1], 22)[1:-1].tolist()
+                  for name in ('bias_step', 'reference_slip')]
     return [each for each in terms if (fine or each.cause != 'reference_once_per_rev')
             and not (fit.lacks_turns and _follows_the_rate(each.cause))]
 
@@ -482,11 +498,12 @@ def _follows_the_rate(cause: str) -> bool:
 def search_causes(fit: SpanFit, false_alarm_rate: float,
                   on_progress: OnProgress) -> tuple[SpanFit, list[FoundCause]]:
     """Add one cause after the other, each cross-fitted, and fit again with those established."""
-    found: list[FoundCause] = []
-    candidates = propose_terms(fit)
+    fine = fit.spans.treatment.is_fine
+    steps = _find_steps(fit, (), false_alarm_rate) if fine else []
+    found, candidates = list(steps), propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
     columns = {each.cause: each for each in candidates if not each.is_single_event}
-    rich_fit = fit_spans(fit.spans, list(columns.values()))
+    rich_fit = fit_spans(fit.spans, [*columns.values(), *(each.cause_term for each in steps)])
     while len(found) < MAX_CAUSES:
         found_terms = [each.cause_term for each in found]
         names = {each.cause for each in found_terms}
@@ -499,6 +516,9 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
             break
         found.append(best)
     found = [each for each in found if each.prediction_gain > 0.0]
+    if fine and found and not steps:
+        found += _find_steps(fit, [each.cause_term for each in found if each.is_established],
+                             false_alarm_rate)
     while established := [each.cause_term for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)
         worst = max(established, key=lambda each: _implausibility(extended, each))
@@ -507,6 +527,52 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
         found = [replace(each, is_established=each.is_established and each.cause_term != worst)
                  for each in found]
     return fit, found
+
+
+def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
+                false_alarm_rate: float) -> list[FoundCause]:
+    """
+    Return the steps of the bias given some causes, at most three.
+
+    A step is tried at each point. The noise is fitted again with the steps, so that a random walk
+    that they had caused does not hide them, and one that the log has is not a step. Of three
+    steps those that are not significant are removed, the weakest first.
+
+    """
+    times = fit.spans.time[2:-2]
+    every = max(len(times) // 200, 1)
+    steps: list[CauseTerm] = []
+    while len(steps) < 3:
+        with_steps = fit_spans(fit.spans, [*causes, *steps]) if causes or steps else fit
+        data = whiten_regression(with_steps, with_steps.causes)
+        place = every * int(np.argmax(_step_gains(fit, data, times[::every])))
+        near = times[max(place - every, 0):place + every + 1]
+        gains = _step_gains(fit, data, near)
+        if gains.max() < math.log(2.0 * len(times) / false_alarm_rate):
+            break
+        steps.append(CauseTerm('bias_step', (float(near[gains.argmax()]),)))
+    while steps:
+        with_steps = fit_spans(fit.spans, [*causes, *steps])
+        places = [with_steps.value_slice(each).start for each in steps]
+        deviations = np.sqrt(np.diag(with_steps.covariance)[places])
+        sigmas = np.abs(with_steps.values[places]) / deviations
+        chances = 2.0 * len(times) * student.sf(sigmas, with_steps.freedom[places])
+        weakest = int(chances.argmax())
+        if chances[weakest] < false_alarm_rate:
+            return [FoundCause(each, max(chance, MIN_PROBABILITY), 0.5 * size ** 2, 1.0, True, {})
+                    for each, chance, size in zip(steps, chances.tolist(), sigmas.tolist())]
+        del steps[weakest]
+    return []
+
+
+def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> Array:
+    """Return the gain in log-likelihood by a step of the bias at each time."""
+    columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
+    base, _ = np.linalg.qr(data.design)
+    both = np.column_stack([data.whiten_columns(np.column_stack(columns)), data.observed])
+    both -= base @ (base.T @ both)
+    step, left = both[:, :-1], both[:, -1]
+    return np.asarray(0.5 * (left @ step) ** 2 / np.maximum(np.sum(step ** 2, axis=0), 1e-300))
 
 
 def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:

@@ -34,6 +34,7 @@ from gyro_calibration.diagnosis.causes import (
     mark_suspected,
     next_experiment,
     REFERENCES,
+    SINGLE_EVENT_REMEDY,
 )
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
@@ -114,7 +115,6 @@ from scipy.stats import mannwhitneyu, norm
 
 #: Probability that an effect of the minimum detectable size is found.
 _DETECTION_POWER = 0.95
-_SINGLE_EVENT_REMEDY = 'find its cause; it occurs in this log alone, and is not added to the model'
 #: Why a constant channel shows no cause.
 _CONSTANT_REASONS = {'temperature': 'the temperature changes by less than 0.2 K',
                      'supply': 'the supply voltage does not change',
@@ -451,7 +451,7 @@ def cause_finding(search: Search, fit: RegressionFit, cause_index: int, evidence
                      or (CAUSES[name].separate_by if confounders else '')),
         evidence=(f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0
                   else ''), probability=probability, where=where,
-        remedy=_SINGLE_EVENT_REMEDY if is_single_event(known) else '')
+        remedy=SINGLE_EVENT_REMEDY if is_single_event(known) else '')
 
 
 def _cause_parameters(fit: RegressionFit, cause_index: int) -> dict[str, Estimate]:
