@@ -362,11 +362,11 @@ def measure_gain(search: Search, causes: Collection[str], has_model: bool) -> Ga
     which = 'the log' if len(replays) == 1 else 'each log'
     return gain_from_squares(f'every third {length:.3g} s of {which}, {len(counts)} '
                              'parts', squares, counts, 'given' if has_model else 'straight',
-                             HEADING_WINDOW if length >= HEADING_WINDOW else None)
+                             length)
 
 
 def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: ArrayLike,
-                      before: str, window: float | None) -> Gain:
+                      before: str, window: float) -> Gain:
     """
     Return the gain on held-out parts.
 
@@ -376,13 +376,11 @@ def gain_from_squares(held_out: str, squares: Mapping[str, ArrayLike], counts: A
     squares : model -> sums of squares of the errors of rate and heading, shape (parts, 2)
     counts : numbers of squares in the sums, shape (parts, 2)
     before : the model that the extended one is compared with
-    window : s; None if the parts are shorter
+    window : over which the heading changes, s
 
     """
     rate, heading = (jackknife_change(np.array([squares[before], squares['extended']])[:, :, k].T,
                                       np.array(counts, float)[:, k]) for k in (0, 1))
-    if window is None:
-        return Gain(held_out, rate, None, HEADING_WINDOW)
     whole = np.sum(counts, axis=0)[1]
     return Gain(held_out, rate, heading, window,
                 {name: float(np.sqrt(np.sum(each, axis=0)[1] / whole))

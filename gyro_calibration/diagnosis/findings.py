@@ -170,8 +170,7 @@ class Gain(Record):
 
     held_out: str  # description of the parts
     rate: Change  # errors of the simulated rate, rad/s
-    # errors of the simulated change of heading over windows, rad; None for shorter parts
-    heading: Change | None
+    heading: Change  # errors of the simulated change of heading over windows, rad
     window: float = 60.0  # s
     # name -> root mean square of the heading error of given, plain (bias, scale factor and delay
     # alone) and extended model, rad
@@ -184,16 +183,13 @@ class Gain(Record):
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as data."""
-        heading = (None if self.heading is None
-                   else {'window_s': self.window, **self.heading.to_dict()})
-        return {'held_out': self.held_out, 'rate_rms': self.rate.to_dict(),
-                'heading_rms': heading, **self.models}
+        return {'held_out': self.held_out, 'rate_rms': self.rate.to_dict(), 'heading_rms': {
+            'window_s': self.window, **self.heading.to_dict()}, **self.models}
 
     def rows(self) -> list[tuple[str, Change, str]]:
         """Return what was measured before and after, with its unit of SI."""
-        heading = ([] if self.heading is None
-                   else [(f'heading error over {self.window:.3g} s', self.heading, 'rad')])
-        return [*heading, ('rate error', self.rate, 'rad/s')]
+        return [(f'heading error over {self.window:.3g} s', self.heading, 'rad'),
+                ('rate error', self.rate, 'rad/s')]
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from gyro_calibration.calibration.dwells import (
 )
 from gyro_calibration.calibration.heading_regression import find_drift
 from gyro_calibration.calibration.reference_noise import (
+    COURSE_NOISE_RATIO,
     heading_difference,
     is_course,
     MAX_ROUNDING_RATIO,
@@ -728,9 +729,15 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
     if reference.kind in ('course', 'odometry') or reference.evidence == 'as given':
         return True
     errors, step = heading_difference(log), encoder_step(log.reference_heading)
+    interval = float(np.median(np.diff(log.time)))
+    if _is_interpolated(log):
+        # the exact motion between its values is not known, and odometry adds up its errors
+        walk = white_noise_deviation(log.output) * math.sqrt(interval)
+        known = np.isfinite(log.reference_heading).mean()
+        if known < 0.5 or errors.total_walk > COURSE_NOISE_RATIO * walk:
+            return True
     # the rounding error of an encoder does not show while its shaft rests
     rounding = step / math.sqrt(12.0)
-    interval = float(np.median(np.diff(log.time)))
     rate_rounding = math.sqrt(2.0) * rounding / interval
     if (rate_rounding > _MAX_RATE_NOISE_SHARE * white_noise_deviation(log.output)
             and step_evenness(log, step) > _MAX_EVENNESS):
@@ -739,3 +746,25 @@ def is_reference_limiting(log: Log, reference: Reference) -> bool:
         return False
     return (reference.kind != 'encoder' or step > _FINE_ENCODER_STEP
             or errors.constant_error > MAX_ROUNDING_RATIO * rounding)
+
+
+def _is_interpolated(log: Log) -> bool:
+    """
+    Tell whether a heading has its values less often than the gyro, and lies on lines in between.
+
+    In motion most values are on the line through their neighbours, and corners between two
+    straight parts come more often than once in a second, unlike those of rates that are held.
+
+    """
+    assert log.reference_heading is not None and log.time is not None
+    known = np.isfinite(log.reference_heading)
+    if known.mean() < 0.5:
+        return True
+    step = np.diff(log.reference_heading[known])
+    moves = np.abs(step[1:]) > 0.0
+    if not moves.any():
+        return False
+    corner = np.abs(np.diff(step)) > 1e-3 * np.median(np.abs(step[1:][moves]))
+    alone = corner[1:-1] & ~corner[:-2] & ~corner[2:] & moves[1:-1]
+    duration = moves.mean() * float(np.ptp(log.time[known]))
+    return bool(corner[moves].mean() < 0.5 and alone.sum() > duration)

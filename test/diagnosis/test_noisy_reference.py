@@ -163,6 +163,24 @@ def test_a_random_walk_of_the_bias_is_no_step(step):
     assert not [each for one in found for each in one.findings if each.effect == 'bias_step']
 
 
+def test_odometry_that_was_interpolated_at_the_samples_of_the_gyro_is_not_exact():
+    log = turning_log(3, lambda time, _: 0.003)
+    walk = np.cumsum(np.random.default_rng(3).standard_normal(len(log))) / np.sqrt(RATE)
+    heading = np.cumsum(log.output - 0.003) / RATE / (1.0 + SCALE) + 0.2 * DEGREE * walk
+    log = replace(log, reference_heading=np.interp(log.time, log.time[::4], heading[::4]))
+    assert is_reference_limiting(log, classify_reference(log))
+
+
+def test_a_table_that_holds_its_rates_is_exact():
+    generator = np.random.default_rng(4)
+    time = np.arange(0.0, 240.0, 1.0 / RATE)
+    rate = np.repeat(generator.uniform(-1.0, 1.0, 48), 125)
+    output = (1.0 + SCALE) * rate + 0.003 + 2e-4 * np.sqrt(RATE) * generator.standard_normal(
+        len(time))
+    log = Log(output=output, time=time, reference_heading=np.cumsum(rate) / RATE)
+    assert not is_reference_limiting(log, classify_reference(log))
+
+
 HIDDEN = {
     'heading_sensitivity': lambda time, rate, heading, temperature: 0.01 * np.sin(heading + 0.5),
     'bias_temperature': lambda time, rate, heading, temperature: 0.002 * (temperature - 25.0)}
