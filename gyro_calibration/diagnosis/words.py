@@ -193,7 +193,10 @@ def _is_fault_of_samples(found: Finding) -> bool:
 
 def _list_causes(findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
-        shown = [readable_name(each.effect) + (' (or {})'.format(
+        effects = [each.effect for each in findings]
+        shown = [readable_name(each.effect) + (
+            f' at {each.where[0]:.4g} s' if each.where and effects.count(each.effect) > 1 else ''
+        ) + (' (or {})'.format(
             join_list([readable_name(name) for name in each.ambiguous_with], 'or'))
             if each.ambiguous_with else '') for each in findings[:_MAX_NAMED_CAUSES]]
         more = ([f'{len(findings) - _MAX_NAMED_CAUSES} more'] if len(findings) > _MAX_NAMED_CAUSES

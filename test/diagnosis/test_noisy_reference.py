@@ -154,6 +154,7 @@ def test_a_bias_in_part_of_a_log_is_a_step_at_its_begin_and_one_at_its_end(step)
         assert each.where[0] == pytest.approx(time, abs=1.0)
         assert each.parameters['bias_step'].estimate == pytest.approx(size, abs=3e-4)
     assert 'bias_step' not in {term.effect.name for term in found.model.terms}
+    assert 'bias step at ' in ' '.join(terminal_lines(found))
 
 
 @pytest.mark.parametrize('step', [0.5, 0.0])
