@@ -34,6 +34,7 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.quality import (
     find_runs,
+    mark_rows,
     mask_outliers,
     mask_repeated_samples,
     quantization_step,
@@ -377,9 +378,7 @@ def find_dwells(log: Log) -> Dwells:
     if more := len(divided) - len(settled):
         remarks.append('dwells that warmed or cooled by more than '
                        f'{MIN_TEMPERATURE_SPREAD:g} K are divided, which makes {more} more')
-    within = np.zeros(len(time), dtype=bool)
-    for rows in dwells:
-        within[rows[0]:rows[-1] + 1] = True
+    within = mark_rows([(rows[0], rows[-1]) for rows in dwells], len(time))
     remarks += _describe_left_out(log, samples, is_outlier & within, is_repeated & within, within)
     share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
     if share < _MIN_DWELL_SHARE:

@@ -72,6 +72,7 @@ from gyro_calibration.logs.quality import (
     bridge_gaps,
     encoder_step,
     find_holes,
+    mark_rows,
     quantization_step,
     robust_deviation,
     white_noise_deviation,
@@ -225,10 +226,7 @@ class Spans:
     @property
     def is_in_motion(self) -> Mask:
         """Tell which samples are not in a rest."""
-        found = np.ones(len(self.log), dtype=bool)
-        for first, last in self.rests:
-            found[first:last + 1] = False
-        return found
+        return ~mark_rows(self.rests, len(self.log))
 
     @property
     def time_in_motion(self) -> Array:
@@ -417,10 +415,7 @@ def lay_out_spans(log: Log, kind: str = 'course', prior: Array | None = None) ->
         time, output, reference if treatment.is_fine or given is None else given)
     if treatment.is_fine:
         rests, stands = rests[~stands], stands[~stands]
-    in_rests = np.zeros(len(time), dtype=bool)
-    for first, last in rests[stands]:
-        in_rests[first:last + 1] = True
-    known = np.flatnonzero(np.isfinite(reference) & ~in_rests)
+    known = np.flatnonzero(np.isfinite(reference) & ~mark_rows(rests[stands], len(time)))
     stamps = at[known]
     length = max(treatment.min_span, float(stamps[-1] - stamps[0]) / treatment.max_spans,
                  2.0 * float(np.median(np.diff(time))))
@@ -828,35 +823,40 @@ def find_drift(log: Log) -> tuple[float, float] | None:
     rows = rows[rows[:, 2] > 0.0]
     in_motion = np.insert(rows[:, [2, 1, 3, 6]], 1, rows[:, 5] - middle * rows[:, 2], axis=1)
     at_rest = np.array([(1.0, time[half].mean() - middle) for half in halves])
-    found = []
-    for columns, observed, weights in (
-            (in_motion, rows[:, 0], 1.0 / rows[:, 2]),
-            (at_rest, means, np.array([len(half) for half in halves], dtype=float))):
-        root, freedom = np.sqrt(weights), len(columns) - columns.shape[1]
-        inverse = np.linalg.pinv(root[:, None] * columns)
-        values = inverse @ (root * observed)
-        left = root * (observed - columns @ values)
-        if freedom < 1:
-            return None
-        found.append((values[0], left @ left / freedom * inverse[0] @ inverse[0], freedom))
-        if columns is in_motion:
-            off = in_motion[:, :2] @ values[:2] + left / root
-    (of_motion, *one), (of_rests, *other) = found
-    variance = one[0] + other[0]
-    freedom = variance ** 2 / (one[0] ** 2 / one[1] + other[0] ** 2 / other[1] + 1e-300)
-    drift, deviation = of_rests - of_motion, math.sqrt(variance)
-    # in the ways between rests
-    at, duration = in_motion[:, 1] / in_motion[:, 0] + middle, in_motion[:, 0]
-    between = 0.5 * (time[rests[:-1, 1]] + time[rests[1:, 0]])
-    way = np.searchsorted(time[rests[:, 0]], at) - 1
-    inside = (way >= 0) & (way < len(between))
-    total = np.bincount(way[inside], duration[inside], len(between))
-    shown = np.bincount(way[inside], off[inside], len(between))[total > 0.0] / total[total > 0.0]
-    around = 0.5 * (means.reshape(-1, 2).mean(axis=1)[1:] + means.reshape(-1, 2).mean(axis=1)[:-1])
-    if len(shown) < 3 or ttest_1samp(shown - around[total > 0.0], 0.0).pvalue > 0.01:
+    if any(len(each) <= each.shape[1] for each in (in_motion, at_rest)):
         return None
-    return ((drift, float(student.ppf(0.975, freedom)) * deviation)
-            if abs(drift) > student.ppf(0.995, freedom) * deviation else None)
+    of_motion, one, freedom_of_one, left = _weighted_fit(in_motion, rows[:, 0], 1.0 / rows[:, 2])
+    of_rests, other, freedom_of_other, _ = _weighted_fit(
+        at_rest, means, np.array([len(half) for half in halves], dtype=float))
+    freedom = (one + other) ** 2 / (one ** 2 / freedom_of_one + other ** 2 / freedom_of_other
+                                    + 1e-300)
+    drift, deviation = of_rests[0] - of_motion[0], math.sqrt(one + other)
+    if abs(drift) <= student.ppf(0.995, freedom) * deviation:
+        return None
+    # the bias on each way from rest to rest, and that of the rests around it
+    way = np.searchsorted(time[rests[:, 0]], in_motion[:, 1] / in_motion[:, 0] + middle) - 1
+    ways = len(rests) - 1
+    inside = (way >= 0) & (way < ways)
+    turned, duration = (np.bincount(way[inside], each[inside], ways) for each in (
+        in_motion[:, :2] @ of_motion[:2] + left, in_motion[:, 0]))
+    of_each = means.reshape(-1, 2).mean(axis=1)
+    known = duration > 0.0
+    differences = (turned[known] / duration[known]
+                   - 0.5 * (of_each[1:] + of_each[:-1])[known])
+    if len(differences) < 3 or ttest_1samp(differences, 0.0).pvalue > 0.01:
+        return None
+    return drift, float(student.ppf(0.975, freedom)) * deviation
+
+
+def _weighted_fit(columns: Array, observed: Array,
+                  weights: Array) -> tuple[Array, float, int, Array]:
+    """Return values, variance of the first, its degrees of freedom, and residual."""
+    root, freedom = np.sqrt(weights), len(columns) - columns.shape[1]
+    inverse = np.linalg.pinv(root[:, None] * columns)
+    values = inverse @ (root * observed)
+    left = observed - columns @ values
+    variance = float(weights @ left ** 2 / freedom * inverse[0] @ inverse[0])
+    return values, variance, freedom, left
 
 
 def is_noisy(log: Log) -> bool:

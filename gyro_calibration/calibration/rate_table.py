@@ -633,7 +633,7 @@ def compute_turn_errors(dwells: Dwells, rate: Array,
 
     """
     known = np.isfinite(rate)
-    wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # a rate told as text is rounded
+    wanted = np.abs(dwells.rate) >= min_rate * (1.0 - 1e-6)  # text is rounded
     lost = int(np.count_nonzero(~known & wanted))
     dwells, rate, wanted = select_dwells(dwells, known), rate[known], wanted[known]
     if not wanted.any():

@@ -338,7 +338,7 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
 
 
 #: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
-#: is judged, s.
+#: is stated, s.
 DRIVE_DURATION = 300.0
 
 

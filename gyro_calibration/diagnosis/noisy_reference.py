@@ -568,10 +568,7 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
 def _step_gains(fit: SpanFit, data: WhitenedRegression, times: Array) -> Array:
     """Return the gain in log-likelihood by a step of the bias at each time."""
     columns = [fit.spans.cause_columns(CauseTerm('bias_step', (time,))) for time in times.tolist()]
-    base, _ = np.linalg.qr(data.design)
-    both = np.column_stack([data.whiten_columns(np.column_stack(columns)), data.observed])
-    both -= base @ (base.T @ both)
-    step, left = both[:, :-1], both[:, -1]
+    step, left = _given_design(data, data.whiten_columns(np.column_stack(columns)))
     return np.asarray(0.5 * (left @ step) ** 2 / np.maximum(np.sum(step ** 2, axis=0), 1e-300))
 
 
@@ -642,15 +639,22 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
 def _term_evidences(data: WhitenedRegression, columns: Array, places: Sequence[slice],
                     terms: Sequence[CauseTerm], rows: Mask) -> list[Evidence]:
     """Return the evidence for each term in some of the rows."""
-    base, _ = np.linalg.qr(data.design[rows])
-    both = np.column_stack([columns, data.observed])[rows]
-    both -= base @ (base.T @ both)
+    given, left = _given_design(data, columns, rows)
     clusters = [each[rows] for each in data.clusters]
     least = 1e-6 * (np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300)
     return [_cluster_robust_evidence(
-        both[:, place], both[:, -1],
+        given[:, place], left,
         clusters if CAUSES[each.cause].along in _MOTION_VARIABLES else clusters[:1], least[place])
         for place, each in zip(places, terms)]
+
+
+def _given_design(data: WhitenedRegression, columns: Array,
+                  rows: Mask | slice = slice(None)) -> tuple[Array, Array]:
+    """Return what of more columns and of the observations the design does not explain."""
+    base, _ = np.linalg.qr(data.design[rows])
+    both = np.column_stack([columns, data.observed])[rows]
+    both -= base @ (base.T @ both)
+    return both[:, :-1], both[:, -1]
 
 
 def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArray[np.intp]],

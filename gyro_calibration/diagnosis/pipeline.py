@@ -107,6 +107,7 @@ from gyro_calibration.diagnosis.search import (
 )
 from gyro_calibration.diagnosis.words import format_amount
 from gyro_calibration.logs.log import DataRefused, Log, NORMAL_QUANTILE_975
+from gyro_calibration.logs.quality import mark_rows
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
@@ -273,9 +274,7 @@ def _settled_dwells(log: Log, fit: RegressionFit,
     except DataRefused:
         return None
     time = fit.problem.replays[0].channels.time
-    within = np.zeros(len(time), dtype=bool)
-    for rows in dwells.rows:
-        within[rows[0]:rows[-1] + 1] = True
+    within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
     white, valid = fit.whitened_series()[0], fit.problem.replays[0].valid
     at = time[valid][0] + fit.problem.replays[0].point_interval * np.arange(len(white))
     inside = within[np.clip(np.searchsorted(time, at), 0, len(time) - 1)]

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 
@@ -155,6 +156,14 @@ def find_runs(mask: Mask) -> list[slice]:
     """Return the slices of consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
     return [slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2])]
+
+
+def mark_rows(ends: Iterable[Sequence[int]], count: int) -> Mask:
+    """Mark the rows from the first to the last of each pair, shape (count,)."""
+    marked = np.zeros(count, dtype=bool)
+    for first, last in ends:
+        marked[first:last + 1] = True
+    return marked
 
 
 def mask_outliers(values: Array, limit: float) -> Mask:
