@@ -296,7 +296,7 @@ def heading_lines(model: GyroModel, found: EncoderCalibration,
                f'{residual.largest / DEGREE:.3f} deg at most.')
     if found.residual_after.rms > 5.0 * DEGREE:
         remedy = ('The reference has errors of this size, or shows another motion: compare its '
-                  'turns with known ones before the model is used.' if found.method == 'course' else
+                  'turns with known ones before using the model.' if found.method == 'course' else
                   'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
                   'needs stretches of constant rate in the log.')
         yield wrap_line(f'The error is above 5 deg rms. {remedy}')
