@@ -215,7 +215,7 @@ WAYS: dict[str, tuple[Callable[[Run], Array], Motion, str]] = {
     'slip of 2 to 15 deg': (slip, CALIBRATION_MOTION, 'slip or a bump'),
     'bump of 2 to 15 deg': (bump, CALIBRATION_MOTION, 'slip or a bump'),
     'early end': (early_end, CALIBRATION_MOTION, 'robot stopped'),
-    'another profile': (another_profile, CALIBRATION_MOTION, 'otherwise than the profile'),
+    'another profile': (another_profile, CALIBRATION_MOTION, 'does not follow the profile'),
     'wrong sign': (wrong_sign, CALIBRATION_MOTION, 'the other way'),
     'twice the rate': (twice_the_rate, CALIBRATION_MOTION, '2 times its rate'),
     'twice as fast': (twice_as_fast, CALIBRATION_MOTION, 'times as fast'),
@@ -272,7 +272,7 @@ def table(runs: int) -> Iterator[str]:
 
 def _coverage(accepted: dict[tuple[str, float], list[tuple[float, ...]]]) -> Iterator[str]:
     yield ('\n| run | noise | s in its 95 % interval | b in its 95 % interval '
-           '| residual said to be more than the noise explains |')
+           '| residual larger than expected |')
     yield '|---|---|---|---|---|'
     for (name, level), errors in accepted.items():
         s, b, probability = np.array(errors).T

@@ -203,13 +203,13 @@ def _refuse_motion(rate: Array, stamps: StampGrid) -> None:
     if not moved.any():
         return
     rests = max(find_runs(~moved), key=lambda rest: rest.stop - rest.start, default=None)
-    longest = ('at rest nowhere' if rests is None
-               else f'at rest longest from {stamps.time_at(rests.start):.1f} '
-               f'to {stamps.time_at(rests.stop - 1):.1f} s')
+    remedy = ('record again at rest' if rests is None else
+              f'use the longest part at rest, from {stamps.time_at(rests.start):.1f} to '
+              f'{stamps.time_at(rests.stop - 1):.1f} s, or record again')
     raise DataRefused('the gyro was moved, or its output jumped: from '
                       f'{stamps.time_at(int(np.argmax(moved))):.2f} s on means over '
                       f'{over * stamps.interval:.3g} s change up to {worst:.0f} standard '
-                      f'deviations; it is {longest}: use that part, or record again')
+                      f'deviations: {remedy}')
 
 
 # lost samples

@@ -418,9 +418,8 @@ def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[s
             rate, half = (each / DEGREE for each in fit.reference_drift)
             yield (f'in motion the reference drifts by {rate:.3f} +- {half:.3f} deg/s (95 %) '
                    'against the rests in which it stands; the bias is that of the rests')
-        yield ('what the drive leaves open of scale factor error and bias is drawn towards zero, '
-               f'as of a gyro of the technology {technology} (--technology); '
-               'the intervals hold that')
+        yield (f'scale factor error and bias have priors of the technology {technology} '
+               '(--technology) with mean zero, which the intervals include')
         return
     reference_error = -s / (1.0 + s)
     yield (f'a reference that shows {abs(100 * reference_error):.2f} % too '

@@ -782,8 +782,8 @@ def fit_course(log: Log, technology: str = 'mems') -> ScaleBiasFit:
                            for each in (fit.spans.observed[:len(turned)], turned))
     if residual > max(MAX_FOLLOWED_RESIDUAL, 0.5 * variation):
         raise DataRefused(f'from span to span of {length:.0f} s the course turns by '
-                          f'{variation / DEGREE:.1f} deg, and less the gyro by '
-                          f'{residual / DEGREE:.1f} deg (robust standard deviations): the gyro '
+                          f'{variation / DEGREE:.1f} deg, and its difference to the gyro changes '
+                          f'by {residual / DEGREE:.1f} deg (robust standard deviations): the gyro '
                           'does not follow the course. Check that both belong to one drive, and '
                           'check axis, sign, units, and that the gyro responds')
     # intervals of a normal distribution, as wide as those of Student's

@@ -49,15 +49,15 @@ class GoodnessOfFit:
 
     def __str__(self) -> str:
         """Return a sentence for people."""
-        amount = ('what the noise explains' if self.probability > MIN_FIT_PROBABILITY else
-                  'more than the noise explains: the robot follows the motion less well than the '
-                  'gyro measures, or shakes')
+        amount = ('as expected from the noise' if self.probability > MIN_FIT_PROBABILITY else
+                  'larger than expected from the noise: the robot does not follow the motion '
+                  'exactly, or vibrates')
         return (f'The residual is {amount} (chi-square {self.chi_square:.1f} with '
                 f'{self.dof:.0f} degrees of freedom, probability {self.probability:.2g}; '
                 f'noise {self.noise_ratio:.2f} times that of the model)')
 
 
-#: Below this probability the message says that the residual is more than the noise explains.
+#: Below this probability the message states that the residual is larger than expected.
 MIN_FIT_PROBABILITY = 1e-3
 
 

@@ -396,7 +396,7 @@ def find_best_motion(robot: RobotLimits, forecast: CalibrationForecast, duration
     motion = family.motion_at(found.x)
     if motion is None:
         raise DataRefused(f'no motion of {duration:g} s that turns there and back was found: '
-                          'give more seconds or more place')
+                          'allow more seconds or a larger angle')
     return require_credible(Plan(motion, forecast.predict(motion)))
 
 
@@ -405,18 +405,18 @@ _AXIS_BOUNDS = [(0.0, 1.0)] * 4 + [(0.2, 1.0)] * 2 + [(0.0, 0.6)]
 
 
 def _refuse_impossible(robot: RobotLimits, duration: float) -> None:
-    """Refuse limits that leave no time or no place for a turn there and one back."""
+    """Refuse limits that leave no time or no angle for a turn there and one back."""
     shortest = 2.0 * robot.rest + 4.0 * robot.ramp_duration(robot.slowest)
     if duration <= shortest:
         raise DataRefused(f'{duration:g} s are too short for rests of {robot.rest:g} s at both '
                           f'ends, a turn there and one back, which take more than {shortest:.3g} '
-                          's: give more seconds, or less rest')
+                          's: allow more seconds or shorter rests')
     angle = robot.slowest * robot.ramp_duration(robot.slowest)
     heading_span = max(robot.highest, -robot.lowest)
     if heading_span <= angle:
-        raise DataRefused(f'the place leaves a turn of {heading_span / DEGREE:.3g} deg, and at '
+        raise DataRefused(f'the headings allow a turn of {heading_span / DEGREE:.3g} deg, and at '
                           f'the slowest smooth rate the ramps alone need {angle / DEGREE:.3g} '
-                          'deg: give more place or more acceleration')
+                          'deg: allow a larger angle or more acceleration')
 
 
 def require_credible(plan: Plan, limits: RunLimits | None = None) -> Plan:

@@ -149,9 +149,9 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
     if unexplained > MAX_UNEXPLAINED_SHARE:
         who, remedy = (('robot', 'was another profile driven?') if motion.name == 'profile' else
                        ('gyro', 'check that both belong to one run'))
-        raise DataRefused(f'the {who} turned otherwise than the {motion.name} (the best that can '
-                          'be made of it explains '
-                          f'{100 * max(1 - unexplained, 0.0):.0f} % of the run): {remedy}')
+        raise DataRefused(f'the {who} does not follow the {motion.name} (the closest motion '
+                          f'explains {100 * max(1 - unexplained, 0.0):.0f} % of the run): '
+                          f'{remedy}')
     raise DataRefused(message)
 
 
@@ -215,5 +215,5 @@ def format_slip(motion: Motion, angle: float, time: float, sigmas: float = math.
     significance = '' if math.isnan(sigmas) else f' ({sigmas:.0f} standard deviations)'
     cause = ('a slip or a bump; run again on free ground' if motion.name == 'profile' else
              'a slip of the mount or an error of the reference; mend it and run again')
-    return (f'a stretch of the run turned {angle / DEGREE:.1f} deg otherwise than the '
+    return (f'a stretch of the run differs by {angle / DEGREE:.1f} deg from the '
             f'{motion.name}{significance}, at about {time:.1f} s: {cause}')

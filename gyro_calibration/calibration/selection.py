@@ -313,7 +313,7 @@ def _explain_choice(fit: Calibration, effect: Effect, significance: float,
     rest = tuple(each for each in fit.effects if each is not effect)
     if taken and not rest:
         return EffectChoice(effect.name, True, math.nan, fit.left_out_rms, math.nan,
-                            'nothing else can be seen')
+                            'the only effect that these dwells determine')
     try:
         other = fit.refit(rest if taken else _add_effect(rest, effect))
     except DataRefused as error:
@@ -326,6 +326,6 @@ def _explain_choice(fit: Calibration, effect: Effect, significance: float,
         reason = ('predicts left-out sweeps better'
                   if _is_supported(smaller, larger, significance) else 'belongs to every model')
     elif larger.p_value(effect) >= significance:
-        reason = f'the chance is above {significance:.2g}, the level of each effect'
+        reason = f'its p-value is above {significance:.2g}, the limit for one effect'
     return EffectChoice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
                         larger.p_value(effect), reason)

@@ -420,8 +420,8 @@ def check_rest(time: Array, rate: Array, fit: ScaleBiasFit, noise: Noise | None 
                           f'{half_difference / DEGREE:.2f} deg/s: leave it at rest after the run')
     if abs(check.rate) > check.limit:
         raise DataRefused('after the run, at rest, the corrected rate is '
-                          f'{check.rate / DEGREE:.4f} deg/s, at most '
-                          f'{check.limit / DEGREE:.4f} are explained: the robot still turned, or '
+                          f'{check.rate / DEGREE:.4f} deg/s, limit '
+                          f'{check.limit / DEGREE:.4f} deg/s: the robot still turned, or '
                           'the run was disturbed; run again and leave it at rest')
     return check
 

@@ -290,8 +290,9 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answ
         data.update(mean_heading_error_rad=mean, last_heading_error_rad=last[-1])
         lines.append(f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the '
                      f'end {last[-1] / DEGREE:.3f} deg.')
-        lines.append('Both headings start at 0 at the first row with a reference. The error that '
-                     'fit states excludes the mean error and a delay of the reference.')
+        lines.append('Both headings start at 0 at the first row with a reference. This error '
+                     'includes its mean and a delay of the reference; the heading errors that fit '
+                     'prints exclude both.')
     lines += [words for quantity, (channel, words) in _MISSING_INPUTS.items()
               if quantity in found.unknown and model.uses_channel(channel)]
     lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms

@@ -256,7 +256,7 @@ def calibrate(client: DemoClient, bar: tqdm) -> None:
             if attempt == MAX_ATTEMPTS:
                 raise
             bar.total += CALIBRATION_MOTION.duration + 4.0
-            bar.write(f'{refusal}; once more', file=sys.stderr)
+            bar.write(f'{refusal}; the run is repeated', file=sys.stderr)
             _wait(bar, 2.0)  # until the robot stands
 
 
@@ -267,7 +267,7 @@ def _wait(bar: tqdm, seconds: float) -> None:
 
 def _evaluate(out: Path, robot: SimulatedRobot, client: DemoClient, begin: float,
               seed: int) -> Answer:
-    """Compare five headings of the drive with the truth, beside the values of Hong and Park."""
+    """Compare five headings of the drive with the truth, with the values of Hong and Park."""
     clock, truth = np.array(robot.true_headings).T
     time_, raw = np.array([pair for pair in client.raw_rates if pair[0] >= begin]).T
     stamp, yaw = np.array([pair for pair in client.headings if pair[0] >= begin]).T
@@ -294,8 +294,8 @@ def _evaluate(out: Path, robot: SimulatedRobot, client: DemoClient, begin: float
             mean, deviation = TABLE_1[name]
             gain = 100 * (1 - mean / TABLE_1['pure integration'][0])
             theirs = f'{mean:.3f} deg, {deviation:.3f} deg, {gain:.0f} %'
-        gain = 100 * (1 - means[name] / means['pure integration'])
-        lines.append(f'| {name} | {means[name]:.3f} deg | {error.std():.3f} deg | {gain:.0f} % '
+        gain = round(100 * (1 - means[name] / means['pure integration']))
+        lines.append(f'| {name} | {means[name]:.3f} deg | {error.std():.3f} deg | {gain} % '
                      f'| {theirs} |')
     table = '\n'.join(lines) + '\n'
     write_atomically(out / 'table.md', table.encode())

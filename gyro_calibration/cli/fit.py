@@ -295,8 +295,8 @@ def heading_lines(model: GyroModel, found: EncoderCalibration,
         yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '
                f'{residual.largest / DEGREE:.3f} deg at most.')
     if found.residual_after.rms > 5.0 * DEGREE:
-        remedy = ('The reference errs as much, or shows another motion: compare its turns with '
-                  'known ones before the model is used.' if found.method == 'course' else
+        remedy = ('The reference has errors of this size, or shows another motion: compare its '
+                  'turns with known ones before using the model.' if found.method == 'course' else
                   'If the gyro is nonlinear or depends on temperature, use --method dwells; it '
                   'needs stretches of constant rate in the log.')
         yield wrap_line(f'The error is above 5 deg rms. {remedy}')
@@ -372,7 +372,7 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
 def _choice_lines(selection: Selection) -> Iterator[str]:
     """Give the reason why each effect was taken or not, and effects not distinguished."""
     if selection.choices:
-        yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"chance":>7s}'
+        yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"p-value":>7s}'
     for choice in selection.choices:
         without, with_it = (f'{_format_finite(value / DEGREE, ".4f"):>8s}'
                             for value in (choice.error_without, choice.error_with))

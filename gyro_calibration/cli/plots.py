@@ -292,7 +292,7 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
         percent.set_ylabel('error [% of a turn]')
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
-    return _save_figure(figure, path, 'Greys in order: temperature. A step between the senses: '
+    return _save_figure(figure, path, 'Shades of grey: temperature. A step between the senses: '
                         'scale factor error; a curve: nonlinearity; growth towards '
                         'slow turns: bias or noise. Hatched: slower than '
                         f'{min_rate / DEGREE:g} deg/s, left out. Scales differ.')

@@ -552,7 +552,8 @@ def add_effects(effects: Iterable[Effect]) -> None:
             raise ValueError(f'the name {effect.name} is taken; give the effect another')
         if any(shape.default is None and not shape.begin_with
                for shape in effect.nonlinear_parameters):
-            raise ValueError(f'{effect.name} has a shape without a default and without begin_with')
+            raise ValueError(f'{effect.name} has a nonlinear parameter without default; give it '
+                             'begin_with')
         shapes = [shape.default if shape.default is not None else shape.begin_with[0]
                   for shape in effect.nonlinear_parameters]
         columns = effect.columns(channels, *shapes)

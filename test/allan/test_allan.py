@@ -264,7 +264,7 @@ def moved(kind):
 
 @pytest.mark.parametrize(
     'kind, said',
-    [('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest longest from 2[23]\d.*to 500'),
+    [('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest, from 2[23]\d.*to 500'),
      ('jolt', r'moved.*from (199|200)\.\d+ s on'), ('swing', 'the record contains something'),
      ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
      ('tatters', r'10 ms apart.*--rate'), ('few', '99 samples.*at least 100'),

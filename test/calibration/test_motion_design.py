@@ -192,10 +192,10 @@ IMPOSSIBLE = {
     'no time': (RobotLimits(1.0, 2.0, rest=10.0), 20.0, '20 s are too short for rests of 10 s'),
     'no time at the slowest rate': (RobotLimits(1.0, 0.5, slowest=0.5,
                                                 rest=1.0), 5.0, 'too short'),
-    'no place': (RobotLimits(1.0, 2.0, lowest=0.0,
-                             highest=0.0), 20.0, 'the place leaves a turn of 0 deg'),
-    'no place at the slowest rate': (RobotLimits(
-        1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5), 20.0, 'more place or more acceleration'),
+    'no angle': (RobotLimits(1.0, 2.0, lowest=0.0,
+                             highest=0.0), 20.0, 'the headings allow a turn of 0 deg'),
+    'no angle at the slowest rate': (RobotLimits(
+        1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5), 20.0, 'angle or more acceleration'),
     'nothing worth it': (RobotLimits(0.01, 0.02), 20.0, 'determines the scale factor to'),
     'next to no time': (RobotLimits(1.0, 2.0, 0.5, rest=1.0), 2.02, ''),
 }
@@ -252,8 +252,8 @@ WRONG = {
     'a text': ({'maximum_rate_dps': 'fast'}, "maximum_rate_dps is 'fast'"),
     'not a number': ({'maximum_rate_dps': math.nan}, 'maximum_rate_dps is nan'),
     'yes': ({'rest_s': True}, 'rest_s is True'),
-    'start outside the place': ({'minimum_heading_deg': 10},
-                                'minimum_heading_deg is 10; wanted a number from -1e+06 to 0'),
+    'start outside the headings': ({'minimum_heading_deg': 10},
+                                   'minimum_heading_deg is 10; wanted a number from -1e+06 to 0'),
     'slowest above fastest': ({'minimum_rate_dps': 70},
                               'minimum_rate_dps is above maximum_rate_dps'),
 }
@@ -273,4 +273,4 @@ def test_wrong_options_are_wrong_use_and_limits_that_leave_no_motion_no_answer(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'quiet.yaml').write_text('effects: {bias: {bias: 0.01}}')
     code, _, said = run('plan', '--limits', limits(rest_s=rest), *options)
-    assert code == wanted and ('give more seconds' in said) == (wanted == 1)
+    assert code == wanted and ('allow more seconds' in said) == (wanted == 1)

@@ -132,7 +132,7 @@ def test_every_effect_has_its_reason():
     reasons = {choice.effect: choice for choice in selection.choices}
     assert (reasons['bias'].taken
             and reasons['scale_factor_asymmetry'].reason.startswith((
-                'the chance is above 0.0', 'does not predict')))
+                'its p-value is above 0.0', 'does not predict')))
     assert reasons['cubic_nonlinearity'].reason.startswith('explains the same as sine_response')
     taken = reasons['scale_factor_temperature']
     assert (taken.taken and taken.error_with < taken.error_without

@@ -327,7 +327,8 @@ def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not
         else:
             with pytest.raises(CallRefused, match='slipped'):
                 calibrate(SimpleNamespace(call_service=call), bar)
-    assert capsys.readouterr().err.count('slipped; once more') == min(refusals, MAX_ATTEMPTS - 1)
+    assert capsys.readouterr().err.count('slipped; the run is repeated') == min(
+        refusals, MAX_ATTEMPTS - 1)
 
 
 def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_path):
