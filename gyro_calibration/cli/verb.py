@@ -81,7 +81,6 @@ def show_progress(activity: str) -> Iterator[Callable[[float | None, str], None]
 
 @contextmanager
 def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
-    """Show a bar of the bytes read of a log, and give the function that updates it."""
     size = sum(os.path.getsize(file)
                for file in list_recording_files(path) if os.path.isfile(file)) or None
     with tqdm(total=size, desc=to_printable(path), unit='B', unit_scale=True, delay=PROGRESS_DELAY,
@@ -200,7 +199,6 @@ def _bounded(value: float, low: float, high: float = math.inf, unit: str = '') -
 
 
 def _picture_file(text: str) -> str:
-    """Return the name of a picture file, if its format and matplotlib are available."""
     if not text.endswith(('.png', '.svg')):
         raise argparse.ArgumentTypeError(f'{text} is no picture file; give a name that ends in '
                                          '.png or .svg')
