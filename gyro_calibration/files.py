@@ -109,9 +109,7 @@ def open_regular_file(path: str | Path, allow_pipes: bool = False) -> io.Buffere
     """
     Open a regular file for reading; on request also a pipe that has a writer.
 
-    Raises
-    ------
-    OSError : it cannot be opened, or is of another type, which might never end
+    Raise `OSError` for other types, which might never end.
 
     """
     # Opening a device may already have an effect; and the file may be replaced between the checks.
@@ -161,15 +159,7 @@ def _has_writer(handle: int) -> bool:
 
 
 def read_bytes(path: str | Path, max_size: int) -> bytes:
-    """
-    Read a regular file whole.
-
-    Raises
-    ------
-    OSError : as `open_regular_file`
-    ValueError : it has more bytes than `max_size`
-
-    """
+    """Read a regular file as `open_regular_file`; raise `ValueError` if it has more bytes."""
     with open_regular_file(path) as file:
         data = file.read(max_size + 1)
     if len(data) > max_size:
@@ -179,15 +169,9 @@ def read_bytes(path: str | Path, max_size: int) -> bytes:
 
 def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
     """
-    Replace a file by new content in one step; its folder is made where it is missing.
+    Replace a file by new content, as `open_replacement`, and return the version that was written.
 
-    Returns
-    -------
-    the version that was written, as `file_version` returns it as long as no other program writes
-
-    Raises
-    ------
-    OSError : as `open_replacement`; the old file is unchanged
+    As long as no other program writes, it is that of `file_version`.
 
     """
     with open_replacement(path) as file:
@@ -197,14 +181,7 @@ def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
 
 
 def file_version(file: str | Path | int) -> tuple[int, int]:
-    """
-    Return an identifier that differs after each write of a file, given by path or descriptor.
-
-    Raises
-    ------
-    OSError : the file does not exist
-
-    """
+    """Return an identifier that differs after each write of a file, by path or descriptor."""
     status = os.stat(file)
     return status.st_ino, status.st_mtime_ns
 
@@ -214,17 +191,18 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
     """
     Give a temporary file to write to, which replaces `path` in one step at the end.
 
-    After an error the old file is unchanged.
-
-    Raises
-    ------
-    OSError : the folder cannot be written to, or the path is not a regular file
+    Its folder is made where it is missing. After an error the old file is unchanged. Raise
+    `OSError` for a path that is not a regular file, or a link to one.
 
     """
-    path = Path(path)
+    path, old = Path(path), None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        old = _stat_replaceable(path)
+        with suppress(FileNotFoundError):  # a new file, or a link without a target
+            if stat.S_ISREG((here := os.lstat(path)).st_mode):
+                old = here
+            else:
+                _require_regular_file(path, os.stat(path).st_mode)
         remove_leftovers(path)
         # A replacement is readable by its owner alone until it gets the mode of the old file; a
         # new file gets the mode that the umask allows.
@@ -253,7 +231,6 @@ def open_replacement(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def _create_temporary(path: Path, mode: int) -> tuple[int, str]:
-    """Return a new temporary file in the folder of another, open and locked, and its path."""
     while True:
         temporary = str(path.parent / f'{_temporary_prefix(path)}{secrets.token_hex(4)}')
         handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
@@ -263,25 +240,6 @@ def _create_temporary(path: Path, mode: int) -> tuple[int, str]:
         if os.fstat(handle).st_nlink:
             return handle, temporary
         os.close(handle)  # another writer removed it as a leftover before it was locked
-
-
-def _stat_replaceable(path: str | Path) -> os.stat_result | None:
-    """
-    Return the status of a regular file that is to be replaced; None for a new file or a link.
-
-    Raises
-    ------
-    OSError : it is a pipe, a socket, a device or a folder, or a link to one; or it cannot be read
-
-    """
-    try:
-        if stat.S_ISREG((here := os.lstat(path)).st_mode):
-            return here
-        mode = os.stat(path).st_mode
-    except FileNotFoundError:  # also a link without a target
-        return None
-    _require_regular_file(path, mode)
-    return None
 
 
 def _temporary_prefix(path: Path) -> str:

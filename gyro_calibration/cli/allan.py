@@ -78,10 +78,16 @@ def run(given: argparse.Namespace) -> Answer:
 
 def answer_lines(record: RestRecord, chart: AllanChart, fit: NoiseFit) -> list[str]:
     """Return the noise figures as lines for people."""
-    lost = int(np.isnan(record.rate).sum())
+    lost, floor, (unit, factor) = np.isnan(record.rate).sum(), chart.floor, DISPLAY_UNITS['B']
+    floor_line = (
+        f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} s, '
+        f'95 %: {floor.lower * factor:.4g} to {floor.upper * factor:.4g}.')
+    if not fit.is_floor_reached:
+        floor_line += (' The deviation still falls at the end of the chart; record longer to '
+                       'reach its minimum.')
     return [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
             f'{len(record.rate) * record.interval:.5g} s at rest.',
-            *record.remarks, _floor_line(chart, fit),
+            *record.remarks, floor_line,
             *(_figure_line(symbol, figure) for symbol, figure in fit.figures.items()),
             _fit_line(fit)]
 
@@ -106,17 +112,6 @@ def figure_labels(fit: NoiseFit) -> dict[str, str]:
 
 def _figure_name(figure: NoiseFigure) -> str:
     return figure.term.name.replace('_', ' ')
-
-
-def _floor_line(chart: AllanChart, fit: NoiseFit) -> str:
-    unit, factor = DISPLAY_UNITS['B']
-    floor = chart.floor
-    text = (f'Lowest Allan deviation: {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} '
-            f's, 95 %: {floor.lower * factor:.4g} to {floor.upper * factor:.4g}')
-    if fit.is_floor_reached:
-        return f'{text}.'
-    return (f'{text}. The deviation still falls at the end of the chart; record longer to reach '
-            'its minimum.')
 
 
 def _fit_line(fit: NoiseFit) -> str:

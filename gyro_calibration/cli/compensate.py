@@ -145,7 +145,6 @@ class CompensatedBlock:
 
 def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
                           found: _Totals) -> Iterator[tuple[Log, dict[str, Array]]]:
-    """Give the log block by block with its new columns, and update the counts."""
     if given.rest or given.hindsight:
         log = verb.read(given)
         with verb.show_progress('heading'):
@@ -195,8 +194,20 @@ def integrate_log(logs: Iterable[Log], model: GyroModel,
             # without output may lie between samples.
             variance = 0.0 if log.time is None else model.noise.rate_variance(
                 float(np.median(np.diff(log.time[known] if known.sum() > 1 else log.time))))
-        columns = _compensated_columns(model, compensation, integrator, variance,
-                                       rows_of(log, known))
+        rows = rows_of(log, known)
+        result, sensitivity = compensation.add(rows)
+        columns = {'rate_rad_s': result.rate}
+        if rows.time is not None:
+            time = compensation.true_time(rows.time) if model.moves_stamps else rows.time
+            (columns['rate_rad_s'], columns['heading_rad'],
+             columns['heading_std_rad']) = integrator.add(time, result.rate, sensitivity)
+        columns['rate_std_rad_s'] = np.sqrt(
+            variance + quadratic_form(uncertainty_covariance(model), sensitivity))
+        if model.moves_stamps and rows.time is not None and len(rows):
+            columns = {name: np.interp(rows.time, time, values)
+                       for name, values in columns.items()}
+        columns |= {'temperature_clipped': result.temperature_clipped,
+                    'beyond_range': result.beyond_range}
         yield CompensatedBlock(log, known, columns, integrator.intervals)
 
 
@@ -252,24 +263,6 @@ def _make_estimator(model: GyroModel, log: Log,
         estimator.use_calibration(with_self_calibration(model, replace(
             model.self_calibration or calibration, time=when)), now)
     return estimator, start_date
-
-
-def _compensated_columns(model: GyroModel, compensation: LogCompensation,
-                         integrator: BlockIntegrator, variance: float,
-                         log: Log) -> dict[str, Array]:
-    result, sensitivity = compensation.add(log)
-    columns = {'rate_rad_s': result.rate}
-    if log.time is not None:
-        time = compensation.true_time(log.time) if model.moves_stamps else log.time
-        (columns['rate_rad_s'], columns['heading_rad'],
-         columns['heading_std_rad']) = integrator.add(time, result.rate, sensitivity)
-    columns['rate_std_rad_s'] = np.sqrt(
-        variance + quadratic_form(uncertainty_covariance(model), sensitivity))
-    if model.moves_stamps and log.time is not None and len(log):
-        columns = {name: np.interp(log.time, time, values) for name, values in columns.items()}
-    columns['temperature_clipped'] = result.temperature_clipped
-    columns['beyond_range'] = result.beyond_range
-    return columns
 
 
 def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answer:

@@ -172,7 +172,6 @@ def _seconds(message: Imu) -> float:
 
 @contextmanager
 def _node_process(module: str, **parameters: object) -> Iterator[None]:
-    """Run a node in a process of its own."""
     arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
     ros_options = ['-r', f'__ns:=/{_NAMESPACE}', '--log-level', 'error']
     process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}',

@@ -127,17 +127,7 @@ _HEADING_ALONE = ('a reference heading determines bias and scale_factor_error on
 
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
               technology: str | None = None) -> Selection | EncoderCalibration:
-    """
-    Calibrate by dwells, or by the reference heading of a single log.
-
-    Parameters
-    ----------
-    logs : of one gyro, by their names
-    effects : to fit; without any, those that the data support
-    method : dwells, likelihood, course or rate; None takes what the logs hold
-    technology : of the gyro, one of `TECHNOLOGY_EFFECTS`
-
-    """
+    """Calibrate as `api.fit` by named logs: by dwells, or by the heading of a single log."""
     for log in logs.values():
         refuse_mismatch(log)
     others = {effect.name for effect in effects} - {'bias', 'scale_factor_error'}
@@ -161,7 +151,6 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
 
 def _answer_dwells(given: argparse.Namespace, model: GyroModel,
                    found: Selection) -> tuple[list[str], dict[str, Any]]:
-    """Draw the dwells, and return lines for people and data."""
     fit = found.calibration
     if given.picture:
         plots.draw_residuals(given.picture, fit)
@@ -184,7 +173,6 @@ def _answer_dwells(given: argparse.Namespace, model: GyroModel,
 
 def _answer_heading(given: argparse.Namespace, logs: Mapping[str, Log], model: GyroModel,
                     found: EncoderCalibration) -> tuple[list[str], dict[str, Any]]:
-    """Draw the headings, and return lines for people and data."""
     ((path, log),), fit, remarks = logs.items(), found.fit, list(found.remarks)
     if given.picture:
         draw_headings(given.picture, found)
@@ -212,10 +200,7 @@ def draw_headings(path: str | Path | None, found: EncoderCalibration) -> Any:
                                 found.residual_before.heading, found.residual_after.heading, name)
 
 
-# as data, in SI
-
 def _model_data(model: GyroModel) -> dict[str, Any]:
-    """Return the fitted values with their intervals, covariance, ranges and technology."""
     values: dict[str, dict[str, Any]] = {}
     for effect, parameter, value, deviation in model.estimates():
         half_width = NORMAL_QUANTILE_975 * deviation
@@ -232,7 +217,6 @@ def _model_data(model: GyroModel) -> dict[str, Any]:
 
 
 def _dwell_data(selection: Selection) -> dict[str, Any]:
-    """Return the accuracy of a calibration from dwells, and the reasons for its effects."""
     fit = selection.calibration
     table, scatter = fit.dwells, fit.scatter
     return {
@@ -261,8 +245,6 @@ def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
             'mean_before_rad_s': part.uncorrected, 'mean_residual_rad_s': part.residual,
             'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
 
-
-# lines for people, in their units
 
 def dwell_lines(model: GyroModel, selection: Selection) -> Iterator[str]:
     """Give the result of a fit to dwells, its accuracy, and the reasons for its effects."""
@@ -308,7 +290,6 @@ def _remark_lines(remarks: Iterable[str]) -> Iterator[str]:
 
 
 def _value_lines(model: GyroModel) -> Iterator[str]:
-    """Give the table of fitted values."""
     yield f'{"value":38s} {"estimate":>12s} {"std. dev.":>10s}   {"95 % interval":27s} unit'
     for effect, parameter, value, deviation in model.estimates():
         unit, factor = (('ppm/K', 1e6) if parameter.unit == '1/K'
@@ -324,7 +305,6 @@ def _value_lines(model: GyroModel) -> Iterator[str]:
 
 
 def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
-    """Give the dwells that were measured, and those that were not fitted."""
     table = fit.dwells
     slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
     temperatures = ('' if table.temperature is None
@@ -341,7 +321,6 @@ def _dwell_count_lines(fit: Calibration) -> Iterator[str]:
 
 
 def _quality_lines(fit: Calibration) -> Iterator[str]:
-    """Give the size of the errors, and warnings."""
     scatter, has_sweeps = fit.scatter, len(np.unique(fit.dwells.sweep)) >= MIN_SWEEPS
     part = 'sweeps' if has_sweeps else 'blocks of time'
     yield (f'Error {fit.uncorrected_rms / DEGREE:.4f} deg/s rms before, '
@@ -370,7 +349,6 @@ def _quality_lines(fit: Calibration) -> Iterator[str]:
 
 
 def _choice_lines(selection: Selection) -> Iterator[str]:
-    """Give the reason why each effect was taken or not, and effects not distinguished."""
     if selection.choices:
         yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"p-value":>7s}'
     for choice in selection.choices:

@@ -130,7 +130,6 @@ def run(given: argparse.Namespace) -> Answer:
 
 def _write_results(given: argparse.Namespace, types: Sequence[TypeSummary],
                    records: Sequence[dict[str, Any]], data: dict[str, Any]) -> list[str]:
-    """Write the results, and return the names of their files."""
     content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
                'report.html': render_report(types, records).encode(),
                **table_files(types, records)}
@@ -150,7 +149,6 @@ def _write_results(given: argparse.Namespace, types: Sequence[TypeSummary],
 
 
 def _type_lines(summary: TypeSummary) -> Iterator[str]:
-    """Give the estimates of a type, and of its units."""
     counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
         (summary.records, 'log'), (summary.units, 'unit'), (summary.drives, 'drive')) if each)
     yield f'{summary.name or "Type not stated, pooled as one"}: {counts}.'
@@ -165,7 +163,6 @@ def _type_lines(summary: TypeSummary) -> Iterator[str]:
 
 
 def _process_logs(given: argparse.Namespace, tasks: Sequence[LogTask]) -> list[dict[str, Any]]:
-    """Return the record of each log, in the order of the logs."""
     found: dict[str, dict[str, Any]] = {}
     try:
         with (_make_executors(given) as (workers, create),

@@ -99,7 +99,6 @@ def _load_effects(path: str) -> None:
 
 
 def _replace_non_finite(value: Any) -> Any:
-    """Return JSON data: numbers that are not finite become null."""
     if isinstance(value, dict):
         return {name: _replace_non_finite(each) for name, each in value.items()}
     if isinstance(value, (list, tuple)):

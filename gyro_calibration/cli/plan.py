@@ -110,22 +110,11 @@ def run(given: argparse.Namespace) -> Answer:
         write_motion(given.out, plan.motion)
     if given.picture:
         draw_motion(given.picture, plan.motion, robot.rate)
-    is_built_in_feasible = can_follow(robot, CALIBRATION_MOTION)
-    return Answer(_lines(given, plan, rows, longer, is_built_in_feasible),
-                  _data(given, plan, rows, longer, is_built_in_feasible),
-                  (given.picture, given.out))
+    return _answer(given, plan, rows, longer, can_follow(robot, CALIBRATION_MOTION))
 
 
 def read_limits(path: str) -> RobotLimits:
-    """
-    Read the limits of a robot.
-
-    Raises
-    ------
-    UsageError : the file cannot be read, misses a limit that is needed, or holds an unknown name
-        or a value out of its range
-
-    """
+    """Read the limits of a robot; a `UsageError` names what is missing, unknown or wrong."""
     try:
         content = read_settings(path)
     except (OSError, ValueError) as error:
@@ -160,49 +149,36 @@ def write_motion(path: str, motion: Motion) -> None:
     write_atomically(path, ('\n'.join(lines) + '\n').encode())
 
 
-_MOTION_LABELS = {'planned': 'planned', 'plain': 'one turn there and back',
-                  'built_in': 'built-in profile, 20 s'}
-
-
-def _lines(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
-           longer: dict[float, Prediction], is_built_in_feasible: bool) -> list[str]:
-    rate, angle = plan.motion.rate_at(plan.motion.time) / DEGREE, plan.motion.heading / DEGREE
-    lines = [f'A motion of {given.seconds:g} s with rates of {rate.min():.1f} to {rate.max():.1f} '
-             f'deg/s and headings of {angle.min():.0f} to {angle.max():.0f} deg.',
-             '', f'Expected of a calibration, and of the heading over {given.drive:g} s after it:']
-    lines += [_row(_MOTION_LABELS[name] + ('' if is_built_in_feasible or name != 'built_in'
-                                           else ', beyond the limits'), row)
-              for name, row in rows.items()]
-    lines += [_row(f'planned, {seconds:g} s', row) for seconds, row in longer.items()]
-    scale_gain, heading_gain = _gains(rows)
-    return lines + [
-        '', f'Compared with one turn there and back, the scale factor is {scale_gain:.2f} times '
-        f'as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
-        f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
-        f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the '
-        'error, independent of the calibration.']
+def _answer(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
+            longer: dict[float, Prediction], is_built_in_feasible: bool) -> Answer:
+    angle, time = plan.motion.heading / DEGREE, plan.motion.time
+    rate, planned, plain = plan.motion.rate_at(time), rows['planned'], rows['plain']
+    scale_gain = plain.scale_deviation / planned.scale_deviation
+    heading_gain = 1.0 - planned.heading_error / plain.heading_error
+    labels = {'planned': 'planned', 'plain': 'one turn there and back',
+              'built_in': 'built-in profile, 20 s' + (
+                  '' if is_built_in_feasible else ', beyond the limits')}
+    lines = [f'A motion of {given.seconds:g} s with rates of {rate.min() / DEGREE:.1f} to '
+             f'{rate.max() / DEGREE:.1f} deg/s and headings of {angle.min():.0f} to '
+             f'{angle.max():.0f} deg.',
+             '', f'Expected of a calibration, and of the heading over {given.drive:g} s after it:',
+             *(_row(labels[name], row) for name, row in rows.items()),
+             *(_row(f'planned, {seconds:g} s', row) for seconds, row in longer.items()),
+             '', f'Compared with one turn there and back, the scale factor is {scale_gain:.2f} '
+             f'times as accurate, and the mean heading error is {100 * abs(heading_gain):.2f} % '
+             f'{"smaller" if heading_gain >= 0.0 else "larger"}.',
+             f'Angle random walk contributes {planned.floor / DEGREE:.3f} deg to the error, '
+             'independent of the calibration.']
+    data = {'duration_s': plan.motion.duration, 'time_s': time.tolist(),
+            'rate_rad_s': rate.tolist(), **{name: asdict(row) for name, row in rows.items()},
+            'built_in_within_limits': is_built_in_feasible, 'scale_gain': scale_gain,
+            'heading_gain': heading_gain, 'more_seconds': [{'duration_s': seconds, **asdict(row)}
+                                                           for seconds, row in longer.items()],
+            'drive_s': given.drive, 'seed': given.seed, 'out': given.out}
+    return Answer(lines, data, (given.picture, given.out))
 
 
 def _row(name: str, row: Prediction) -> str:
     return (f'  {name + ":":34} scale +- {100 * row.scale_deviation:.4f} %, '
             f'bias +- {row.bias_deviation / DEGREE:.4f} deg/s, '
             f'mean heading error {row.heading_error / DEGREE:.3f} deg')
-
-
-def _gains(rows: dict[str, Prediction]) -> tuple[float, float]:
-    """Return the gains over the plain motion: of the scale a factor, of the heading a fraction."""
-    planned, simple = rows['planned'], rows['plain']
-    return (simple.scale_deviation / planned.scale_deviation,
-            1.0 - planned.heading_error / simple.heading_error)
-
-
-def _data(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
-          longer: dict[float, Prediction], is_built_in_feasible: bool) -> dict[str, Any]:
-    scale_gain, heading_gain = _gains(rows)
-    return {'duration_s': plan.motion.duration, 'time_s': plan.motion.time.tolist(),
-            'rate_rad_s': plan.motion.rate_at(plan.motion.time).tolist(),
-            **{name: asdict(row) for name, row in rows.items()},
-            'built_in_within_limits': is_built_in_feasible, 'scale_gain': scale_gain,
-            'heading_gain': heading_gain, 'more_seconds': [{'duration_s': seconds, **asdict(row)}
-                                                           for seconds, row in longer.items()],
-            'drive_s': given.drive, 'seed': given.seed, 'out': given.out}

@@ -61,13 +61,7 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
 
 def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
                    after: Array, name: str = 'reference') -> Any:
-    """
-    Draw the headings of a reference and of a gyro, rad, and their difference.
-
-    `before` and `after` are the heading of the gyro less the reference, without calibration and
-    with it.
-
-    """
+    """Draw headings, rad, of a reference, and of a gyro less it before and after calibration."""
     figure, ((above,), (middle,), (below,)) = _panels(3, 1, (9, 9), (1.3, 1, 1))
     above.plot(time, reference / DEGREE, color='tab:blue', linewidth=3, alpha=0.5, label=name)
     above.plot(time, (reference + before - before[0]) / DEGREE, color='black', linewidth=1,
@@ -124,12 +118,7 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
                names: Mapping[str, str]) -> Any:
-    """
-    Draw an Allan chart: deviation, parts of the noise and their sum (figure 2 of Hong and Park).
-
-    The names of the parts are by symbol, such as 'angle random walk N = 2.3 deg/√h'.
-
-    """
+    """Draw an Allan chart with the parts of the noise, named by symbol (Hong and Park, fig. 2)."""
     hour = 3600.0 / DEGREE
     figure, ((axes,),) = _panels(1, 1, (9, 6.5))
     axes.fill_between(chart.time, chart.lower * hour, chart.upper * hour, color='black',
@@ -162,16 +151,13 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
                         'B. Slope +1/2: random walk of the bias.')
 
 
-# rate tables
-
 def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tuple[float, float],
                        temperature_range: tuple[float, float],
                        dwells: Dwells | None = None) -> Any:
     """
     Draw the error that a model removes, over output and temperature (figure 6 of Ojeda et al.).
 
-    Without a finite range of temperatures, a single curve is drawn at the reference temperature.
-    Dwells that were fitted are dots.
+    Without a range of temperatures it is that at the reference temperature. Dwells are dots.
 
     """
     output = np.linspace(*rate_range, 161)
@@ -271,8 +257,7 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
     """
     Draw the errors of full turns with a static bias only and with the model.
 
-    Each has its own scale (figures 8 and 9 of Ojeda et al.); slower turns than `min_rate`, rad/s,
-    are left out.
+    They are figures 8 and 9 of Ojeda et al.; turns slower than `min_rate`, rad/s, are left out.
 
     """
     figure, panels = _panels(2, 1, (8.5, 8))

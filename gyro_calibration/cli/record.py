@@ -48,6 +48,7 @@ from gyro_calibration.logs.recording import read_recording, topic_type_fault, To
 from gyro_calibration.logs.ros_bag import MCAP_END, McapWriter, Message, METADATA_NAME
 from tqdm import tqdm
 
+_EXISTS = '{}: exists already, and recordings are never overwritten; give a new name'
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
@@ -99,15 +100,9 @@ def run(given: argparse.Namespace) -> Answer:
         raise UsageError(f'{given.out} is no recording file; give a name that ends in '
                          f'{", ".join(_FILE_SUFFIXES[:-1])} or {_FILE_SUFFIXES[-1]}')
     if os.path.exists(given.out):
-        raise _make_error_of_existing(given.out)
+        raise UsageError(_EXISTS.format(given.out))
     with _stop_event(given.seconds) as stop:
-        session = (_PortSession if given.port else _TopicSession)(given, stop)
-        return session.run()
-
-
-def _make_error_of_existing(path: str) -> UsageError:
-    return UsageError(f'{path}: exists already, and recordings are never overwritten; give a new '
-                      'name')
+        return _record((_PortSession if given.port else _TopicSession)(given, stop), given.out)
 
 
 @contextmanager
@@ -156,7 +151,7 @@ class _Recorder:
         try:
             self._file = io.FileIO(path, 'xb')
         except FileExistsError:
-            raise _make_error_of_existing(path) from None
+            raise UsageError(_EXISTS.format(path)) from None
 
     def append(self, piece: bytes) -> None:
         """Write a piece; on an error truncate the file to the pieces before, raise `DiskFull`."""
@@ -304,76 +299,51 @@ def recording_notes(**details: object) -> dict[str, str]:
 # Sources
 
 
-class _Session:
-    """
-    The common part of recordings from port and topics: pieces, progress, answer.
+def _record(session: _PortSession | _TopicSession, out: str) -> Answer:
+    """Record until the end, close the file also after an error, and return the answer."""
+    recorder, start = session.recorder, time.monotonic()
+    last_flush = start
 
-    `samples` and `lost` count what came of the gyro; `remedy` is that where nothing came.
-
-    """
-
-    remedy = ''
-
-    def __init__(self, given: argparse.Namespace, stop: threading.Event,
-                 recorder: CsvRecorder | McapRecorder):
-        self._given, self._stop, self._recorder = given, stop, recorder
-        self._start_time = self._last_flush = time.monotonic()
-
-    def run(self) -> Answer:
-        """Record until the end, close the file also after an error, and return the answer."""
-        recorder = self._recorder
-        try:
-            with tqdm(desc=to_printable(self._given.out), unit=' samples', leave=False,
-                      disable=None) as bar:
-                try:
-                    self._record_until_stopped(bar)
-                finally:
-                    recorder.close()
-        except DiskFull as error:
-            written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but '
-                       f'for the last {_WRITE_INTERVAL:g} s' if recorder.size
-                       else 'nothing was written')
-            raise DataRefused(f'{error.strerror}; {written}: make room, then record '
-                              'again') from None
-        (samples, lost), seconds = self._counts(), time.monotonic() - self._start_time
-        if not samples:
-            with suppress(FileNotFoundError):  # other messages may have come
-                os.unlink(recorder.path)
-            raise DataRefused(f'no sample was received in {seconds:.1f} '
-                              f's{self._describe_failure()}; no file was written: {self.remedy}')
-        data, remarks = self._conclude()
-        out = self._given.out
-        return Answer([f'{samples} samples in {seconds:.1f} s, {lost} lost, written to {out}.',
-                       *remarks],
-                      {'out': out, 'samples': samples, 'lost': lost, 'seconds': seconds,
-                       'bytes': os.path.getsize(out), **data, 'remarks': remarks})
-
-    def _flush_if_due(self, bar: Any) -> None:
-        if time.monotonic() - self._last_flush >= _WRITE_INTERVAL:
-            self._recorder.flush()
-            self._last_flush = time.monotonic()
-            samples, lost = self._counts()
+    def on_chunk() -> None:
+        nonlocal last_flush
+        if time.monotonic() - last_flush >= _WRITE_INTERVAL:
+            recorder.flush()
+            last_flush = time.monotonic()
+            samples, lost = session.counts()
             bar.set_postfix_str(f'{lost} lost', refresh=False)
             bar.update(samples - bar.n)
 
-    def _counts(self) -> tuple[int, int]:
-        """Return how many samples were received from the gyro, and how many are known as lost."""
-        raise NotImplementedError
+    try:
+        with tqdm(desc=to_printable(out), unit=' samples', leave=False, disable=None) as bar:
+            try:
+                session.record(on_chunk)
+            finally:
+                recorder.close()
+    except DiskFull as error:
+        written = (f'{recorder.size} bytes remain in {recorder.path}, which is complete but for '
+                   f'the last {_WRITE_INTERVAL:g} s' if recorder.size else 'nothing was written')
+        raise DataRefused(f'{error.strerror}; {written}: make room, then record again') from None
+    (samples, lost), seconds = session.counts(), time.monotonic() - start
+    if not samples:
+        with suppress(FileNotFoundError):  # other messages may have come
+            os.unlink(recorder.path)
+        raise DataRefused(f'no sample was received in {seconds:.1f} s{session.failure}; no file '
+                          f'was written: {session.remedy}')
+    data, remarks = session.conclude()
+    return Answer([f'{samples} samples in {seconds:.1f} s, {lost} lost, written to {out}.',
+                   *remarks],
+                  {'out': out, 'samples': samples, 'lost': lost, 'seconds': seconds,
+                   'bytes': os.path.getsize(out), **data, 'remarks': remarks})
 
-    def _record_until_stopped(self, bar: Any) -> None:
-        """Record; call `_flush_if_due` after each chunk."""
-        raise NotImplementedError
 
-    def _conclude(self) -> tuple[dict[str, Any], list[str]]:
-        """Return further data and remarks of the answer."""
-        raise NotImplementedError
+class _PortSession:
+    """
+    Records samples from a port.
 
-    def _describe_failure(self) -> str:
-        return ''
+    As `_TopicSession`, it has a recorder, counts samples received and lost, and concludes with
+    data and remarks of the answer; where nothing came, it has the failure and a remedy.
 
-
-class _PortSession(_Session):
-    """Records samples from a port."""
+    """
 
     remedy = 'check the port, the power and the wires of the gyro'
 
@@ -394,11 +364,11 @@ class _PortSession(_Session):
                                           self._settings, on_change=self._report_state)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        self._last_message = ''
+        self._given, self._stop, self._last_message = given, stop, ''
         kind = McapRecorder if given.out.endswith('.mcap') else CsvRecorder
-        super().__init__(given, stop, kind(given.out, self._file_notes))
+        self.recorder = kind(given.out, self._file_notes)
 
-    def _counts(self) -> tuple[int, int]:
+    def counts(self) -> tuple[int, int]:
         counts = self._connection.counts()
         return counts.samples, counts.lost_samples
 
@@ -416,19 +386,19 @@ class _PortSession(_Session):
             port=self._given.port, device=found.path, protocol=protocol and protocol.name,
             baud=found.baud, axis=settings.axis, **scale)
 
-    def _record_until_stopped(self, bar: Any) -> None:
+    def record(self, on_chunk: Callable[[], None]) -> None:
         # a constant, so that the stamps do not jump when the clock is set
         offset = time.time_ns() - round(read_steady_clock() * NSEC_PER_SEC)
         for chunk in self._connection.chunks(self._stop):
-            if self._connection.protocol and isinstance(self._recorder, McapRecorder):
-                self._recorder.variance = self._connection.protocol.sample_variance(self._settings)
+            if self._connection.protocol and isinstance(self.recorder, McapRecorder):
+                self.recorder.variance = self._connection.protocol.sample_variance(self._settings)
             for sample, stamp in zip(chunk.samples, chunk.stamps, strict=True):
-                self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + offset, sample)
-            self._flush_if_due(bar)
+                self.recorder.add_sample(round(stamp * NSEC_PER_SEC) + offset, sample)
+            on_chunk()
 
     def _report_state(self, state: ConnectionState) -> None:
         if state.name == 'failed':
-            self._recorder.flush(is_due=True)  # without samples no piece is written
+            self.recorder.flush(is_due=True)  # without samples no piece is written
         message, found = state.problem or state.name, self._connection
         if message == self._last_message or state.name == 'listening' and self._last_message:
             return  # it listens again at each attempt
@@ -437,11 +407,12 @@ class _PortSession(_Session):
             message = f'samples of {found.protocol.name} come at {found.baud} bit/s'
         verb.print_message(message)
 
-    def _describe_failure(self) -> str:
+    @property
+    def failure(self) -> str:
         return f' ({self._connection.last_error})' if self._connection.last_error else ''
 
-    def _conclude(self) -> tuple[dict[str, Any], list[str]]:
-        found, recorder = self._connection, self._recorder
+    def conclude(self) -> tuple[dict[str, Any], list[str]]:
+        found, recorder = self._connection, self.recorder
         remarks = [f'{count} {name.replace("_", " ")}.'
                    for name, count in vars(found.counts()).items()
                    if name not in ('samples', 'lost_samples') and count]
@@ -456,11 +427,12 @@ class _PortSession(_Session):
                 'openings': found.open_count}, remarks
 
 
-class _TopicSession(_Session):
+class _TopicSession:
     """Records messages from topics into a recording, from which a log is written at the end."""
 
     remedy = ('check that a driver publishes, and that ROS_DOMAIN_ID and '
               'ROS_AUTOMATIC_DISCOVERY_RANGE agree')
+    failure = ''
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         port_options = (given.protocol, given.columns, given.sensitivity, given.invert, given.baud,
@@ -491,29 +463,45 @@ class _TopicSession(_Session):
         self._unknown_topics: dict[str, str] = {}
         self._previous, self._intervals = (0, 0), Intervals()
         self._damaged, self._clock_steps, self._misfits = 0, 0, dict[str, str]()
-        super().__init__(given, stop, McapRecorder(
+        self._given, self._stop, self._start_time = given, stop, time.monotonic()
+        self.recorder = McapRecorder(
             given.out if self._is_mcap else f'{given.out}.mcap',
             lambda: recording_notes(
-                topics='everything' if given.all else ', '.join(self._topics))))
+                topics='everything' if given.all else ', '.join(self._topics)))
 
-    def _counts(self) -> tuple[int, int]:
+    def counts(self) -> tuple[int, int]:
         samples = self._samples or (self._messages if self._is_mcap else 0)
         return samples, self._intervals.lost_samples
 
-    def _record_until_stopped(self, bar: Any) -> None:
-        with _redirect_stdout():
-            self._take_messages(self._topics, self._given.all, self._add_message,
-                                lambda node: self._tick(node, bar), self._stop)
+    def record(self, on_chunk: Callable[[], None]) -> None:
+        def tick(node: Any) -> None:
+            on_chunk()
+            self._unknown_topics = node.unknown_topics
+            if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
+                self._is_waiting = False
+                if missing := node.missing_topics:
+                    verb.print_message(f'no publisher so far of {", ".join(missing)}; '
+                                       f'there are {", ".join(node.known_topics()) or "none"}')
+
+        # prints of the middleware go to standard error; standard output is the answer
+        sys.stdout.flush()
+        stdout_copy = os.dup(1)
+        os.dup2(2, 1)
+        try:
+            self._take_messages(self._topics, self._given.all, self._add_message, tick,
+                                self._stop)
+        finally:
+            os.dup2(stdout_copy, 1)
+            os.close(stdout_copy)
 
     def _add_message(self, message: Message, definition: str) -> None:
-        assert isinstance(self._recorder, McapRecorder)
         role = self._roles.get(message.topic)
         if role and (wrong := topic_type_fault(role, message.topic, message.kind)):
             if not self._is_mcap:
                 raise LogError(wrong)
             self._misfits[message.topic], role = wrong, None
         self._messages += 1
-        self._recorder.add_message(message, definition)
+        self.recorder.add_message(message, definition)
         if role:
             self._received.add(message.topic)
         if role == 'gyro':
@@ -532,18 +520,9 @@ class _TopicSession(_Session):
             if interval > 0 and not was_set:
                 self._intervals.add(interval / NSEC_PER_SEC)
 
-    def _tick(self, node: Any, bar: Any) -> None:
-        self._flush_if_due(bar)
-        self._unknown_topics = node.unknown_topics
-        if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
-            self._is_waiting = False
-            if missing := node.missing_topics:
-                verb.print_message(f'no publisher so far of {", ".join(missing)}; '
-                                   f'there are {", ".join(node.known_topics()) or "none"}')
-
-    def _conclude(self) -> tuple[dict[str, Any], list[str]]:
+    def conclude(self) -> tuple[dict[str, Any], list[str]]:
         """Write the log; the recording is kept where that fails."""
-        recording, out = self._recorder.path, self._given.out
+        recording, out = self.recorder.path, self._given.out
         if not self._is_mcap:
             topics = {self._roles[topic]: topic for topic in self._received}
             try:
@@ -561,16 +540,3 @@ class _TopicSession(_Session):
         if self._clock_steps:
             remarks.append(f'The clock of the stamps was set {self._clock_steps} times.')
         return {'messages': self._messages}, remarks
-
-
-@contextmanager
-def _redirect_stdout() -> Iterator[None]:
-    """Redirect prints of the ROS 2 middleware to standard error; standard output is the answer."""
-    sys.stdout.flush()
-    stdout_copy = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        yield
-    finally:
-        os.dup2(stdout_copy, 1)
-        os.close(stdout_copy)

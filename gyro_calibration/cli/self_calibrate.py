@@ -117,12 +117,22 @@ def run(given: argparse.Namespace) -> Answer:
 
 def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time = verb.require_time(given, log)
-    motion, begin = ((read_motion(given.profile), time[0]) if given.profile
-                     else _reference_motion(given, log))
+    try:
+        motion, begin = ((read_motion(given.profile), time[0]) if given.profile
+                         else motion_from_log(log))
+    except InputError as error:
+        if given.profile:
+            raise
+        kind = DataRefused if isinstance(error, DataRefused) else UsageError
+        raise kind(f'{given.log}: {error} with --profile') from None
     _refuse_implausible(given, model, log)
+    scale = given.reference_scale_deviation
+    usual = default_reference_errors(motion) if given.profile else ReferenceErrors()
+    reference = ReferenceErrors(usual.scale_deviation if scale is None else scale / 100.0,
+                                (given.reference_drift or 0.0) * DEGREE,
+                                (given.reference_random_walk or 0.0) * DEGREE / 60.0)
     with show_progress('fit of scale factor error, bias and delay'):
-        run = calibrate_run(log, model, motion, begin, given.method,
-                            _reference_errors(given, motion))
+        run = calibrate_run(log, model, motion, begin, given.method, reference)
     if given.picture:
         run.draw(given.picture)
     return _store_and_answer(given, model, log, run.fit, run.is_used, given.method,
@@ -185,10 +195,10 @@ def _calibrate_by_turns(given: argparse.Namespace, model: GyroModel, log: Log) -
                             mark_deviation=marking, output=output[known])
     direction = 'counter-clockwise' if found.turns > 0 else 'clockwise'
     before, after = found.rest_durations
-    data = {'turns': found.turns, 'turning_s': found.duration,
-            'rests_s': list(found.rest_durations), 'marking_rad': marking}
     return _store_and_answer(
-        given, model, log, found.fit, known, 'turns', data,
+        given, model, log, found.fit, known, 'turns',
+        {'turns': found.turns, 'turning_s': found.duration,
+         'rests_s': list(found.rest_durations), 'marking_rad': marking},
         [f'{abs(found.turns)} full turns {direction} in {found.duration:.1f} s, between '
          f'standstills of {before:.1f} and {after:.1f} s; standard deviation of the mark '
          f'{marking / DEGREE:g} deg.'])
@@ -202,19 +212,9 @@ def _refuse_implausible(given: argparse.Namespace, model: GyroModel, log: Log) -
     return found
 
 
-def _reference_errors(given: argparse.Namespace, motion: Motion) -> ReferenceErrors:
-    """Return the accuracy of the reference by the options, or the usual one of a profile."""
-    scale = given.reference_scale_deviation
-    usual = default_reference_errors(motion) if given.profile else ReferenceErrors()
-    return ReferenceErrors(usual.scale_deviation if scale is None else scale / 100.0,
-                           (given.reference_drift or 0.0) * DEGREE,
-                           (given.reference_random_walk or 0.0) * DEGREE / 60.0)
-
-
 def _store_and_answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: ScaleBiasFit,
                       is_used: Mask, method: str, data: dict[str, Any],
                       lines: list[str]) -> Answer:
-    """Write the calibration, and return the answer."""
     calibration = make_self_calibration(fit, method, log, is_used)
     if given.out:
         write_model(given.out, with_self_calibration(verb.add_origin(given, model), calibration))
@@ -238,7 +238,6 @@ def make_self_calibration(fit: ScaleBiasFit, method: str, log: Log,
 
 
 def _fit_data(fit: ScaleBiasFit, check: RestCheck | None) -> dict[str, Any]:
-    """Return further results of the fit, in SI; nan where they are not known."""
     goodness = fit.goodness
     return {'time_offset_s': fit.time_offset,
             'time_offset_standard_deviation_s': fit.time_offset_deviation,
@@ -266,12 +265,3 @@ def _fit_lines(fit: ScaleBiasFit, check: RestCheck | None, method: str,
     if check:
         yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; '
                f'limit: {check.limit / DEGREE:.4f} deg/s.')
-
-
-def _reference_motion(given: argparse.Namespace, log: Log) -> tuple[Motion, float]:
-    try:
-        return motion_from_log(log)
-    except DataRefused as error:
-        raise DataRefused(f'{given.log}: {error} with --profile') from None
-    except InputError as error:
-        raise UsageError(f'{given.log}: {error} with --profile') from None

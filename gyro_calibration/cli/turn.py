@@ -22,7 +22,7 @@ from collections.abc import Iterator
 import csv
 import io
 import math
-from typing import Any, TypeAlias
+from typing import Any
 
 from gyro_calibration.calibration.dwells import (
     Dwells,
@@ -51,7 +51,7 @@ from gyro_calibration.model.model_file import read_model
 import numpy as np
 
 #: Limits of each bin, and which errors lie in it.
-Bins: TypeAlias = 'list[tuple[float, float, Mask]]'
+Bins = list[tuple[float, float, Mask]]
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -90,11 +90,12 @@ def run(given: argparse.Namespace) -> Answer:
     remarks = [*found.remarks, *errors.remarks, *remarks]
     if places := [place for place, good in zip(found.location, is_inlier) if not good]:
         remarks.append(f'{len(places)} outlying dwells are left out: {format_list(places)}')
-    return Answer(_lines(given, errors, remarks), {**_data(given, errors, remarks), **data},
+    rates = _rate_bins(errors, given.slowest * DEGREE)
+    temperatures = [] if errors.turns.temperature is None else [
+        each for each in equal_bins(errors.turns.temperature, 8) if each[2].any()]
+    return Answer(_lines(given, errors, rates, temperatures, remarks),
+                  {**_data(given, errors, rates, temperatures, remarks), **data},
                   (given.out, given.picture))
-
-
-# rates by the model
 
 
 def _predict_by_fit(found: Dwells,
@@ -114,7 +115,6 @@ def _predict_by_fit(found: Dwells,
 
 def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
                       found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
-    """Return rates by a given model, the dwells not outlying, and remarks."""
     result = compensate(model, found.output, found.temperature)
     names = [term.effect.name for term in model.terms]
     clipped, beyond = (int(np.count_nonzero(each))
@@ -140,15 +140,12 @@ def _predict_by_model(given: argparse.Namespace, model: GyroModel, log: Log,
 
 
 def _describe_fit_data(model: GyroModel, log: str) -> str:
-    """Return whether the model was fitted to the log, by the SHA-256 of its files."""
     if any(file.is_file() and sha256_digest(file) in str(model.origin)
            for file in list_recording_files(log)):
         return '; it was fitted to this log, so these are errors of a fit, not of a prediction'
     return '' if 'sha256' in str(model.origin) else (
         '; if it was fitted to this log, these are errors of a fit, not of a prediction')
 
-
-# bins
 
 def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
     """Return the limits of bins around 1, 2, 4, ... times the slowest rate, and what lies in."""
@@ -160,21 +157,14 @@ def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
     edges = [slowest, *(0.75 * slowest * 2.0 ** number for number in range(1, bins)),
              float(speed.max())]
     places = np.clip(np.searchsorted(edges, speed, side='right') - 1, 0, bins - 1)
-    up = [(low, high, (places == place) & (rate > 0.0))
-          for place, (low, high) in enumerate(zip(edges, edges[1:]))]
-    down = [(-high, -low, (places == place) & (rate < 0.0))
-            for place, (low, high) in enumerate(zip(edges, edges[1:]))]
-    return [each for each in (*down[::-1], *up) if each[2].any()]
+    found = [each for place, (low, high) in enumerate(zip(edges, edges[1:])) for each in (
+        (low, high, (places == place) & (rate > 0.0)),
+        (-high, -low, (places == place) & (rate < 0.0)))]
+    return sorted((each for each in found if each[2].any()), key=lambda each: each[0])
 
 
-def _temperature_bins(errors: TurnErrors) -> Bins:
-    return [] if errors.turns.temperature is None else [
-        each for each in equal_bins(errors.turns.temperature, 8) if each[2].any()]
-
-
-# the answer
-
-def _lines(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> Iterator[str]:
+def _lines(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatures: Bins,
+           remarks: list[str]) -> Iterator[str]:
     (rms_before, largest_before), (rms_after, largest_after) = map(
         _sizes, (errors.static, errors.modelled))
     yield (f'Error of a turn of 360 deg: largest {_format_error(largest_before)} with the static '
@@ -185,14 +175,12 @@ def _lines(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) ->
            f'of {len(np.unique(errors.turns.sweep))} sweeps in {given.log}.')
     for remark in remarks:
         yield f'{remark[0].upper()}{remark[1:]}.'
-    yield from _table('rate [deg/s]', errors,
-                      [(low / DEGREE, high / DEGREE, mask)
-                       for low, high, mask in _rate_bins(errors, given.slowest * DEGREE)])
-    yield from _table('temperature [degC]', errors, _temperature_bins(errors))
+    yield from _table('rate [deg/s]', errors, [(low / DEGREE, high / DEGREE, mask)
+                                               for low, high, mask in rates])
+    yield from _table('temperature [degC]', errors, temperatures)
 
 
 def _sizes(errors: Array) -> tuple[float, float]:
-    """Return the root mean square and the largest absolute value of errors."""
     return rms(errors), float(np.abs(errors).max())
 
 
@@ -218,15 +206,16 @@ def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
             for each in (errors.static, errors.modelled) for value in _sizes(each[mask]))
 
 
-def _data(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> dict[str, Any]:
+def _data(given: argparse.Namespace, errors: TurnErrors, rates: Bins, temperatures: Bins,
+          remarks: list[str]) -> dict[str, Any]:
     turns = errors.turns
     ratios = [before / after if after > 0.0 else None
               for before, after in zip(_sizes(errors.static), _sizes(errors.modelled))]
     return {'turns': len(turns), 'slowest_rad_s': given.slowest * DEGREE,
             **_error_data(errors, np.ones(len(turns), dtype=bool)),
             'ratio_rms': ratios[0], 'ratio_largest': ratios[1],
-            'by_rate': _bin_data('rad_s', errors, _rate_bins(errors, given.slowest * DEGREE)),
-            'by_temperature': _bin_data('degc', errors, _temperature_bins(errors)),
+            'by_rate': _bin_data('rad_s', errors, rates),
+            'by_temperature': _bin_data('degc', errors, temperatures),
             'rate_rad_s': turns.rate.tolist(), 'temperature_degc': None
             if turns.temperature is None else turns.temperature.tolist(),
             'static_rad_per_turn': errors.static.tolist(),

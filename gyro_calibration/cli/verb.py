@@ -20,7 +20,6 @@ from datetime import datetime, timezone
 import importlib.util
 import math
 import os
-import shutil
 import sys
 import textwrap
 from threading import Event, Thread
@@ -59,34 +58,29 @@ def show_progress(activity: str) -> Iterator[Callable[[float | None, str], None]
         status_text[0] = (f'{words} ...'
                           if share is None else f'{100.0 * share:3.0f} %  {words} ...')
 
-    if not sys.stderr.isatty():
-        yield on_progress
-        return
     finished = Event()
 
     def show() -> None:
         if finished.wait(PROGRESS_DELAY):
             return
-        while True:
-            text = f'{status_text[0]}  {time.monotonic() - begin:.0f} s'
-            width = shutil.get_terminal_size().columns - 1
-            print(f'\r\033[K{text[:width]}', end='', file=sys.stderr, flush=True)
-            if finished.wait(0.5):
-                print('\r\033[K', end='', file=sys.stderr, flush=True)
-                return
+        with tqdm(bar_format='{desc}', leave=False) as bar:
+            while not finished.wait(0.5):
+                text = f'{status_text[0]}  {time.monotonic() - begin:.0f} s'
+                bar.set_description_str(text[:bar.ncols])
 
     thread = Thread(target=show, daemon=True)
-    thread.start()
+    if sys.stderr.isatty():
+        thread.start()
     try:
         yield on_progress
     finally:
         finished.set()
-        thread.join()
+        if thread.is_alive():
+            thread.join()
 
 
 @contextmanager
 def _show_bytes_read(path: str) -> Iterator[Callable[[int], object]]:
-    """Show a bar of the bytes read of a log, and give the function that updates it."""
     size = sum(os.path.getsize(file)
                for file in list_recording_files(path) if os.path.isfile(file)) or None
     with tqdm(total=size, desc=to_printable(path), unit='B', unit_scale=True, delay=PROGRESS_DELAY,
@@ -205,7 +199,6 @@ def _bounded(value: float, low: float, high: float = math.inf, unit: str = '') -
 
 
 def _picture_file(text: str) -> str:
-    """Return the name of a picture file, if its format and matplotlib are available."""
     if not text.endswith(('.png', '.svg')):
         raise argparse.ArgumentTypeError(f'{text} is no picture file; give a name that ends in '
                                          '.png or .svg')

@@ -27,19 +27,19 @@ from typing import NamedTuple
 
 from gyro_calibration.files import InputError, suggest_nearest, to_printable
 
-_DEGREE = math.radians(1.0)
+DEGREE = math.pi / 180.0
 
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
     'time_s': ('time', 1.0),
     'gyro_rad_s': ('output', 1.0),
-    'gyro_dps': ('output', _DEGREE),
+    'gyro_dps': ('output', DEGREE),
     'gyro_counts': ('counts', 1.0),
     'temperature_degc': ('temperature', 1.0),
     'reference_rate_rad_s': ('reference_rate', 1.0),
-    'reference_rate_dps': ('reference_rate', _DEGREE),
+    'reference_rate_dps': ('reference_rate', DEGREE),
     'reference_heading_rad': ('reference_heading', 1.0),
-    'reference_heading_deg': ('reference_heading', _DEGREE),
+    'reference_heading_deg': ('reference_heading', DEGREE),
     'acceleration_mps2': ('specific_force', 1.0),
     'supply_v': ('supply', 1.0),
     'moving': ('moving', 1.0),
@@ -50,9 +50,9 @@ ATTITUDE = ('attitude_w', 'attitude_x', 'attitude_y', 'attitude_z')
 #: Axes of a gyro; column names may contain one, such as gyro_x_dps.
 AXES = ('x', 'y', 'z')
 
-_RATE_UNITS = {'rad/s': 1.0, 'deg/s': _DEGREE, 'dps': _DEGREE, 'mrad/s': 1e-3,
-               'deg/h': _DEGREE / 3600.0}
-_ANGLE_UNITS = {'rad': 1.0, 'deg': _DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
+_RATE_UNITS = {'rad/s': 1.0, 'deg/s': DEGREE, 'dps': DEGREE, 'mrad/s': 1e-3,
+               'deg/h': DEGREE / 3600.0}
+_ANGLE_UNITS = {'rad': 1.0, 'deg': DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
 #: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _OPTION_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
@@ -90,21 +90,11 @@ class Column(NamedTuple):
 def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
                  axis: str = 'z') -> dict[str, Column]:
     """
-    Find the column of each quantity of a log.
+    Return the column of each quantity of a log, and of each part of an `ATTITUDE`.
 
-    Parameters
-    ----------
-    header : names of the columns
-    user_columns : quantity, as in options -> name of its column, or name:unit
-    axis : x, y or z, for names that contain an axis
-
-    Returns
-    -------
-    quantity, or part of `ATTITUDE` -> column
-
-    Raises
-    ------
-    InputError : an unknown quantity, column or unit, a quantity in two columns, or no output
+    `user_columns` has the name of a quantity in options -> name of its column, or name:unit. The
+    axis is that of names that contain one. Raise `InputError` for an unknown quantity, column or
+    unit, a quantity in two columns, or no output.
 
     """
     found, by_user = dict[str, Column](), set[str]()
@@ -141,7 +131,6 @@ def find_columns(header: Sequence[str], user_columns: Mapping[str, str] = {},
 
 def _find_column(header: Sequence[str], name: str, text: str,
                  units: Mapping[str, float]) -> Column:
-    """Return a column that the user named, with or without a unit."""
     column, unit = text, next(iter(units))
     if text not in header and ':' in text:
         column, _, unit = text.rpartition(':')
@@ -210,5 +199,4 @@ def _guess_unit(name: str, quantity: str) -> str:
 
 
 def _shorten(text: str) -> str:
-    """Return at most 100 characters of a text, safe for a terminal."""
     return to_printable(text[:100])[:100]

@@ -47,6 +47,7 @@ from gyro_calibration.logs.columns import (
     AXES,
     Column,
     COLUMNS,
+    DEGREE,
     find_columns,
     is_header,
     QUANTITIES,
@@ -61,7 +62,6 @@ Mask = NDArray[np.bool_]
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
-DEGREE = math.pi / 180.0
 #: Half-width of the central 95 % interval of a normal distribution, standard deviations.
 NORMAL_QUANTILE_975 = 1.96
 
@@ -81,8 +81,7 @@ _ROS_1_MAGIC = b'#ROSBAG V2.0'
 #: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
 _MAX_MAGNITUDES = {'temperature': 1e5}
 _NULLABLE_QUANTITIES = ('output', 'counts', 'reference_rate', 'reference_heading', *ATTITUDE)
-#: Line numbers of the rows and of the line after them, quantity -> values in SI, and other columns
-#: as text.
+#: Line numbers of the rows and the line after, quantity -> values in SI, other columns as text.
 _ParsedRows = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
 
@@ -109,8 +108,7 @@ class Log:
     supply: Array | None = None  # V
     moving: Array | None = None  # 1 or 0
     notes: tuple[str, ...] = ()  # the lines before the header, without their '#'
-    # other columns of the file, as text, in their order; the second of two equal names becomes
-    # `name.1`
+    # other columns of the file, as text; the second of two equal names becomes `name.1`
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -142,7 +140,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
         heading, acceleration, supply or moving -> name, or name:unit; or attitude -> the four
         names of a quaternion, w/x/y/z, whose rotation about the axis is the reference heading
     axis : x, y or z, for columns such as gyro_x_dps, and for an attitude
-    on_progress : as for `read_log_blocks`
+    on_progress : takes the number of bytes read
 
     Raises
     ------
@@ -169,19 +167,10 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
                     rows: int = BLOCK_ROWS, on_progress: Callable[[int], object] | None = None,
                     columns: Mapping[str, str] = {}, axis: str = 'z') -> Iterator[Log]:
     """
-    Read a log file in blocks, so that memory does not grow with its length.
+    Read a log file as `read_log`, in blocks, so that memory does not grow with its length.
 
-    Parameters
-    ----------
-    path, sensitivity, rate, columns, axis : as for `read_log`
-    rows : rows in a block, at least 2; the last block may have fewer, as may blocks with texts
-        that span lines
-    on_progress : is called after each block with the number of bytes read, unless the file is a
-        pipe
-
-    Raises
-    ------
-    LogError : as `read_log`, when the row is reached
+    A block has `rows` rows, at least 2; the last one may have fewer, as may blocks with texts that
+    span lines. After each, `on_progress` takes the number of bytes read, unless from a pipe.
 
     """
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
@@ -189,15 +178,13 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
     with _convert_read_errors(path), open_regular_file(
             path, allow_pipes=True) as file, io.TextIOWrapper(
                 gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
-                encoding='utf-8-sig',
-                newline='') as text:
+                encoding='utf-8-sig', newline='') as text:
         if file.peek(len(_ROS_1_MAGIC)).startswith(_ROS_1_MAGIC):
             raise LogError(f'{path}: is a recording of ROS 1; wanted a log file or a ROS 2 '
                            'recording: convert it, by pip install rosbags and '
                            f'rosbags-convert --src {path} --dst recording')
         lines = _iter_lines(text)
-        table, first_line = _read_header(path, _limit_length(lines), columns,
-                                         axis)
+        table, first_line = _read_header(path, _limit_length(lines), columns, axis)
         unfolded = 0
         if rate is not None:
             table.columns.pop('time', None)
@@ -206,8 +193,8 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             if (compressed and file.seekable()
                     and unfolded > MIN_EXPANSION_BYTES + MAX_EXPANSION_RATIO * file.tell()):
                 raise LogError(f'{path}: decompresses to more than {MAX_EXPANSION_RATIO} times '
-                               'its size, which '
-                               'is the limit; decompress it first if this is intended')
+                               'its size, which is the limit; decompress it first if this is '
+                               'intended')
             places, arrays, others = (_parse_numeric_rows(block, first_line, table)
                                       or _parse_text_rows(path, block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
@@ -266,7 +253,6 @@ def _read_block(lines: Iterator[str], rows: int) -> list[str]:
 
 
 def _limit_length(lines: Iterator[str]) -> Iterator[str]:
-    """Give lines, and raise csv.Error beyond the length of a block."""
     left = _MAX_BLOCK_LENGTH
     for line in lines:
         left -= len(line)
@@ -288,7 +274,7 @@ class _FileHeader(NamedTuple):
 
 def _read_header(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
                  axis: str) -> tuple[_FileHeader, int]:
-    """Read notes and header, and return them with the number of the next line."""
+    """Return notes and header, and the number of the next line."""
     notes, line = [], next(lines, '')
     while line.startswith('#'):
         notes.append(line[1:].strip())
@@ -353,12 +339,7 @@ def _parse_numeric_rows(lines: list[str], first_line: int,
 
 def _parse_text_rows(path: str | Path, lines: list[str], remaining_lines: Iterator[str],
                      first_line: int, table: _FileHeader) -> _ParsedRows:
-    """
-    Parse rows one by one, with the texts of other columns, and name the faulty row and column.
-
-    A quoted text may span lines, and so take lines of the rest.
-
-    """
+    """Parse rows one by one, with texts, which may span lines; name a faulty row and column."""
     reader = csv.reader(itertools.chain(lines, _limit_length(remaining_lines)),
                         delimiter=table.delimiter)
     places, rows, header = [first_line], [], table.header
@@ -441,8 +422,7 @@ def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z')
 
     Raises
     ------
-    LogError : no output, arrays of different lengths, values that are no numbers, or a time that
-        does not increase
+    LogError : no output, different lengths, values that are no numbers, or unordered time
 
     """
     header = [str(name) for name in table]
@@ -530,10 +510,6 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     ----------
     reference_time, wrapped : times, s, and heading, rad, of shape (m,); nan where it was lost
     time, output : of the gyro, s and rad/s, shape (n,)
-
-    Returns
-    -------
-    the heading, rad, and whether the gyro determined a number of turns
 
     """
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
@@ -633,29 +609,22 @@ def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, 
           gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
           if str(path).endswith('.gz') else nullcontext(file) as data):
         for number, (log, more) in enumerate(blocks):
-            data.write(_format_rows(log, more,
-                                    with_header=number == 0).encode('utf-8', 'backslashreplace'))
-
-
-def _format_rows(log: Log, extra_columns: Mapping[str, Array], with_header: bool) -> str:
-    columns: dict[str, Sequence[Any]] = {}
-    for name, (quantity, factor) in COLUMNS.items():
-        values = getattr(log, quantity)
-        if factor == 1.0 and values is not None:
-            columns[name] = values.tolist()
-    columns.update(
-        {name: list(map(_normalize_newlines, texts)) for name, texts in log.others.items()})
-    columns.update({name: np.asarray(values, dtype=float).tolist()
-                    for name, values in extra_columns.items()})
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
-    if with_header:
-        text.writelines(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
-        writer.writerow(columns)
-    writer.writerows(zip(*columns.values()))
-    return text.getvalue()
+            columns: dict[str, Sequence[Any]] = {
+                name: getattr(log, quantity).tolist()
+                for name, (quantity, factor) in COLUMNS.items()
+                if factor == 1.0 and getattr(log, quantity) is not None}
+            columns |= {name: list(map(_normalize_newlines, texts))
+                        for name, texts in log.others.items()}
+            columns |= {name: np.asarray(values, dtype=float).tolist()
+                        for name, values in more.items()}
+            text = io.StringIO()
+            writer = csv.writer(text, lineterminator='\n')
+            if number == 0:
+                text.writelines(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
+                writer.writerow(columns)
+            writer.writerows(zip(*columns.values()))
+            data.write(text.getvalue().encode('utf-8', 'backslashreplace'))
 
 
 def _normalize_newlines(text: str) -> str:
-    """Return a text with its line ends as newlines."""
     return text.replace('\r\n', '\n').replace('\r', '\n') if '\r' in text else text

@@ -45,34 +45,25 @@ from numpy.typing import NDArray
 _Nanoseconds = NDArray[np.int64]
 
 REFERENCE_TYPES = (cdr.ODOMETRY, cdr.IMU, cdr.POSE, cdr.TWIST)
-#: Role of a topic -> the option that names it, and its possible message types.
+#: Role of a topic -> the option that names it, its possible message types, and the quantities of
+#: which a message of another type must have one.
 _ROLES = {
-    'gyro': ('--topic', (cdr.IMU,)),
-    'temperature': ('--temperature-topic', (cdr.TEMPERATURE,)),
-    'reference': ('--reference-topic', REFERENCE_TYPES),
+    'gyro': ('--topic', (cdr.IMU,), {'rate'}),
+    'temperature': ('--temperature-topic', (cdr.TEMPERATURE,), {'temperature'}),
+    'reference': ('--reference-topic', REFERENCE_TYPES, {'rate', 'orientation.w'}),
 }
 
-#: Largest step back of stamps by messages out of order, s; a larger one means that a clock was
-#: set.
+#: Largest step back of stamps by messages out of order, s; at a larger one a clock was set.
 _MAX_STEP_BACK = 1.0
 #: Largest number of topics in a message.
 _MAX_LISTED_TOPICS = 20
 #: Time without a temperature beyond which a note is made, s; gyros take minutes to warm up.
 _MAX_TEMPERATURE_GAP = 30.0
 
-#: Role -> quantities, of which its topic must have one.
-_REQUIRED_QUANTITIES = {'gyro': {'rate'}, 'temperature': {'temperature'},
-                        'reference': {'rate', 'orientation.w'}}
-
 
 @dataclass(frozen=True)
 class Topics:
-    """
-    The selected topics of a recording; None selects the only one, and no reference.
-
-    The axis is that of the gyro: x, y or z.
-
-    """
+    """Topics of a recording, None for the only one and no reference; axis x, y, z of the gyro."""
 
     gyro: str | None = None
     reference: str | None = None
@@ -82,7 +73,7 @@ class Topics:
 
 def topic_type_fault(role: str, topic: str, kind: str) -> str:
     """Return why the message type of a topic does not fit its role; '' if it does."""
-    option, kinds = _ROLES[role]
+    option, kinds, _ = _ROLES[role]
     return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_join_names(kinds, "or")}'
 
 
@@ -157,6 +148,10 @@ class _TopicSeries:
         return replace(self, stamps=self.stamps[which], received=self.received[which],
                        numbers=self.numbers[which])
 
+    def with_unique_stamps(self) -> _TopicSeries:
+        """Return the series sorted by stamps, without duplicates."""
+        return self.select(np.unique(self.stamps, return_index=True)[1])
+
     def with_times(self, use_stamps: bool) -> _TopicSeries:
         """Return the series with stamps, or times of receipt, as its stamps."""
         if not use_stamps:
@@ -170,17 +165,9 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     """
     Read a ROS 2 recording: a folder, or a file .mcap or .db3.
 
-    Parameters
-    ----------
-    path : the recording
-    topics : the selected topics
-    rate : sample rate, Hz, which replaces the stamps
-    on_progress : is called with the number of bytes read
-    on_note : is called with each note on selections and corrections
-
-    Raises
-    ------
-    LogError : it cannot be read, or has no gyro or several; names its topics
+    A sample rate, Hz, replaces the stamps. `on_progress` takes the number of bytes read, `on_note`
+    each note on selections and corrections. Raise `LogError` for a recording that cannot be read,
+    or has no gyro or several; it names the topics.
 
     """
     contents, series = Contents(), dict[str, _TopicBuffer]()
@@ -232,19 +219,15 @@ class _LogBuilder:
             self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
                                'as lost')
             output[lost] = np.nan
-        log = Log(output=output, time=time, specific_force=self._specific_force(gyro))
+        arrays: dict[str, Any] = {'output': output, 'specific_force': self._specific_force(gyro)}
         if temperature is not None:
             times = temperature.with_times(use_stamps and temperature.has_stamps)
-            log = replace(log,
-                          temperature=self._interpolate_temperature(times, gyro.stamps[0], time))
+            arrays['temperature'] = self._interpolate_temperature(times, gyro.stamps[0], time)
         if reference is not None:
-            log = replace(log, **self._interpolate_reference(reference.with_times(use_stamps),
-                                                             gyro, time, log.output))
-        if rate is not None:
-            log = replace(log, time=np.arange(len(gyro)) / rate)
-        return replace(log, notes=(*self._notes, *self._contents.notes))
-
-    # Which topics
+            arrays |= self._interpolate_reference(reference.with_times(use_stamps), gyro, time,
+                                                  output)
+        return Log(time=time if rate is None else np.arange(len(gyro)) / rate, **arrays,
+                   notes=(*self._notes, *self._contents.notes))
 
     def _find_only_imu(self) -> str:
         found = [topic for topic in self._topics_of_type({cdr.IMU})
@@ -296,7 +279,7 @@ class _LogBuilder:
                            f'where the package {kind.partition("/")[0]} is sourced')
         definition = self._contents.definitions.get(kind)
         found = cdr.parse_layout(definition).quantities if definition else {}
-        if (not _REQUIRED_QUANTITIES[role] & set(found)
+        if (not _ROLES[role][2] & set(found)
                 and (wrong := topic_type_fault(role, topic, kind))):
             raise LogError(f'{self._path}: {wrong}')
         if topic not in self._series or not len(self._series[topic]):
@@ -317,8 +300,6 @@ class _LogBuilder:
             self._notes.append(f'{series.damaged_count} messages of {topic} could not be read and '
                                'were left out')
         return series.sort_by_arrival()
-
-    # The gyro
 
     def _order_samples(self, gyro: _TopicSeries, rate: float | None) -> _TopicSeries:
         """Sort samples by their stamps, leave out duplicates, and refuse unusable times."""
@@ -367,18 +348,10 @@ class _LogBuilder:
             return None
         return force.copy()
 
-    # Temperature and reference
-
     def _interpolate_temperature(self, series: _TopicSeries, begin: np.int64,
                                  time: Array) -> Array | None:
-        """
-        Return the temperature at the samples, by linear interpolation between readings.
-
-        Before the first reading and after the last it is constant. A housing takes minutes to warm
-        up, so interpolation is closer than the last reading, which a robot has to use.
-
-        """
-        series = _unique_stamps(series.select(np.isfinite(series.values('temperature'))))
+        """Return the temperature between readings; before and after them it is constant."""
+        series = series.select(np.isfinite(series.values('temperature'))).with_unique_stamps()
         at = (series.stamps - begin) / NSEC_PER_SEC
         if (not len(at) or at[0] > time[-1] + _MAX_TEMPERATURE_GAP
                 or at[-1] < -_MAX_TEMPERATURE_GAP):
@@ -394,19 +367,19 @@ class _LogBuilder:
         return np.interp(time, at, series.values('temperature'))
 
     def _interpolate_reference(self, series: _TopicSeries, gyro: _TopicSeries, time: Array,
-                               output: Array | None) -> dict[str, Any]:
+                               output: Array) -> dict[str, Any]:
         """Return heading and rate of a reference at the samples of the gyro; nan where lost."""
         if series.topic == gyro.topic:
             raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; '
                            'name another by --reference-topic')
-        series = _unique_stamps(series)
+        series = series.with_unique_stamps()
         at, wrapped = (series.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _wrapped_headings(series)
         rate = series.values('rate') if series.is_reported('rate') else None
         if rate is not None:
             rate = np.where(np.isfinite(rate), rate, np.nan)
         heading = None
         if wrapped is not None:  # without its jumps by whole turns
-            heading, by_gyro = unwrap_heading(at, wrapped, time, np.asarray(output))
+            heading, by_gyro = unwrap_heading(at, wrapped, time, output)
             if by_gyro:
                 self._notes.append('the reference turned by more than half a turn between two '
                                    'values; the number of turns was taken from the gyro')
@@ -427,11 +400,6 @@ class _LogBuilder:
         return found
 
 
-def _unique_stamps(series: _TopicSeries) -> _TopicSeries:
-    """Return the series sorted by stamps, without duplicates."""
-    return series.select(np.unique(series.stamps, return_index=True)[1])
-
-
 def _wrapped_headings(series: _TopicSeries) -> Array | None:
     """Return the rotation about z, wrapped, nan where invalid; None if not reported."""
     if not series.is_reported('orientation.w'):
@@ -448,12 +416,7 @@ def _wrapped_headings(series: _TopicSeries) -> Array | None:
 
 
 def interpolate_with_gaps(time: Array, known_time: Array, values: Array) -> Array:
-    """
-    Return values interpolated at other times; nan in gaps.
-
-    A gap is longer than 5 median intervals and longer than 0.1 s.
-
-    """
+    """Return values at other times; nan in gaps longer than 5 median intervals and 0.1 s."""
     known_time, values = known_time[np.isfinite(values)], values[np.isfinite(values)]
     if len(known_time) < 2:
         return np.full(len(time), np.nan)

@@ -146,15 +146,8 @@ def read_messages(path: str | Path, contents: Contents,
     """
     Give the messages of a recording with known quantities, and fill in its contents.
 
-    Parameters
-    ----------
-    path : a folder, or a file .mcap, .db3, .mcap.zstd or .db3.zstd
-    contents : is filled in
-    on_progress : is called with the number of bytes read
-
-    Raises
-    ------
-    LogError : a file is not a recording
+    It is a folder, or a file .mcap, .db3, .mcap.zstd or .db3.zstd; `LogError` for others. The
+    progress is the number of bytes read.
 
     """
     done = 0
@@ -231,7 +224,6 @@ def _decompress(compression: str, packed: BinaryIO, budget: _ExpansionBudget) ->
 
 
 def _import_library(name: str) -> Any:
-    """Import a compression library; only compressed recordings need one."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -241,7 +233,6 @@ def _import_library(name: str) -> Any:
 
 
 def _decompress_up_to(size: int, compression: str, data: bytes, budget: _ExpansionBudget) -> bytes:
-    """Return the first bytes of compressed data, at most a number."""
     expanded = bytearray()
     for piece in _decompress(compression, io.BytesIO(data), budget):
         expanded += piece
@@ -251,12 +242,9 @@ def _decompress_up_to(size: int, compression: str, data: bytes, budget: _Expansi
 
 
 def _decompress_message(data: bytes, budget: _ExpansionBudget) -> bytes:
-    """Return the bytes of a message, decompressed if the message itself is compressed."""
     return (_decompress_up_to(1 << 16, 'zstd', data, budget)
             if data.startswith(_ZSTANDARD_MAGIC) else data)
 
-
-# MCAP
 
 _RecordCode = IntEnum('_RecordCode', 'HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_INDEX '
                       'CHUNK_INDEX ATTACHMENT ATTACHMENT_INDEX STATISTICS METADATA '
@@ -359,7 +347,6 @@ def _read_text(body: bytes, offset: int) -> tuple[str, int]:
 
 
 def _parse_metadata(body: bytes) -> tuple[str, dict[str, str]]:
-    """Return name and pairs of a metadata record."""
     name, place = _read_text(body, 0)
     pairs, place = {}, place + 4
     while place < len(body):
@@ -496,8 +483,6 @@ class McapWriter:
         checked = struct.pack('<I', zlib.crc32(summary + footer))
         return data_end + summary + footer + checked + _MAGIC
 
-
-# SQLite
 
 _TABLES = ('topics', 'messages', 'message_definitions')
 #: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.

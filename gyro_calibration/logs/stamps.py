@@ -162,5 +162,4 @@ def _count_lost_per_step(time: Array, steps: Array, interval: float, has_bursts:
 
 
 def _number_samples(lost: Integers) -> Integers:
-    """Return the number of each sample, by the samples lost after each but the last."""
     return np.arange(len(lost) + 1) + np.cumsum(np.concatenate([[0], lost]))

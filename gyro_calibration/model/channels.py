@@ -51,17 +51,10 @@ class ChannelHistory:
                specific_force: Number | None = None, supply: Number | None = None,
                heading: Number = 0.0) -> Channels:
         """
-        Take the next sample (numbers) or the next samples (arrays of shape (n,), n > 0).
+        Take the next sample (numbers) or samples (shape (n,), n > 0), and return its channels.
 
-        Parameters
-        ----------
-        time : stamp, s, increasing
-        temperature : degC; None where it is not known
-        specific_force, supply, heading : m/s², V, rad; None where they are not known
-
-        Returns
-        -------
-        the channels, with rate and output 0
+        Stamps are in s, quantities in degC, m/s², V and rad, or None where they are not known.
+        Rate and output of the channels are 0.
 
         """
         if self._block is None:
@@ -162,7 +155,6 @@ def _differences(signal: Number, previous: float) -> Number:
 
 
 def _hold_last_sign(sign: Number, previous: float) -> Number:
-    """Return the last sign that is not zero."""
     if not isinstance(sign, np.ndarray):
         return float(sign) or previous
     last = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), -1))

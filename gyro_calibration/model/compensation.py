@@ -59,12 +59,9 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     """
     Compensate by model (Ojeda et al., eq. 13), then self-calibration (Hong and Park, eq. 3).
 
-    Parameters
-    ----------
-    output : rad/s, a number or shape (n,)
-    temperature : degC, alike; the model's reference temperature where it is None
-    environment : further channels, from the history (`GyroModel.start_history`) that took the same
-        temperatures; needed where the model `needs_history`
+    Output, rad/s, and temperature, degC, are numbers or have shape (n,); no temperature is the
+    reference temperature. A model that `needs_history` needs the environment: further channels,
+    from the history (`GyroModel.start_history`) that took the same temperatures.
 
     """
     given = model.reference_temperature if temperature is None else temperature
@@ -75,7 +72,6 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
 
 def _compensate_at_once(model: GyroModel, output: Number, temperature: Number,
                         environment: Channels | None = None) -> CompensatedSamples:
-    """Compensate a sample, or all samples of a log, with the same result."""
     (slowest, fastest), limit = model.rate_range, model.rate_limit
     # no masks are made where the extremes show that all samples are inside
     beyond = _mask_outside(output, max(slowest, -limit), min(fastest, limit))
@@ -111,7 +107,6 @@ def _mask_outside(values: Number, low: float, high: float) -> Number:
 
 
 def _compensate_blocks(model: GyroModel, output: Array, temperature: Number) -> CompensatedSamples:
-    """Compensate in blocks that fit into the cache of the processor."""
     modelled, clipped, beyond = (
         np.empty(len(output)), np.zeros(len(output), bool), np.zeros(len(output), bool))
     rate = modelled if model.self_calibration is None else np.empty(len(output))

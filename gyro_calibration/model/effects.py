@@ -144,14 +144,8 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
 
     A lag obeys ``time_constant * d(lagged)/dt = signal - lagged``, solved exactly for a signal
     that is linear between its samples. The difference decays by exp(-x) over an interval of x time
-    constants, and a change d of the signal reduces it by ``d (1 - exp(-x)) / x``.
-
-    Parameters
-    ----------
-    interval : since the previous sample, s, not negative
-    change : of the signal since the previous sample
-    time_constant : s, above 0
-    initial_difference : the difference at the sample before the first one
+    constants, and a change d of the signal reduces it by ``d (1 - exp(-x)) / x``. Interval, s, not
+    negative, and change are those since the previous sample.
 
     """
     if not isinstance(interval, np.ndarray):
@@ -200,11 +194,8 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     It is one of the output, not of the true rate, so that compensation is one subtraction (eq.
     13). Its powers are centred and scaled, since the condition number of raw powers of deg/s and
     degC is about 1e11. The coefficient ``t{j}w{i}`` belongs to power j of temperature and i of
-    output. The index of eq. 10 as printed collides; here each product has its own column.
-
-    Parameters
-    ----------
-    rate_order, temperature_order : p and q of the paper, not negative
+    output. The index of eq. 10 as printed collides; here each product has its own column. The
+    orders are p and q of the paper, not negative.
 
     """
     names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
@@ -267,16 +258,10 @@ def _evaluate_horner(coefficients: Sequence[Number], value: Number) -> Number:
 
 def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:
     """
-    Read the matrix C of eq. 11 of Ojeda et al.
+    Return the effect of the matrix C of eq. 11 of Ojeda et al., and its values in SI.
 
-    Parameters
-    ----------
-    matrix : shape (q + 1, p + 1), for deg/s and degC, highest powers first:
-        ``error = [T² T 1] C [w³ w² w 1]'`` (eq. 12)
-
-    Returns
-    -------
-    the effect, and the values of its parameters in SI
+    The matrix has shape (q + 1, p + 1), for deg/s and degC, highest powers first:
+    ``error = [T² T 1] C [w³ w² w 1]'`` (eq. 12).
 
     """
     c = np.array(matrix, dtype=float)
@@ -307,7 +292,6 @@ def _raw_power_coefficients(centre: float, scale: float, count: int) -> Array:
 
 
 def _at_each(channels: Channels, value: Number) -> Number:
-    """Return a value in the shape of the rates."""
     return value + 0.0 * channels.rate
 
 
@@ -363,7 +347,6 @@ SCALE_FACTOR_TEMPERATURE = Effect(
 
 
 def _temperature_lag(channels: Channels, time_constant: float) -> Number:
-    """Return the lagged temperature minus the temperature, K."""
     if channels.lagged is None:
         return 0.0
     return channels.lagged('temperature', time_constant) - channels.temperature
@@ -499,8 +482,7 @@ _SIGNAL_EFFECTS = (
         distortion=lambda signal, time, rate: _interpolate((1.0 + rate) * time, time, signal),
         stage='rate', correct_stamps=lambda time, rate: (1.0 + rate) * time,
         not_compensated='It is compensated by scaling the stamps of a log; a robot stamps by its '
-        'own '
-        'clock, without this effect.'),
+        'own clock, without this effect.'),
     Effect('dead_zone', 'The output stays zero while the rate is small.', frozenset({'rate'}),
            (Parameter('amplitude', '1', default=1.0),), lambda channels, dead_zone: (
                (abs(channels.rate) < dead_zone) * -channels.rate,),

@@ -44,7 +44,7 @@ class Term:
     values: tuple[float, ...]
 
     def columns(self, channels: Channels) -> Sequence[Number]:
-        """Return one column a coefficient."""
+        """Return one column for each coefficient."""
         return self.effect.columns(channels, *self.values[:len(self.effect.nonlinear_parameters)])
 
     def error(self, channels: Channels) -> Number:
@@ -110,7 +110,7 @@ class SelfCalibration:
         return self.scale * rate + self.offset
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all values by name, in SI; None for unknown ones."""
+        """Return the values by name, in SI; None for unknown ones."""
         scale_deviation, bias_deviation = (None if math.isnan(value) else value
                                            for value in self.standard_deviations)
         return {'scale_factor_error': self.scale_factor_error,
@@ -120,7 +120,6 @@ class SelfCalibration:
                 'calibration_temperature': self.temperature, 'method': self.method}
 
     def __str__(self) -> str:
-        """Return a sentence for people."""
         known = self.covariance is not None
         scale, bias = (f' +- {deviation:.{digits}f}' if known else '' for deviation, digits in zip(
             (100 * self.standard_deviations[0], self.standard_deviations[1] / DEGREE), (3, 4)))
@@ -309,12 +308,7 @@ class GyroModel:
         return ChannelHistory(self.reference_temperature, *self.extrapolation_range)
 
     def output(self, rate: Number, temperature: Number) -> Number:
-        """
-        Return the output, rad/s, that solves ``output = rate + error(rate, output, temperature)``.
-
-        It has no noise.
-
-        """
+        """Return the output, rad/s, with ``output = rate + error(rate, output, temperature)``."""
         return self.output_from_channels(Channels(rate, rate, temperature))
 
     def output_from_channels(self, channels: Channels) -> Number:
@@ -326,12 +320,7 @@ class GyroModel:
             rate)[0] if dependent else given
 
     def rate(self, output: Number, temperature: Number) -> Number:
-        """
-        Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``.
-
-        Effects that compensation cannot undo are left in it.
-
-        """
+        """Return the rate, rad/s, with ``rate = output - error(rate, output, temperature)``."""
         return self.rate_from_channels(Channels(output, output, temperature))[0]
 
     def rate_from_channels(self, channels: Channels) -> tuple[Number, Number]:
@@ -403,9 +392,9 @@ def _iterate_secant(g: Callable[[Number], Number], start: Number, low: float = -
     """
     Solve x = g(x) for a slope of g well below one; return x, and the last step.
 
-    The secant iteration converges faster than linearly, and in one pass for a constant slope. The
-    number of passes is fixed, so that a sample and a log take the same steps. A single sample
-    skips passes that would change nothing, and is limited to the bounds.
+    The secant iteration takes one pass for a constant slope. The number of passes is fixed, so
+    that a sample and a log take the same steps; a single sample skips passes that would change
+    nothing, and is limited to the bounds.
 
     """
     a, b = start, g(start)
@@ -428,17 +417,8 @@ def _invert_response(error_at: Callable[[Number], Number], output: Number, start
     """
     Solve ``rate + error_at(rate) = output`` in a domain where the left side grows with the rate.
 
-    Parameters
-    ----------
-    error_at : rate -> error at that rate, rad/s
-    output : output, rad/s, a number or shape (n,)
-    start : first value of the iteration, rad/s, a number or shape (n,)
-    domain : lowest and highest rate, rad/s
-
-    Returns
-    -------
-    the rate, and whether there is none in the domain; the correction at the nearer end of the
-    domain is used then
+    Return the rate, and whether there is none in the domain; the correction at the nearer end of
+    the domain is used then. A start and an output have shape (n,), or are numbers.
 
     """
     low, high = domain

@@ -141,7 +141,6 @@ def _parse_range(key_path: str, value: Any) -> tuple[float, float]:
 
 
 def _parse_matrix(key_path: str, value: Any, wanted: str) -> Array:
-    """Return rows of numbers of one length."""
     lengths = {len(row) if isinstance(row, list) else 0
                for row in value} if isinstance(value, list) else {0}
     if len(lengths) != 1 or 0 in lengths:

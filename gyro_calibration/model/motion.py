@@ -93,12 +93,9 @@ def motion_from_headings(time: Array, heading: Array) -> Motion:
 
 def motion_from_log(log: Log) -> tuple[Motion, float]:
     """
-    Return the motion of the reference of a log with a time, and the time of its beginning, s.
+    Return the motion of the reference of a log, and the time of its beginning, s.
 
-    Raises
-    ------
-    InputError : the log has no reference over time
-    DataRefused : the reference has fewer than two values
+    Raise `InputError` without a reference over time, `DataRefused` with less than two values.
 
     """
     for values, motion in ((log.reference_heading, motion_from_headings),
@@ -114,15 +111,7 @@ def motion_from_log(log: Log) -> tuple[Motion, float]:
 
 
 def constant_rate_motion(segments: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
-    """
-    Return a motion of constant rates.
-
-    Parameters
-    ----------
-    segments : (duration, s, rate, deg/s) of each stretch
-    ramp : duration of the linear ramp at the beginning of each stretch, s
-
-    """
+    """Return a motion of stretches (duration, s, rate, deg/s), each beginning with a ramp, s."""
     time, rate = [0.0], [0.0]
     for duration, value in segments:
         start = time[-1]
@@ -171,17 +160,20 @@ def read_motion(path: str | Path) -> Motion:
     It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s. The reference of a log
     is a profile too: its heading where it has both, and without the rows where it was lost.
 
-    Raises
-    ------
-    MotionError : the file cannot be read, has other columns, a value that is not a finite number,
-        or times that do not increase
+    Raise `MotionError` for other columns, values that are not finite, times that do not increase.
 
     """
     try:
         lines = io.StringIO(read_bytes(path, MAX_PROFILE_BYTES).decode('utf-8-sig'), newline=None)
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
-        name = _find_motion_column(path, header)
+        found = sorted(name for name in _COLUMN_UNITS if name in header)
+        is_log = [each[:14] for each in found] == ['reference_head', 'reference_rate']
+        if 'time_s' not in header or len(found) != 1 + is_log:
+            given = excerpt(','.join(header)) or 'nothing'
+            raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
+                              'heading_deg, heading_rad, rate_dps, rate_rad_s')
+        name = found[0]
         places = header.index('time_s'), header.index(name)
         time, values = np.fromiter((_parse_number(path, row, place, header)
                                     for row in rows for place in places), float).reshape(-1, 2).T
@@ -195,17 +187,6 @@ def read_motion(path: str | Path) -> Motion:
     if len(time) < 2 or not (np.diff(time) >= MIN_SAMPLE_INTERVAL).all():
         raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
     return (motion_from_rates if 'rate' in name else motion_from_headings)(time, values)
-
-
-def _find_motion_column(path: str | Path, header: list[str]) -> str:
-    """Return the name of the column that holds the motion."""
-    found = sorted(name for name in _COLUMN_UNITS if name in header)
-    both = [each[:14] for each in found] == ['reference_head', 'reference_rate']
-    if 'time_s' not in header or len(found) != 1 + both:
-        given = excerpt(','.join(header)) or 'nothing'
-        raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
-                          'heading_deg, heading_rad, rate_dps, rate_rad_s')
-    return found[0]
 
 
 def _parse_number(path: str | Path, row: list[str], place: int, header: list[str]) -> float:
@@ -250,12 +231,8 @@ def simulate_gyro_output(model: GyroModel, time: Array, channels: Channels,
     """
     Return the output, rad/s, shape (n,), of a gyro in a motion and its surroundings.
 
-    Parameters
-    ----------
-    model : effects and noise of the gyro
-    time : stamps, s, increasing, shape (n,); the noise is that of samples at their median interval
-    channels : true rate and surroundings at these times, of a log by `channels.channels_from_log`
-    generator : source of the noise; without one there is none
+    The channels have the true rate and surroundings at the stamps, s, shape (n,). The noise is
+    that of samples at their median interval; without a generator there is none.
 
     """
     rate = model.distort('rate', channels.rate, time)

@@ -42,21 +42,19 @@ def read_settings(path: str | Path, max_size: int = MAX_SETTINGS_BYTES) -> Any:
     Dates are texts, and 1e-4, a text in YAML 1.1, is a number. A file that names its format, as
     programs write it, must end with a line end: a truncated 9.3e-06 could read as 9.3.
 
-    Raises
-    ------
-    OSError : it cannot be opened
-    ValueError : it is no such file; the message is part of a sentence, with the line if known
+    Raise `ValueError` for any other file; its message is part of a sentence.
 
     """
     try:
         text = read_bytes(path, max_size).decode('utf-8-sig')
         content = yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        place = f'line {mark.line + 1}: ' if mark else ''
-        raise ValueError(f'{place}{_to_single_line(error.problem or error.context)}') from error
     except yaml.YAMLError as error:
-        raise ValueError(_to_single_line(error)) from error
+        problem, mark = error, None
+        if isinstance(error, yaml.MarkedYAMLError):
+            problem, mark = (error.problem or error.context,
+                             error.problem_mark or error.context_mark)
+        place = f'line {mark.line + 1}: ' if mark else ''
+        raise ValueError(place + ' '.join(str(problem).split())[:200]) from error
     if isinstance(content, dict) and 'format' in content and not text.endswith(('\n', '\r')):
         raise ValueError('its last line has no end, as that of a file which was cut off')
     return content
@@ -72,18 +70,10 @@ class InvalidValue(ValueError):
 
 def validate(key_path: str, value: Any, schema: Any) -> Any:
     """
-    Return a value as parsed by its schema.
+    Return a value, at a place such as `noise.angle_random_walk`, as parsed by its schema.
 
-    Parameters
-    ----------
-    key_path : of the value in the file, such as `noise.angle_random_walk`
-    value : what the file holds there
-    schema : a function of place and value; or a mapping of names to schemas, all of them optional
-        in the file; or None, for a mapping of any names
-
-    Raises
-    ------
-    WrongValue : the value does not fit the schema
+    A schema is a function of place and value; or a mapping of names to schemas, all of them
+    optional in the file; or None, for a mapping of any names. Raise `InvalidValue` for others.
 
     """
     if callable(schema):
@@ -125,25 +115,12 @@ def parse_text(key_path: str, value: Any) -> str:
     return str(value)
 
 
-def _to_single_line(text: object) -> str:
-    """Return a message as one line of at most 200 characters."""
-    return ' '.join(str(text).split())[:200]
-
-
 def format_settings(content: Any) -> str:
-    """
-    Return names, texts, numbers and lists as YAML that `read_settings` reads back unchanged.
-
-    Raises
-    ------
-    ArithmeticError : a number is not finite
-
-    """
+    """Return finite numbers, texts, lists and names as YAML, as `read_settings` reads it."""
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 def _parse_plain(text: str) -> Any:
-    """Return the value of an unquoted text."""
     if text in ('', '~', 'null', 'Null', 'NULL'):
         return None
     if text.lower() in ('true', 'false'):

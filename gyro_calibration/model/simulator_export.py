@@ -33,21 +33,11 @@ from scipy.optimize import minimize
 
 def fit_gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:
     """
-    Return the process that fits bias instability and rate random walk best.
+    Return the process that fits bias instability and rate random walk best, and its error.
 
     The logarithms of the Allan variances, angle random walk included, are compared at one
-    averaging time per octave.
-
-    Parameters
-    ----------
-    noise : noise figures of the gyro
-    interval : between samples, s
-    span : the longest averaging time, s
-
-    Returns
-    -------
-    the process, with density 0 if both figures are 0; and the largest relative error of the Allan
-    deviation from one sample to the span, 1
+    averaging time per octave, from the interval of the samples to the span, s. The error is the
+    largest relative one of the Allan deviation. If both figures are 0, the process has density 0.
 
     """
     floor, walk = noise.bias_instability, noise.rate_random_walk
@@ -95,18 +85,10 @@ class SimulatorParameters:
 def simulator_parameters(model: GyroModel, sample_rate: float, temperature: float,
                          span: float) -> tuple[SimulatorParameters, float]:
     """
-    Return the parameters of a model that simulators support.
+    Return the parameters of a model that simulators support, and the error of their wander.
 
-    Parameters
-    ----------
-    model : with its last self-calibration
-    sample_rate : of the simulated gyro, Hz
-    temperature : operating temperature, degC
-    span : longest averaging time at which the wander is fitted, s
-
-    Returns
-    -------
-    the parameters, and the largest relative error of the Allan deviation by the wander, 1
+    The sample rate is in Hz, the operating temperature in degC; span and error are those of
+    `fit_gauss_markov`.
 
     """
     interval = 1.0 / sample_rate
@@ -188,12 +170,9 @@ _NOISE_UNITS = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
 def export_model(parameters: SimulatorParameters, model: GyroModel,
                  simulator: str) -> tuple[str, list[str]]:
     """
-    Write the `simulator_parameters` of a gyro for one of `SIMULATORS`.
+    Return the `simulator_parameters` of a gyro as text for one of `SIMULATORS`.
 
-    Returns
-    -------
-    text for the simulator, with a comment on the parameters that are left out; and these
-    parameters, one text each
+    A comment lists the parameters that are left out; they are returned too, one text each.
 
     """
     text, names = _FORMATTERS[simulator](parameters)
