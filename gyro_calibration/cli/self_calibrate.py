@@ -64,10 +64,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
                         'rate_dps; default: the reference of the log')
-    parser.add_argument(
-        '--turns', type=_parse_turns, metavar='N', help='number of full turns from a '
-        'mark to the same mark with standstill at both ends, counter-clockwise '
-        f'positive; {_NEAREST}: the number nearest to the gyro')
+    parser.add_argument('--turns', type=_parse_turns, metavar='N', help='number of full turns '
+                        'from a mark to the same mark with standstill at both ends, '
+                        f'counter-clockwise positive; {_NEAREST}: the number nearest to the gyro')
     parser.add_argument('--marking', type=verb.non_negative_number, metavar='DEG',
                         help='standard deviation of the angle between both standstills on the '
                         f'mark, deg; default: {MARK_DEVIATION / DEGREE:g}')

@@ -314,8 +314,7 @@ class _McapReader:
             elif code == _RecordCode.MESSAGE:
                 number, _, received, _ = struct.unpack_from('<HIQQ', body)
                 if channel := self._channels.get(number):
-                    yield Message(*channel, received,
-                                  _decompress_message(body[22:], self._budget))
+                    yield Message(*channel, received, _decompress_message(body[22:], self._budget))
             elif code == _RecordCode.SCHEMA:
                 kind, place = _read_text(body, 2)
                 definition, _ = _read_text(body, _read_text(body, place)[1])

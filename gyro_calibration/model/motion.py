@@ -120,8 +120,7 @@ def constant_rate_motion(segments: list[tuple[float, float]], ramp: float = 0.5)
     return motion_from_rates(np.array(time), np.array(rate))
 
 
-def _turns_and_rests(first_rest: float,
-                     turns: Iterable[tuple[float, float, float]]) -> Motion:
+def _turns_and_rests(first_rest: float, turns: Iterable[tuple[float, float, float]]) -> Motion:
     """Return the motion of turns of (duration, s, rate, deg/s, duration of the rest after, s)."""
     return constant_rate_motion([(first_rest, 0.0), *(
         stretch for duration, rate, rest in turns for stretch in ((duration, rate), (rest, 0.0)))])
