@@ -204,15 +204,10 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
              generator: np.random.Generator | None = None,
              temperature: Number | None = None) -> Log:
     """
-    Return the log of a simulated gyro.
+    Return the log of a simulated gyro, as `api.simulate`, with the true motion as reference.
 
-    Parameters
-    ----------
-    model : effects and noise of the gyro
-    motion : its true motion, kept in the log as the reference
-    sample_rate : Hz
-    generator : source of the noise; without one there is none
-    temperature : degC, of all samples or of each, shape (n,); default: the reference temperature
+    Without a generator there is no noise; without a temperature, degC, of all samples or of each,
+    it is the reference temperature.
 
     """
     time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate
