@@ -141,24 +141,14 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
 
 @dataclass(frozen=True)
 class CalibratedRun:
-    """
-    A run on a known motion, fitted and checked by the rest after it.
+    """A run on a known motion, fitted and checked by the rest after it."""
 
-    Attributes
-    ----------
-    fit, rest_check : with the rest, and None where there is none
-    is_used : which rows of the log
-    time, rate : of these rows, on the clock of the motion, s and rad/s
-    motion : that was driven
-
-    """
-
-    fit: ScaleBiasFit
+    fit: ScaleBiasFit  # with the rest, where there is one
     rest_check: RestCheck | None
-    is_used: Mask
-    time: Array
-    rate: Array
-    motion: Motion
+    is_used: Mask  # which rows of the log
+    time: Array  # of these rows, on the clock of the motion, s
+    rate: Array  # of these rows, rad/s
+    motion: Motion  # that was driven
 
     def draw(self, path: str | Path | None) -> Any:
         """Draw the run with its errors before and after, and return the figure."""
