@@ -58,7 +58,6 @@ def arrived(name: str, share: float, full_scale: float | None) -> list[float]:
 
 
 def row(name: str, share: float) -> str:
-    """Return a line of the table."""
     exact, *rates = arrived(name, share, None)
     wrong = [rate for rate in rates if abs(rate - exact) > 1e-9]
     _, *limited = arrived(name, share, FULL_SCALE)
@@ -69,7 +68,6 @@ def row(name: str, share: float) -> str:
 
 
 def table() -> Iterator[str]:
-    """Yield the lines of the table in Markdown."""
     yield (f'| format | check | bytes struck | of {FRAMES} samples arrive | wrong ones '
            '| the largest, deg/s | wrong ones within full scale |')
     yield '|:---|:---|---:|---:|---:|---:|---:|'
@@ -78,7 +76,6 @@ def table() -> Iterator[str]:
 
 
 def main() -> None:
-    """Print the table."""
     for line in table():
         print(line, flush=True)
 

@@ -71,7 +71,6 @@ def carried_row(number: int, gyros: int) -> str:
 
 
 def main(gyros: int) -> None:
-    """Print both tables."""
     print('| gyro | inside, begin of a run | inside, bias | inside, difference '
           '| median error of the difference | of none | rms | of none | outliers held back '
           '| good ones held back, a gyro |\n|' + '---|' * 10)

@@ -131,7 +131,6 @@ def _percent(values: Sequence[bool]) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the parts and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--logs', type=int, default=2, help='of each kind; default: 2')
     parser.add_argument('--part', nargs='+', default=PARTS)

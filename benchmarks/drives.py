@@ -55,7 +55,6 @@ class Drive:
 
 
 def path(rate: Array, moving: NDArray[np.bool_]) -> Path:
-    """Return the path of rates, rad/s."""
     return Path(rate, integrate(np.arange(len(rate)) * STEP, rate), moving)
 
 

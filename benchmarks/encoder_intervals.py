@@ -74,7 +74,6 @@ def run(case: tuple[str, int, float]) -> Array:
 
 
 def table(runs: int, duration: float = 600.0) -> Iterator[str]:
-    """Yield the lines of a table of the coverage."""
     yield '| noise | s within | b within | rms error of s | stated | rms error of b | stated |'
     yield '|---|---|---|---|---|---|---|'
     with ProcessPoolExecutor() as pool:

@@ -132,11 +132,9 @@ def stamped(time: Array, number: Array, stamps: str, interval: float,
     clock = SampleClock(1.0 / interval, MODULUS if stamps == 'sequence' else 0)
     pieces = np.split(number, np.flatnonzero(np.diff(come) > 0.0) + 1)
     ends = come[np.cumsum([len(piece) for piece in pieces]) - 1]
-    found = [
+    return np.concatenate([
         clock.stamp_samples([Sample(0.0, sequence=int(each) % MODULUS) for each in piece],
-                            float(end)) for piece, end in zip(pieces, ends)
-    ]
-    return np.concatenate([np.array(stamps) for stamps in found])
+                            float(end)) for piece, end in zip(pieces, ends)])
 
 
 def errors(drive: Drive, fault: Fault, generator: np.random.Generator) -> tuple[Array, Array]:
@@ -174,7 +172,6 @@ def growth(clean: Array, faulty: Array,
 
 
 def table(name: str, interval: float, found: list[dict[str, tuple[Array, Array]]]) -> str:
-    """Return the table of a gyro in Markdown."""
     lines = [f'{name} at {1.0 / interval:g} Hz, {len(found)} drives', '',
              '| line | error, deg | growth, % | 95 % | added, deg | error² / variance |',
              '|:---|---:|---:|---:|---:|---:|']
@@ -191,7 +188,6 @@ def table(name: str, interval: float, found: list[dict[str, tuple[Array, Array]]
 
 
 def main() -> None:
-    """Simulate and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0])
     parser.add_argument('--drives', type=int, default=16)
     parser.add_argument('--rate', type=float, default=100.0, help='samples a second')

@@ -22,8 +22,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-import os
-from pathlib import Path
 import sys
 import tempfile
 import time
@@ -55,7 +53,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import motion_from_rates
 import numpy as np
 from numpy.random import Generator
-from processes import calibrate
+from processes import calibrate, resident_memory
 from scipy.special import ndtri
 from scipy.stats import beta
 
@@ -112,17 +110,16 @@ def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
                          ('mean', 'unit', 'new')) + ' |')
 
 
-def drives(folder: str, out: str = '') -> Iterator[str]:
-    """
-    Predict each log from the other drives, and from those and the other units of its drive.
-
-    What the verb `fleet` has done in `out` is not done again.
-
-    """
+def _processed(folder: str, out: str) -> list[dict[str, Any]]:
+    """Return the records of the drives; what `fleet` has done in `out` is not done again."""
     with tempfile.TemporaryDirectory() as new:
-        records = [
-            process_log(LogTask(entry, out or new)) for entry in find_logs([f'{folder}/rc_car_*'])
-        ]
+        return [process_log(LogTask(entry, out or new))
+                for entry in find_logs([f'{folder}/rc_car_*'])]
+
+
+def drives(folder: str, out: str = '') -> Iterator[str]:
+    """Predict each log from the other drives, and from those and the other units of its drive."""
+    records = _processed(folder, out)
     units, named = (sorted({each[key] for each in records}) for key in ('unit', 'drive'))
     unit, drive = (np.array([names.index(each[key]) for each in records])
                    for names, key in ((units, 'unit'), (named, 'drive')))
@@ -159,10 +156,7 @@ def first(folder: str, out: str = '') -> Iterator[str]:
     compared with the course over the next 60 s.
 
     """
-    with tempfile.TemporaryDirectory() as new:
-        records = [
-            process_log(LogTask(entry, out or new)) for entry in find_logs([f'{folder}/rc_car_*'])
-        ]
+    records = _processed(folder, out)
     error: dict[str, list[float]] = {}
     for record in records:
         log = read_log(record['log'])
@@ -209,8 +203,7 @@ def _predicted(value: Array, sigma: Array, unit: Any, drive: Any, left: Any, kno
                      drive[~left] if known else np.unique(drive[~left], return_inverse=True)[1]))
     found = pooled.estimate(unit=unit[left], error=sigma[left], power_ons=1.0,
                             **({'drive': drive[left]} if known else {'drives': 1.0}))
-    return (value[left] - found.value,
-            (found.low < value[left]) & (value[left] < found.high))
+    return value[left] - found.value, (found.low < value[left]) & (value[left] < found.high)
 
 
 def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
@@ -366,11 +359,10 @@ def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
                 if not isinstance(found, WorkerLost):
                     used[found[1]] = found[2]
                 if (done_ + lost) % max(count // 4, 1) == 0:
-                    memory.append(_memory())
+                    memory.append(resident_memory() / 1e6)
         own = time.process_time() - begin
         alone.append(_alone())  # a busy machine is slower at one time than at another
-        cost = [1e3 * each for each in (
-            np.mean(alone), sum(used.values()) / count, own / count)]
+        cost = [1e3 * each for each in (np.mean(alone), sum(used.values()) / count, own / count)]
         yield (f'| {count} | {lost} | {done_} of {count - len(last)} | '
                f'{", ".join(f"{each:.2f}" for each in cost)} | '
                f'{", ".join(f"{each:.0f}" for each in memory)} |')
@@ -382,12 +374,6 @@ def _alone(logs: int = 500) -> float:
     for number in range(logs):
         calibrate(number)
     return (time.process_time() - begin) / logs
-
-
-def _memory() -> float:
-    """Return the memory of this process now, MB."""
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
 def prior(generator: Generator, runs: int = 40) -> Iterator[str]:
@@ -419,7 +405,6 @@ PARTS = {each.__name__: each for each in (variances, slopes, alarms, smallest, s
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the tables that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('what', nargs='+', help='drives FOLDER, first FOLDER, or of '
                         f'{", ".join(PARTS)}')

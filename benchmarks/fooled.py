@@ -82,7 +82,6 @@ class Run:
 
 
 def drawn(number: int, level: float) -> Run:
-    """Return a run by its number."""
     generator = np.random.default_rng([number, round(10 * level)])
     noise = Noise(level * XV3500.noise.angle_random_walk, level * XV3500.noise.bias_instability)
     return Run(generator, 0.03 * generator.standard_normal(),
@@ -276,12 +275,9 @@ def _coverage(accepted: dict[tuple[str, float], list[tuple[float, ...]]]) -> Ite
     yield '|---|---|---|---|---|'
     for (name, level), errors in accepted.items():
         s, b, probability = np.array(errors).T
-        shares = [
-            100 * np.mean(each)
-            for each in (np.abs(s) < 1.96, np.abs(b) < 1.96, probability < MIN_FIT_PROBABILITY)
-        ]
-        yield f'| {name} | {level:g} times | ' + ' | '.join(f'{share:.1f} %'
-                                                            for share in shares) + ' |'
+        shares = ' | '.join(f'{100 * np.mean(each):.1f} %' for each in (
+            np.abs(s) < 1.96, np.abs(b) < 1.96, probability < MIN_FIT_PROBABILITY))
+        yield f'| {name} | {level:g} times | {shares} |'
 
 
 if __name__ == '__main__':

@@ -116,8 +116,7 @@ def _integrated(calibration: str, threshold: Threshold | None, known: Known) -> 
 
 
 @lru_cache(1)
-def _tracked(known: Known, factor: float = 1.0, wheels: bool = False
-             ) -> tuple[Estimate, Estimate]:
+def _tracked(known: Known, factor: float = 1.0, wheels: bool = False) -> tuple[Estimate, Estimate]:
     """Return what this program makes of a drive, live and with hindsight, told this noise."""
     drive, model = known.drive, GyroModel(self_calibration=known.likely)
     noise = Noise(*(factor * figure for figure in vars(drive.gyro.model.noise).values()))
@@ -205,7 +204,6 @@ def score(drive: Drive, estimate: Estimate, generator: np.random.Generator) -> S
 
 def scores(job: tuple[str, str, int, int, str,
                       Mapping[str, Mapping[str, float]]]) -> dict[str, Score]:
-    """Return the scores of all rows of one drive."""
     gyro, course, number, seed, only, settings = job
     generator = np.random.default_rng([seed, number, *gyro.encode(), *course.encode()])
     drive = known(GYROS[gyro], COURSES[course], generator)
@@ -231,7 +229,6 @@ Columns = Mapping[tuple[str, str], Sequence[Mapping[str, Score]]]
 
 def table(columns: Columns, names: Iterable[str], cell: Callable[[Sequence[Score]], str],
           title: str) -> str:
-    """Return a table of rows by gyros and courses."""
     heads = [f'{gyro}, {course}' for gyro, course in columns]
     lines = [f'| {title} | {" | ".join(heads)} |', f'|:---|{"---:|" * len(heads)}']
     for name in names:

@@ -149,8 +149,7 @@ def output_of(one: Gyro, rate: np.ndarray, generator: np.random.Generator) -> np
     flicker = one.noise.bias_instability ** 2 * math.log(RATIO) / math.pi  # of each process
     for constant in CONSTANTS:
         left = math.exp(-one.interval / constant)
-        new = generator.standard_normal(warm + count) * math.sqrt(
-            flicker * (1.0 - left ** 2))
+        new = generator.standard_normal(warm + count) * math.sqrt(flicker * (1.0 - left ** 2))
         new[0] = generator.standard_normal() * math.sqrt(flicker)
         bias += lfilter([1.0], [1.0, -left], new)[warm:]
     return (rate * (1.0 + SCALE * generator.standard_normal()) + bias

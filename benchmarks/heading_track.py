@@ -25,42 +25,26 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Track:
-    """
-    A heading over a log.
+    """A heading over a log: arrays of shape (n,)."""
 
-    Attributes
-    ----------
-    heading, variance, rate, rate_variance : rad, rad², rad/s and (rad/s)², shape (n,)
-    resting : shape (n,)
-    deleted_heading : heading attributed to bias or noise at rest, or deleted by the threshold
-        filter, rad
-    intervals : of the samples, with the number of lost ones
-
-    """
-
-    heading: Array
-    variance: Array
-    rate: Array
-    rate_variance: Array
+    heading: Array  # rad
+    variance: Array  # rad²
+    rate: Array  # rad/s
+    rate_variance: Array  # (rad/s)²
     resting: Mask
-    deleted_heading: float
-    intervals: Intervals
+    deleted_heading: float  # attributed to bias or noise at rest, or deleted by the filter, rad
+    intervals: Intervals  # of the samples, with the number of lost ones
 
 
 def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
           settings: Settings, wheels: Sequence[bool | None] | None = None, hindsight: bool = False,
           age: float | None = 0.0, still: Array | None = None) -> Track:
     """
-    Return the heading over a whole log.
+    Return the heading over a whole log, with hindsight smoothed by all later data.
 
-    Parameters
-    ----------
-    time, rate : s and rad/s, compensated, shape (n,)
-    sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
-    noise, covariance, settings, age : as in `HeadingTracker`
-    wheels : whether wheels or commands move the robot, n of them, or None
-    still : as in `HeadingTracker.add`
-    hindsight : smooth the heading by all later data
+    The compensated rates, rad/s, have shape (n,), their sensitivity to the values of the
+    calibration (m, n); wheels state whether something moves the robot. All else is as in
+    `HeadingTracker`.
 
     """
     tracker = HeadingTracker(noise, covariance, settings, age, hindsight)

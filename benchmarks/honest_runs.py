@@ -269,7 +269,6 @@ def row(kind: str, name: str, runs: int, seed: int) -> tuple[str, list[str]]:
 
 
 def main(runs: int = 100, seed: int = 1, kinds: str = '') -> None:
-    """Print the table."""
     print('| robot | gyro | refused | coverage of s | of b | s known to, % | s off, rms, % | '
           'b known to, deg/s | b off, rms, deg/s | beyond 5 sigma |')
     print('|---|---|---|---|---|---|---|---|---|---|')

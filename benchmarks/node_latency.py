@@ -73,7 +73,6 @@ class Block:
 
     @property
     def lost(self) -> int:
-        """Return how many messages never came back."""
         return self.sent - len(self.latencies)
 
 
@@ -134,26 +133,16 @@ class Probe:
         self._subscription = self._node.create_subscription(Imu, 'imu/data', print,
                                                             SENSOR_QOS).handle
         self._wait_set = implementation.WaitSet(1, 0, 0, 0, 0, 0, self._node.context.handle)
-        self._listen_idly()
+        # the other messages are sent too, at no cost of time here: these are never read
+        self._listener = rclpy.create_node('listener', namespace=subject)
+        for topic in ('heading', 'yaw_rate'):
+            self._listener.create_subscription(PUBLISHED[topic], topic, print, SENSOR_QOS)
         self._message = Imu()
         self._begin = 0
         self._latencies: list[float] = []
 
-    def _listen_idly(self) -> None:
-        """Have the other messages sent too, at no cost of time here: these are never read."""
-        self._listener = rclpy.create_node('listener', namespace=self._subject)
-        for topic in ('heading', 'yaw_rate'):
-            self._listener.create_subscription(PUBLISHED[topic], topic, print, SENSOR_QOS)
-
     def wait_for_subject(self) -> None:
-        """
-        Send samples until they come back.
-
-        Raises
-        ------
-        TimeoutError : nothing came back within 20 s
-
-        """
+        """Send samples until they come back, for at most 20 s."""
         deadline = time.monotonic() + 20.0
         while len(self._latencies) < 50:
             if time.monotonic() > deadline:
@@ -165,7 +154,9 @@ class Probe:
     def measure(self, rate: int) -> Block:
         """Send the samples of one block, half of them at rest and half in motion."""
         self._latencies, self._begin = [], time.monotonic_ns()
-        self._send_temperature()
+        temperature = Temperature(temperature=31.0)
+        self._stamp(temperature)
+        self._temperature.publish(temperature)
         begin, used, count = time.monotonic(), processor_time(self._process), round(BLOCK * rate)
         for index in range(count):
             self._serve_until(begin + index / rate)
@@ -184,7 +175,10 @@ class Probe:
             self._wait_set.add_subscription(self._subscription)
             self._wait_set.wait(round(1e9 * left))
             while taken := self._subscription.take_message(Imu, False):
-                self._receive(taken[0])
+                stamp = taken[0].header.stamp
+                sent = 1_000_000_000 * stamp.sec + stamp.nanosec
+                if sent >= self._begin:
+                    self._latencies.append(1e-6 * (time.monotonic_ns() - sent))
 
     def _stamp(self, message: Imu | Temperature) -> None:
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.monotonic_ns(),
@@ -194,16 +188,6 @@ class Probe:
         self._message.angular_velocity.z = rate
         self._stamp(self._message)
         self._imu.publish(self._message)
-
-    def _send_temperature(self) -> None:
-        message = Temperature(temperature=31.0)
-        self._stamp(message)
-        self._temperature.publish(message)
-
-    def _receive(self, message: Imu) -> None:
-        sent = 1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec
-        if sent >= self._begin:
-            self._latencies.append(1e-6 * (time.monotonic_ns() - sent))
 
 
 def compare(folder: Path) -> dict[str, dict[int, list[Block]]]:
@@ -244,7 +228,6 @@ FIGURES = {
 
 
 def table(blocks: dict[str, dict[int, list[Block]]]) -> Iterator[str]:
-    """Yield the lines of the comparison in Markdown."""
     yield '| rate | figure | relay | compensation_node | ratio |'
     yield '|---:|:---|---:|---:|---:|'
     for rate in RATES:

@@ -98,10 +98,8 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
 
 
 def forecasts(duration: float) -> list[CalibrationForecast]:
-    return [
-        CalibrationForecast(XV3500.noise, duration, drive, DRIVE, 0.0)
-        for drive in DRIVES.values()
-    ]
+    return [CalibrationForecast(XV3500.noise, duration, drive, DRIVE, 0.0)
+            for drive in DRIVES.values()]
 
 
 def planned(place: str, duration: float) -> Motion:
@@ -123,7 +121,6 @@ def row(pool: Executor, runs: int, name: str, motion: Motion, late: float = 0.0,
 
 
 def main(runs: int) -> None:
-    """Print the table."""
     twenty = LENGTHS[0]
     motions = {place: planned(place, twenty) for place in ABILITIES}
     rows = [('built-in profile', CALIBRATION_MOTION)]

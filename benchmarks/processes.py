@@ -64,6 +64,11 @@ def processor_time(process: int) -> float:
     return time.clock_gettime(~process << 3 | 2)
 
 
+def resident_memory(process: int | str = 'self') -> int:
+    """Return the resident memory of a process, bytes."""
+    return int(Path(f'/proc/{process}/statm').read_text().split()[1]) * os.sysconf('SC_PAGE_SIZE')
+
+
 def calibrate(number: int) -> tuple[float, int, float]:
     """
     Return the bias of a simulated log by least squares: a task of a fleet; below 0 it is killed.

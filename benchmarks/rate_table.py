@@ -100,9 +100,8 @@ def error(model: GyroModel, dwells: Dwells) -> np.ndarray:
 
 def left_out(fit: Fit, dwells: Dwells) -> float:
     """Return the root mean square error in sweeps that were left out, rad/s."""
-    parts = [(select_dwells(dwells, dwells.sweep
-                            != number), select_dwells(dwells, dwells.sweep == number))
-             for number in np.unique(dwells.sweep)]
+    parts = [(select_dwells(dwells, dwells.sweep != number),
+              select_dwells(dwells, dwells.sweep == number)) for number in np.unique(dwells.sweep)]
     return rms(np.concatenate([error(fit(seen), unseen) for seen, unseen in parts]))
 
 
@@ -113,7 +112,6 @@ def beyond(fit: Fit, dwells: Dwells) -> float:
 
 
 def main() -> None:
-    """Print the table."""
     dwells = table(Path(os.environ['GYRO_CALIBRATION_DATA']))
     print('| calibration | left-out sweeps | slower than 60 deg/s seen, 60 to 101 predicted |\n'
           '|---|---|---|')
@@ -197,7 +195,6 @@ def of_simulation(count: int, sine: bool) -> Iterator[tuple[Dwells, Dwells, bool
 
 
 def line(name: str, campaigns: Iterator[tuple[Dwells, Dwells, bool]]) -> str:
-    """Return a row of the table."""
     found: list[tuple[float, ...]] = []
     for seen, unseen, faster in campaigns:
         model = select_effects(seen).calibration.model
@@ -213,7 +210,6 @@ def line(name: str, campaigns: Iterator[tuple[Dwells, Dwells, bool]]) -> str:
 
 
 def campaigns(count: int = 40) -> None:
-    """Print the table of campaigns."""
     print('| campaigns | number | error: mean, worst, deg/s | least squares: mean, worst, deg/s '
           '| z in range | hotter | hotter and faster |\n|---|---|---|---|---|---|---|')
     if folder := os.environ.get('GYRO_CALIBRATION_DATA'):

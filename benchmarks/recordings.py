@@ -95,7 +95,6 @@ def row(given: tuple[Array, Array, Array], seconds: float) -> list[float]:
 
 
 def cells(rows: Array) -> list[str]:
-    """Return the cells of self-calibrations."""
     given = rows[np.isfinite(rows[:, 2])]
     found = [f'{size:.2f}' for size in np.sqrt(np.mean(rows[:, :2] ** 2, axis=0))]
     return found + ([f'{math.sqrt(np.mean(given[:, 2] ** 2)):.2f}',
@@ -138,13 +137,11 @@ def fit_row(given: tuple[Array, Array, Array], seconds: float) -> list[float]:
 
 
 def fit_cells(rows: Array) -> list[str]:
-    """Return the cells of `fit`."""
     return [*(f'{size:.1f}' for size in np.sqrt(np.nanmean(rows ** 2, axis=0))),
             str((rows[:, 2] > rows[:, 0]).sum())]
 
 
 def main(by_fit: bool, step: float = 60.0, first: float = 0.0) -> None:
-    """Print the table."""
     print('| recording | on | nothing | increments | fit | the same, refusals as nothing '
           '| worse than nothing | refused |\n|---|---|---|---|---|---|---|---|' if by_fit else
           '| recording | on | none | eq. 7 | now | stated, deg/s | inside 95 %, at least '

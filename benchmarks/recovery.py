@@ -89,7 +89,8 @@ class Table:
     def measure(self, gyro: GyroModel, generator: np.random.Generator) -> Dwells:
         """Return the dwells of a gyro on the table."""
         sweep = np.repeat(np.arange(self.sweeps), self.rates)
-        rate = np.concatenate([self._pass(number) for number in range(self.sweeps)])
+        up = np.linspace(0.0 if self.one_way else -self.fastest, self.fastest, self.rates)
+        rate = np.concatenate([up if number % 2 else -up for number in range(self.sweeps)])
         warming = np.tile(np.linspace(0.0, 2.0, self.rates), self.sweeps)
         temperature = np.repeat(np.linspace(*self.temperatures, self.sweeps), self.rates) + warming
         deviation = self.dwell * (np.exp(0.5 * generator.standard_normal(len(rate))) if self.told
@@ -101,10 +102,6 @@ class Table:
         return Dwells(rate, gyro.output(rate, temperature) + bias + scale * rate, temperature,
                       deviation if self.told else np.full(len(rate), np.nan), sweep,
                       tuple(f'row {row + 1}' for row in range(len(rate))))
-
-    def _pass(self, number: int) -> np.ndarray:
-        way = 1.0 if number % 2 else -1.0
-        return way * np.linspace(0.0 if self.one_way else -self.fastest, self.fastest, self.rates)
 
 
 SCATTERS = {
@@ -140,21 +137,17 @@ def expressed(truth: GyroModel, fitted: GyroModel) -> np.ndarray:
     channels = Channels(rate, truth.output(rate, temperature), temperature)
     shapes = {term.effect.name: term.values[:len(term.effect.nonlinear_parameters)]
               for term in truth.terms if term.effect is SINE_RESPONSE}
-    terms = [
-        Term(term.effect,
-             (*shapes.get(term.effect.name, term.values[:len(term.effect.nonlinear_parameters)]),
-              *term.values[len(term.effect.nonlinear_parameters):])) for term in fitted.terms
-    ]
+    terms = [Term(term.effect, (
+        *shapes.get(term.effect.name, term.values[:len(term.effect.nonlinear_parameters)]),
+        *term.values[len(term.effect.nonlinear_parameters):])) for term in fitted.terms]
     linear = [term for term in terms if term.effect is not SINE_RESPONSE]
     rest = truth.error(channels) - sum(term.error(channels)
                                        for term in terms if term.effect is SINE_RESPONSE)
     columns = np.column_stack([column for term in linear for column in term.columns(channels)])
     found = iter(np.linalg.lstsq(columns, rest, rcond=None)[0].tolist())
-    return np.array([
-        value for term in terms
-        for value in (term.values[:1] if term.effect is
-                      SINE_RESPONSE else [next(found) for _ in term.fitted_indices])
-    ])
+    return np.array([value for term in terms for value in (
+        term.values[:1] if term.effect is SINE_RESPONSE
+        else [next(found) for _ in term.fitted_indices])])
 
 
 def run(terms: Sequence[Term], table: Table,
@@ -192,7 +185,6 @@ def row(name: str, held: tuple[np.ndarray, np.ndarray]) -> str:
 
 
 def main(runs: int) -> None:
-    """Print both tables."""
     header = ('values, % | lowest to highest | rates, % | lowest to highest |\n'
               '|---|---|---|---|---|')
     print(f'| effect | {header}', flush=True)

@@ -70,7 +70,6 @@ class Row:
     still: bool = field(default=False)
 
     def cells(self):
-        """Return the columns as text."""
         turned = f'{self.turned:.0f}{" and still turning" if self.still else ""}'
         zero = ('never' if self.zero == math.inf else '-' if math.isnan(self.zero)
                 else f'{self.zero:.2f}')
@@ -296,7 +295,6 @@ def other_sends(rate):
 
 
 def teleop(stage):
-    """Let teleop turn the robot."""
     stage.other.rate = TELEOP
     stage.wait(lambda: stage.robot.robot.rate > 0.9 * TELEOP, 10.0, 'teleop')
 
@@ -349,7 +347,6 @@ FAULTS = {
 
 
 def main():
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--only', default='', help='faults that have this in their name')
     given = parser.parse_args()

@@ -54,7 +54,7 @@ from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.runner import SENSOR_QOS
 import numpy as np
-from processes import apart, end, node_command, processor_time
+from processes import apart, end, node_command, processor_time, resident_memory
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.signals import SignalHandlerOptions
@@ -217,10 +217,8 @@ class Counter:
         self._heading = 2.0 * math.atan2(message.orientation.z, message.orientation.w)
         if self._first_heading is None:
             self._first_heading = self._heading
-        if number is not None:
-            self._place(number, now)
-
-    def _place(self, number: int, now: float) -> None:
+        if number is None:
+            return
         if number <= self._last:
             self.repeated += 1
             return
@@ -368,11 +366,6 @@ class Run:
                 'driver_said': gyro_said}
 
 
-def resident_memory(process: int) -> int:
-    """Return the resident memory of a process, bytes."""
-    return int(Path(f'/proc/{process}/statm').read_text().split()[1]) * os.sysconf('SC_PAGE_SIZE')
-
-
 def median(values: list[int]) -> float:
     """Return the median; nan of nothing."""
     return statistics.median(values) if values else math.nan
@@ -401,7 +394,6 @@ def soak(protocol: str, rate: float, seconds: float, leading: float,
 
 
 def outcomes(given: argparse.Namespace) -> Iterator[dict[str, object]]:
-    """Yield the figures of what was asked for."""
     if not given.protocols:
         yield soak(SOAKED, SOAKED_RATE, 60.0 * given.minutes, LEADING, given.patient)
         return
@@ -410,7 +402,6 @@ def outcomes(given: argparse.Namespace) -> Iterator[dict[str, object]]:
 
 
 def text(found: dict[str, object]) -> Iterator[str]:
-    """Yield what was found, in words."""
     yield (f'{found["protocol"]} at {found["rate_hz"]:.0f} Hz for {found["lasted_s"]:.0f} s: '
            f'{found["sent"]} samples sent, {found["read_by_driver"]} of '
            f'{found["sent_with_leading"]} read by the driver with those before and after')

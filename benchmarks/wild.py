@@ -54,9 +54,8 @@ Answer = tuple[Callable[[Log], Array], str, list[Finding]]
 def points(log: Log, rate: Array, lag: float) -> tuple[Array, Array, Array]:
     """Return times, headings by rates, and courses where known, the gyro being `lag` s late."""
     known = np.flatnonzero(np.isfinite(log.reference_heading))
-    at = known[np.unique(
-        np.searchsorted(log.time[known], np.arange(log.time[known[0]], log.time[known[-1]],
-                                                   POINT)))]
+    at = known[np.unique(np.searchsorted(
+        log.time[known], np.arange(log.time[known[0]], log.time[known[-1]], POINT)))]
     at = at[(log.time[at] + lag >= log.time[0]) & (log.time[at] + lag <= log.time[-1])]
     turned = np.interp(log.time[at] + lag, log.time, integrate(log.time, rate))
     return log.time[at], turned, log.reference_heading[at]
@@ -178,9 +177,8 @@ def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, f
     if town:
         steering *= generator.uniform(size=len(knots)) < 0.4
     rate = np.interp(time, knots, steering)
-    speed = np.abs(
-        np.interp(time, knots,
-                  generator.uniform(-2.0 if town else 0.5, 12.0 if town else 3.0, len(knots))))
+    speed = np.abs(np.interp(time, knots, generator.uniform(
+        -2.0 if town else 0.5, 12.0 if town else 3.0, len(knots))))
     rate = rate * np.minimum(speed / 2.0, 1.0)
     heading = np.cumsum(rate) / RATE
     # bicycle model: the rear axle is `behind` the antenna, tyres slip in proportion to the lateral
@@ -192,9 +190,8 @@ def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, f
     course = np.convolve(heading + slip, np.ones(2 * width + 1) / (2 * width + 1), mode='same')
     fixes = np.arange(0, count, RATE // FIXES)
     noise, kept = np.zeros(len(fixes)), np.exp(-1.0 / FIXES)
-    sizes = np.where(
-        np.convolve(generator.uniform(size=len(fixes)) < 0.003 * town, np.ones(30), mode='same')
-        > 0.0, 6.0, 0.5) * DEGREE
+    bad = np.convolve(generator.uniform(size=len(fixes)) < 0.003 * town, np.ones(30), mode='same')
+    sizes = np.where(bad > 0.0, 6.0, 0.5) * DEGREE
     for place in range(1, len(fixes)):
         noise[place] = kept * noise[place - 1] + math.sqrt(
             1.0 - kept ** 2) * sizes[place] * generator.standard_normal()
@@ -229,7 +226,6 @@ def held(drives: int) -> Iterator[str]:
 
 
 def main(arguments: list[str]) -> None:
-    """Print the table."""
     by_fit = arguments[:1] in (['drives'], ['simulated'])
     if arguments[:1] == ['simulated']:
         drives = int(arguments[1]) if len(arguments) > 1 else 40

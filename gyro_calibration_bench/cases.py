@@ -94,7 +94,6 @@ class Case:
 
     @property
     def table_row(self) -> str:
-        """Return the row of the table that it belongs to."""
         if self.part == 'references':
             kind, suffix = self.reference, ', with a model' if self.noise == 'floor' else ''
             return f'{kind}, ' + (f'{self.multiple:g} times' if self.names else 'nothing' + suffix)
@@ -108,7 +107,6 @@ class Case:
 
 
 def part_cases(part: str, repetitions: int) -> Iterator[Case]:
-    """Go through the cases of a part."""
     if part == 'nothing':
         yield from (Case(part, (), 0.0, noise, _choose_in_turn(REFERENCES, number), number)
                     for number in range(repetitions) for noise in ALARM_NOISES)

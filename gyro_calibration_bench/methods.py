@@ -77,7 +77,6 @@ def known_model(known: KnownModel) -> Any:
 
 
 def gyro_calibration(logs: Sequence[Path], known: KnownModel | None) -> Answer:
-    """Diagnose."""
     from gyro_calibration import read_log
     from gyro_calibration.diagnosis.pipeline import diagnose
     found = diagnose([read_log(path) for path in logs], np.random.default_rng(0),
@@ -90,22 +89,13 @@ def gyro_calibration(logs: Sequence[Path], known: KnownModel | None) -> Answer:
 
 @dataclass(frozen=True)
 class Problem:
-    """
-    A least squares problem, without the biases of the logs and the scale unless a model has them.
+    """A least squares problem, without biases of the logs and scale unless a model has them."""
 
-    Attributes
-    ----------
-    error : output less reference, shape (n,), rad/s
-    columns : shape (n, m)
-    owners : for each column the effect and the size that its coefficient 1 has, nan if none
-    nuisances : number of values that were taken out
-
-    """
-
-    error: np.ndarray
-    columns: np.ndarray
+    error: np.ndarray  # output less reference, shape (n,), rad/s
+    columns: np.ndarray  # shape (n, m)
+    # for each column the effect and the size that its coefficient 1 has, nan if none
     owners: tuple[tuple[str, float], ...]
-    nuisances: int
+    nuisances: int  # number of values that were taken out
 
 
 def read_session(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
@@ -137,7 +127,6 @@ def read_session(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
 
 
 def block_means(values: np.ndarray, interval: float) -> np.ndarray:
-    """Return means over `BLOCK_DURATION`."""
     size = round(BLOCK_DURATION / interval)
     return values[:len(values) // size * size].reshape(-1, size).mean(axis=1)
 

@@ -32,66 +32,34 @@ WITHOUT_SIZE = {*COUNTED_FAULTS, *STEP_EFFECTS, 'unit_error', 'bias_instability'
 
 @dataclass(frozen=True)
 class NamedCause:
-    """
-    A cause that an answer names.
-
-    Attributes
-    ----------
-    effect : its name
-    ambiguous_with : names of effects that explain the log as well
-    size, interval : of the leading parameter in SI and its 95 % interval, where they are known
-
-    """
+    """A cause that an answer names."""
 
     effect: str
-    ambiguous_with: tuple[str, ...] = ()
-    size: float | None = None
-    interval: tuple[float, float] | None = None
+    ambiguous_with: tuple[str, ...] = ()  # effects that explain the log as well
+    size: float | None = None  # of the leading parameter in SI, where it is known
+    interval: tuple[float, float] | None = None  # of 95 %
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """
-    Scores of an answer.
+    """Scores of an answer."""
 
-    Attributes
-    ----------
-    is_detected : something is reported
-    is_first : the strongest finding has the right name
-    is_in_set : each hidden cause is in the set of a separate finding
-    set_sizes : of the findings that contain a hidden cause
-    false_names : names of the findings that contain none
-    unexplained_variables : variables of structures without a name
-    is_right : each hidden cause is in a set of at most three, and nothing else is reported; a
-        cause outside the catalogue is reported as unexplained, and nothing is named
-    interval_holds : for each cause that is named with a number, whether its 95 % interval includes
-        the truth
-
-    """
-
-    is_detected: bool
-    is_first: bool
-    is_in_set: bool
-    set_sizes: tuple[int, ...]
-    false_names: tuple[str, ...]
-    unexplained_variables: tuple[str, ...]
+    is_detected: bool  # something is reported
+    is_first: bool  # the strongest finding has the right name
+    is_in_set: bool  # each hidden cause is in the set of a separate finding
+    set_sizes: tuple[int, ...]  # of the findings that contain a hidden cause
+    false_names: tuple[str, ...]  # of the findings that contain none
+    unexplained_variables: tuple[str, ...]  # of structures without a name
+    # each hidden cause is in a set of at most three, and nothing else is reported; a cause outside
+    # the catalogue is reported as unexplained, and nothing is named
     is_right: bool
+    # for each cause that is named with a number, whether its 95 % interval includes the truth
     interval_holds: dict[str, bool]
 
 
 def judge_answer(causes: Sequence[Cause], findings: Sequence[NamedCause],
                  unexplained_variables: Sequence[str], allowed: Collection[str] = ()) -> Judgement:
-    """
-    Compare an answer with the truth.
-
-    Parameters
-    ----------
-    causes : that were hidden
-    findings : the named causes
-    unexplained_variables : variables along which there is structure without a name
-    allowed : names of findings that are true though they were not hidden
-
-    """
+    """Compare an answer with the hidden causes; allowed names are true though not hidden."""
     wanted = {EQUIVALENT_CAUSES.get(cause.name, cause.name) for cause in causes}
     findings = [each for each in findings if each.effect not in allowed or each.effect in wanted]
     sets = [_names_in_set(each) for each in findings]
@@ -143,19 +111,11 @@ def interval_holds(causes: Iterable[Cause], findings: Sequence[NamedCause],
 
 @dataclass(frozen=True)
 class ScoredCase:
-    """
-    A case with its answer.
+    """A case with its answer."""
 
-    Attributes
-    ----------
-    row : of the table
-    is_right : as the bench counts it: of look-alikes both have to be in the set of one finding,
-        and with a log that separates them the hidden one alone
-    judgement : the rest
-
-    """
-
-    row: str
+    row: str  # of the table
+    # of look-alikes both have to be in the set of one finding, and with a log that separates them
+    # the hidden one alone
     is_right: bool
     judgement: Judgement
     has_hidden: bool

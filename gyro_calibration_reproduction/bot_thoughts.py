@@ -64,7 +64,6 @@ ASSUMED = ('The log of the encoder turntable is not published; 63 s of turning b
 
 def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
-    """Reproduce the numbers of the blog."""
     found = np.array([encoder_errors(generator) for _ in progress(range(runs))])
     return Reproduction(TITLE, ASSUMED, (*_compare_three_speeds(), *_compare_solver(found)),
                         (_slope_contradiction(), _strobe_contradiction(),
@@ -158,11 +157,9 @@ def encoder_errors(generator: np.random.Generator) -> tuple[float, ...]:
     """
     Return the errors of one run of the encoder turntable.
 
-    Returns
-    -------
-    errors of scale, 1, and offset, rad/s, by the method of the solver, which is least squares of
-    the encoder's gradient on the gyro; the same by likelihood; the error of scale of the reverse
-    regression; the largest error of the heading after the method of the solver, rad
+    They are those of scale, 1, and offset, rad/s, by the method of the solver, which is least
+    squares of the encoder's gradient on the gyro; the same by likelihood; of the scale of the
+    reverse regression; the largest of the heading after the method of the solver, rad.
 
     """
     time, rate, motion = encoder_log(generator)

@@ -21,32 +21,20 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Comparison:
-    """
-    A published number and the one computed here, both in the unit of the source.
-
-    Attributes
-    ----------
-    quantity, unit : of both numbers
-    ours : the computed number
-    published : as printed, since its last digit shows its accuracy; ``< 2`` is a bound, ``~ 10``
-        an order of magnitude, '' means that the source has no such number
-    place : in the source
-    uncertainty : of the computed number, from the finite number of runs
-    why : reason of a difference, in a few words, printed where there is one
-    note : in a few words, printed in any case
-    own_figures : whether the computed number follows from other figures of the source alone, so
-        that a difference is a contradiction within it
-
-    """
+    """A published number and the one computed here, both in the unit of the source."""
 
     quantity: str
     unit: str
-    ours: float
+    ours: float  # the computed number
+    # as printed, since its last digit shows its accuracy; ``< 2`` is a bound, ``~ 10`` an order of
+    # magnitude, '' means that the source has no such number
     published: str = ''
-    place: str = ''
-    uncertainty: float = 0.0
-    why: str = ''
-    note: str = ''
+    place: str = ''  # in the source
+    uncertainty: float = 0.0  # of the computed number, from the finite number of runs
+    why: str = ''  # reason of a difference, in a few words, printed where there is one
+    note: str = ''  # in a few words, printed in any case
+    # whether the computed number follows from other figures of the source alone, so that a
+    # difference is a contradiction within it
     own_figures: bool = False
 
     @property
@@ -75,7 +63,6 @@ class Comparison:
         return 'contradicts itself' if self.own_figures else 'differs'
 
     def data(self) -> dict[str, Any]:
-        """Return all fields and the verdict, by name."""
         return {**asdict(self), 'verdict': self.verdict}
 
     def cells(self) -> tuple[str, ...]:
@@ -109,48 +96,29 @@ def from_own_figures(quantity: str, unit: str, ours: float, published: str, plac
 
 @dataclass(frozen=True)
 class Contradiction:
-    """
-    A contradiction in a source, shown by computed numbers.
+    """A contradiction in a source, shown by computed numbers."""
 
-    Attributes
-    ----------
-    numbers : by name, in the units of the sentence
-    pattern : the sentence, with the numbers' names in braces
-
-    """
-
-    numbers: Mapping[str, float]
-    pattern: str
+    numbers: Mapping[str, float]  # by name, in the units of the sentence
+    pattern: str  # the sentence, with the numbers' names in braces
 
     @property
     def sentence(self) -> str:
-        """Return the sentence with its numbers."""
         return self.pattern.format(**self.numbers)
 
     def data(self) -> dict[str, Any]:
-        """Return sentence and numbers."""
         return {'sentence': self.sentence, 'numbers': dict(self.numbers)}
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """
-    The reproduction of a source.
+    """The reproduction of a source."""
 
-    Attributes
-    ----------
-    title : authors, title and year
-    assumed : what the source does not state and was chosen here, one sentence each
-
-    """
-
-    title: str
-    assumed: tuple[str, ...]
+    title: str  # authors, title and year
+    assumed: tuple[str, ...]  # what the source does not state and was chosen here, as sentences
     comparisons: tuple[Comparison, ...]
     contradictions: tuple[Contradiction, ...]
 
     def data(self) -> dict[str, Any]:
-        """Return everything by name."""
         return {'title': self.title, 'assumed': list(self.assumed),
                 'comparisons': [each.data() for each in self.comparisons],
                 'contradictions': [each.data() for each in self.contradictions]}

@@ -63,7 +63,6 @@ ASSUMED = (
 
 def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
-    """Reproduce the numbers of the paper."""
     errors = np.array([drive_errors(generator) for _ in progress(range(runs))])
     return Reproduction(TITLE, ASSUMED, (*_compare_self_calibration(), *_compare_own_figures(),
                                          *_compare_table_1(errors)),
@@ -75,12 +74,7 @@ def reproduce(generator: np.random.Generator, runs: int = 200,
 # figures 6 and 7
 
 def one_turn(speed: float, duration: float) -> Motion:
-    """
-    Return a rest of 2 s and then a turn at `speed`, rad/s, with ramps of 0.25 s.
-
-    The second ramp begins `duration` s after the first one.
-
-    """
+    """Return a rest of 2 s and a turn, rad/s, with ramps of 0.25 s that begin `duration` apart."""
     return motion_from_rates(np.array([0.0, 2.0, 2.25, 2.0 + duration, 2.25 + duration]),
                              np.array([0.0, 0.0, speed, speed, 0.0]))
 
@@ -111,7 +105,6 @@ def errors_by_trapezoids(motion: Motion) -> tuple[float, float]:
 
 
 def _solve_equation_7(integral: Array, time: Array, heading: Array) -> Array:
-    """Return s̄ and b̄ by eq. 7."""
     return np.linalg.lstsq(np.column_stack([integral, time]), heading, rcond=None)[0]
 
 

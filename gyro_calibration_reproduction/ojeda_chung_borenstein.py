@@ -88,7 +88,6 @@ def rd2100(sine_constant: float = SINE_CONSTANT) -> GyroModel:
 
 def reproduce(generator: np.random.Generator, runs: int = 200,
               progress: Progress = iter) -> Reproduction:
-    """Reproduce the numbers of the paper."""
     found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
     return Reproduction(TITLE, ASSUMED, (*_compare_own_figures(), *_compare_instrument(),
                                          *_compare_results(found)),
@@ -130,10 +129,8 @@ def calibrate_and_turn(generator: np.random.Generator) -> Array:
     """
     Calibrate by each of `CAMPAIGNS`, then turn by 360 deg at all rates and temperatures.
 
-    Returns
-    -------
-    rms error of the rate, rad/s, and largest error of a turn, rad, without a model and with each,
-    shape (1 + campaigns, 2)
+    Return the rms error of the rate, rad/s, and the largest error of a turn, rad, without a model
+    and with each, shape (1 + campaigns, 2).
 
     """
     gyro = rd2100()
@@ -153,12 +150,7 @@ def calibrate_and_turn(generator: np.random.Generator) -> Array:
 def simulate_turn_errors(gyro: GyroModel, models: Sequence[GyroModel], rates: Array,
                          temperatures: Array,
                          generator: np.random.Generator) -> tuple[Array, Array]:
-    """
-    Return the errors of full turns, each after a rest, rad, and the durations of the turns, s.
-
-    Their shapes are (models, n) and (n,).
-
-    """
+    """Return errors of full turns after rests, rad, (models, n), and their durations, s, (n,)."""
     turning = np.round(2.0 * math.pi / np.abs(rates) * OUTPUT_RATE).astype(int)
     # of rest and turn in turn
     lengths = np.column_stack([np.full(len(rates), SAMPLES_PER_SET), turning]).ravel()
@@ -254,11 +246,8 @@ def regressor_error(deviation: float, averaged: int, generator: np.random.Genera
     """
     Return the error of eq. 3 at 100 deg/s if it is fitted over noisy outputs, rad/s.
 
-    Parameters
-    ----------
-    deviation : of the white noise of a sample, rad/s
-    averaged : samples of a data set
-    samples : at each rate
+    The deviation is that of a sample, rad/s; `averaged` samples are a data set, `samples` are
+    taken at each rate.
 
     """
     rates = np.repeat(full_range_rates(21), samples // averaged)
@@ -285,12 +274,7 @@ def _regressor(generator: np.random.Generator) -> Contradiction:
 
 def extrapolation_errors(sine_constant: float,
                          generator: np.random.Generator) -> tuple[float, float]:
-    """
-    Return the rms errors of the rate from 70 to 100 deg/s, by polynomial and by sine, rad/s.
-
-    The calibration is up to 60 deg/s.
-
-    """
+    """Return the rms errors, rad/s, at 70 to 100 deg/s of polynomial and sine from up to 60."""
     gyro, temperatures = rd2100(sine_constant), np.linspace(MIN_TEMPERATURE, MAX_TEMPERATURE, 11)
     table = simulate_rate_table(gyro,
                                 np.arange(-60.0, 61.0, 10.0) * DEGREE, temperatures, generator)

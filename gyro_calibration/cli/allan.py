@@ -60,8 +60,7 @@ def run(given: argparse.Namespace) -> Answer:
     model, log = read_model(given.model) if given.model else GyroModel(), verb.read(given)
     try:
         time = verb.require_time(given, log)
-        record = build_rest_record(time, np.asarray(log.output), log.moving,
-                                   log.reference_heading)
+        record = build_rest_record(time, np.asarray(log.output), log.moving, log.reference_heading)
         with show_progress('noise figures from the Allan deviation'):
             chart = allan_deviation(record.rate, record.interval)
             fit = fit_noise(record.rate, record.interval)

@@ -18,8 +18,9 @@ example: gyro_calibration compensate drive.csv --model model.yaml --out compensa
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 import math
 from typing import Any
@@ -89,29 +90,23 @@ _MISSING_INPUTS = {
 class _Totals:
     """Counts over the blocks so far; heading and deviation of the last sample, rad."""
 
-    rows: int = 0
-    rows_without_output: int = 0
-    refused_samples: int = 0
-    temperature_clipped: int = 0
-    beyond_range: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    longest_gap: float = 0.0
     unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
     errors: list[tuple[float, int, float]] = field(default_factory=list)
     first_error: float = math.nan
-    lost_samples: int = 0
-    longest_gap_s: float = 0.0
 
     def add(self, piece: CompensatedBlock) -> None:
         log, columns = piece.log, piece.columns
-        self.lost_samples = piece.intervals.lost_samples
-        self.longest_gap_s = piece.intervals.longest_gap
-        self.rows += len(log)
+        self.longest_gap = piece.intervals.longest_gap
+        self.counts['lost_samples'] = piece.intervals.lost_samples
         without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
-        self.rows_without_output += without
-        self.refused_samples += len(log) - len(columns['rate_rad_s']) - without
-        self.temperature_clipped += int(columns['temperature_clipped'].sum())
-        self.beyond_range += int(columns['beyond_range'].sum())
+        self.counts.update(
+            rows=len(log), rows_without_output=without,
+            refused_samples=len(log) - len(columns['rate_rad_s']) - without,
+            **{name: int(columns[name].sum()) for name in ('temperature_clipped', 'beyond_range')})
         self.unknown = tuple(
             quantity for quantity in _MISSING_INPUTS if getattr(log, quantity) is None)
         if len(columns.get('heading_rad', ())):
@@ -158,9 +153,10 @@ def _compensate_and_count(given: argparse.Namespace, model: GyroModel,
     for piece in check_finite(blocks, given.log):
         found.add(piece)
         yield piece.log, piece.full_columns()
-    if found.rows == found.rows_without_output:
+    counts = found.counts
+    if counts['rows'] == counts['rows_without_output']:
         raise DataRefused(f'{given.log}: no gyro output is finite; record again')
-    if found.rows == found.rows_without_output + found.refused_samples:
+    if counts['rows'] == counts['rows_without_output'] + counts['refused_samples']:
         raise DataRefused(f'{given.log}: {no_plausible_row_message(model)}')
 
 
@@ -266,17 +262,15 @@ def _make_estimator(model: GyroModel, log: Log,
 
 
 def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answer:
-    data: dict[str, Any] = {'out': given.out, **asdict(found),
+    data: dict[str, Any] = {'out': given.out, **found.counts, 'longest_gap_s': found.longest_gap,
                             'temperature_known': 'temperature' not in found.unknown}
-    heading, deviation, *_ = (
-        data.pop(name) for name in ('heading', 'deviation', 'unknown', 'errors', 'first_error'))
-    lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
-    if heading is not None:
+    lines = [f'{data["rows"]} rows compensated by {given.model}, written to {given.out}.']
+    if found.heading is not None:
         # The deviation is zero where the model has neither noise nor covariance.
-        known_deviation = deviation if deviation > 0.0 else None
-        data.update(heading_rad=heading, heading_std_rad=known_deviation)
-        known = '' if known_deviation is None else f' +- {known_deviation / DEGREE:.2f}'
-        lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
+        deviation = found.deviation if found.deviation > 0.0 else None
+        data.update(heading_rad=found.heading, heading_std_rad=deviation)
+        known = '' if deviation is None else f' +- {deviation / DEGREE:.2f}'
+        lines.append(f'Heading at the end: {found.heading / DEGREE:.2f}{known} deg.')
     if found.errors:
         sums, counts, last = zip(*found.errors)
         mean = sum(sums) / sum(counts)

@@ -55,10 +55,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=['dwells', 'likelihood', 'course', 'rate'],
-                        help='dwells: means at constant rates; likelihood: maximum likelihood '
-                        'from the reference heading; course: a course over ground, as from '
-                        'satellite navigation; rate: the rate of the reference heading, '
-                        'sample by sample. Default: by the columns of the log')
+                        help='dwells: means at constant rates; likelihood: by the reference '
+                        'heading; course: by a course over ground; rate: by the rate of the '
+                        'reference heading. Default: by the columns of the log')
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         '--effects', type=_parse_effects, metavar='NAME,...', help='effects to fit, of '
@@ -66,10 +65,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     what.add_argument('--polynomial', type=_parse_orders, nargs='?', const='3,2', metavar='P,Q',
                       help='fit the polynomial over output and temperature of these orders '
                       'instead; default: 3,2')
-    parser.add_argument(
-        '--technology', choices=list(TECHNOLOGY_EFFECTS), help='technology of the gyro; '
-        'selects between effects that the data do not distinguish, and the prior '
-        'with a reference heading (default there: mems)')
+    parser.add_argument('--technology', choices=list(TECHNOLOGY_EFFECTS), help='of the gyro; '
+                        'selects between effects that the data do not distinguish, and the prior '
+                        'with a reference heading (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
                         help='name of the gyro, stored in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')

@@ -73,14 +73,13 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--pattern', type=_parse_pattern, metavar='TEXT', help='pattern of the file '
         "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
-    parser.add_argument('--type', metavar='NAME', dest='gyro_type', help='type of the gyro in '
-                        'logs without a type')
+    parser.add_argument('--type', metavar='NAME', dest='gyro_type',
+                        help='type of the gyro in logs without a type')
     parser.add_argument('--rate', type=verb.positive_number, metavar='HZ',
                         help='sample rate, for logs without a usable time_s')
     parser.add_argument('--technology', choices=list(TECHNOLOGY_PRIORS), default='mems',
                         help='technology of the gyros; default: mems')
-    parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only, which is '
-                        'faster')
+    parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only; faster')
     parser.add_argument('--seed', type=verb.non_negative_integer, default=0, metavar='N',
                         help='seed of the random draws of a diagnosis; default: 0')
     parser.add_argument('--workers', type=verb.positive_integer, metavar='N',
@@ -217,8 +216,8 @@ def _exclude_invalid(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         elif (_rest_noise(each)
                 and is_degree_ratio(ratio := _rest_noise(each) / median_noise[each['type']])):
             exclusion = (f'its white noise is {ratio:.3g} times the median of its type, as by '
-                         'deg/s in '
-                         'place of rad/s; correct the unit of its column, or state its type')
+                         'deg/s in place of rad/s; correct the unit of its column, or state its '
+                         'type')
         found.append({**each, 'status': NO_EVIDENCE, 'reason': exclusion} if exclusion else each)
     return found
 

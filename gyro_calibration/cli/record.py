@@ -89,8 +89,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     port.add_argument('--invert', action='store_true', default=None,
                       help='the gyro reports clockwise turns as positive')
     port.add_argument('--increments', choices=list(_INCREMENT_OPTIONS), default='default',
-                      help='whether the gyro sends angles, not rates; '
-                      'default: that of the protocol')
+                      help='the gyro sends angles, not rates; default: that of the protocol')
     port.add_argument('--sample-rate', type=verb.positive_number, metavar='HZ',
                       help='sample rate of the gyro; default: that of the protocol')
 
@@ -281,8 +280,8 @@ class CsvRecorder(_Recorder):
                 text.write(f'# {name}: {" ".join(note.split())}\n')
             writer.writerow(['time_s', *self._columns])
         for stamp, values in self._rows:
-            writer.writerow([repr((stamp - self._start_stamp) / NSEC_PER_SEC),
-                             *(repr(values[name]) for name in self._columns)])
+            writer.writerow([(stamp - self._start_stamp) / NSEC_PER_SEC,
+                             *(values[name] for name in self._columns)])
         data = text.getvalue().encode()
         self.append(gzip.compress(data, mtime=0) if self.path.endswith('.gz') else data)
         self._rows.clear()
@@ -488,8 +487,7 @@ class _TopicSession:
         stdout_copy = os.dup(1)
         os.dup2(2, 1)
         try:
-            self._take_messages(self._topics, self._given.all, self._add_message, tick,
-                                self._stop)
+            self._take_messages(self._topics, self._given.all, self._add_message, tick, self._stop)
         finally:
             os.dup2(stdout_copy, 1)
             os.close(stdout_copy)

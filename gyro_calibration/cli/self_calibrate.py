@@ -64,10 +64,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     verb.add_log_options(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
                         'rate_dps; default: the reference of the log')
-    parser.add_argument(
-        '--turns', type=_parse_turns, metavar='N', help='number of full turns from a '
-        'mark to the same mark with standstill at both ends, counter-clockwise '
-        f'positive; {_NEAREST}: the number nearest to the gyro')
+    parser.add_argument('--turns', type=_parse_turns, metavar='N', help='number of full turns '
+                        'from a mark to the same mark with standstill at both ends, '
+                        f'counter-clockwise positive; {_NEAREST}: the number nearest to the gyro')
     parser.add_argument('--marking', type=verb.non_negative_number, metavar='DEG',
                         help='standard deviation of the angle between both standstills on the '
                         f'mark, deg; default: {MARK_DEVIATION / DEGREE:g}')
@@ -142,24 +141,14 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
 
 @dataclass(frozen=True)
 class CalibratedRun:
-    """
-    A run on a known motion, fitted and checked by the rest after it.
+    """A run on a known motion, fitted and checked by the rest after it."""
 
-    Attributes
-    ----------
-    fit, rest_check : with the rest, and None where there is none
-    is_used : which rows of the log
-    time, rate : of these rows, on the clock of the motion, s and rad/s
-    motion : that was driven
-
-    """
-
-    fit: ScaleBiasFit
+    fit: ScaleBiasFit  # with the rest, where there is one
     rest_check: RestCheck | None
-    is_used: Mask
-    time: Array
-    rate: Array
-    motion: Motion
+    is_used: Mask  # which rows of the log
+    time: Array  # of these rows, on the clock of the motion, s
+    rate: Array  # of these rows, rad/s
+    motion: Motion  # that was driven
 
     def draw(self, path: str | Path | None) -> Any:
         """Draw the run with its errors before and after, and return the figure."""

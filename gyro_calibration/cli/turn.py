@@ -59,10 +59,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model to evaluate; default: the effects that the data support, '
                         'fitted for each sweep to the other sweeps')
-    parser.add_argument(
-        '--technology', choices=list(TECHNOLOGY_EFFECTS), help='technology of the gyro; '
-        'without --model, selects between effects that the data do not '
-        'distinguish')
+    parser.add_argument('--technology', choices=list(TECHNOLOGY_EFFECTS), help='of the gyro; '
+                        'without --model, selects between effects that the data do not '
+                        'distinguish')
     parser.add_argument('--slowest', type=verb.positive_number, default=MIN_TURN_RATE / DEGREE,
                         metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')

@@ -127,24 +127,10 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
              columns: Mapping[str, str] = {}, axis: str = 'z',
              on_progress: Callable[[int], object] | None = None) -> Log:
     """
-    Read a log file (.csv or .csv.gz).
+    Read a log file (.csv or .csv.gz), with the parameters of `api.read_log`.
 
     Values are separated by commas, or by semicolons or tabs; then the decimal mark may be a comma.
-
-    Parameters
-    ----------
-    path : the file
-    sensitivity : rad/s per count; used where the file has raw counts only
-    rate : sample rate, Hz, which replaces the time in the file
-    columns : names of columns outside of the log format: time, gyro, counts, temperature, rate,
-        heading, acceleration, supply or moving -> name, or name:unit; or attitude -> the four
-        names of a quaternion, w/x/y/z, whose rotation about the axis is the reference heading
-    axis : x, y or z, for columns such as gyro_x_dps, and for an attitude
-    on_progress : takes the number of bytes read
-
-    Raises
-    ------
-    LogError : the file cannot be read, or is not a log; names file, row and column
+    `on_progress` takes the number of bytes read. A `LogError` names file, row and column.
 
     """
     blocks, numbers = [], 0
@@ -413,16 +399,9 @@ def _refuse_unordered_time(path: str | Path, line_numbers: Sequence[int], time: 
 
 def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z') -> Log:
     """
-    Return a log from a pandas DataFrame, or from a mapping of names to arrays.
+    Return a log from a pandas DataFrame, or from a mapping of names to arrays of shape (n,).
 
-    Parameters
-    ----------
-    table : its names, when iterated, and under each name an array of shape (n,)
-    columns, axis : as for `read_log`
-
-    Raises
-    ------
-    LogError : no output, different lengths, values that are no numbers, or unordered time
+    Raise `LogError` for no output, different lengths, values that are no numbers, unordered time.
 
     """
     header = [str(name) for name in table]
@@ -504,12 +483,8 @@ def unwrap_heading(reference_time: Array, wrapped: Array, time: Array,
     Where the reference was lost or is slow, it may turn by more than half a turn from one value to
     the next. The integral of the gyro then gives the number of turns. Its sign and bias against
     the reference are estimated from the values that lie close together. A heading in deg instead
-    of rad is left as it is, as its unit is to be corrected first.
-
-    Parameters
-    ----------
-    reference_time, wrapped : times, s, and heading, rad, of shape (m,); nan where it was lost
-    time, output : of the gyro, s and rad/s, shape (n,)
+    of rad is left as it is, as its unit is to be corrected first. The reference, s and rad, has
+    shape (m,), nan where it was lost; time and output of the gyro, s and rad/s, shape (n,).
 
     """
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)

@@ -75,10 +75,6 @@ class Message:
     data: bytes
 
 
-#: Messages or None, each with the number of bytes read where progress is to be shown, else 0.
-_Messages = Iterator[tuple[Message | None, int]]
-
-
 @dataclass
 class Contents:
     """Contents of a recording as far as it was read."""
@@ -151,15 +147,15 @@ def read_messages(path: str | Path, contents: Contents,
 
     """
     done = 0
+
+    def on_place(place: int) -> None:
+        on_progress(done + place)
+
     for file in list_recording_files(path):
         read = _read_mcap if _recording_suffix(file) == '.mcap' else _read_database
         try:
             with _open_uncompressed(file) as source:
-                for message, place in read(source, file, contents):
-                    if place:
-                        on_progress(done + place)
-                    if message:
-                        yield message
+                yield from read(source, file, contents, on_place)
             done += file.stat().st_size
         except OSError as error:
             raise LogError(f'{file}: cannot be read ({describe_error(error)}); '
@@ -256,20 +252,18 @@ MCAP_END = (struct.pack('<BQ4x', _RecordCode.DATA_END, 4)
             + struct.pack('<BQ20x', _RecordCode.FOOTER, 20) + _MAGIC)
 
 
-def _read_mcap(source: Path, path: Path, contents: Contents) -> _Messages:
+def _read_mcap(source: Path, path: Path, contents: Contents,
+               on_progress: OnProgress) -> Iterator[Message]:
     with open(source, 'rb') as file:
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
             raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
-        reader, reported = _McapReader(contents, _ExpansionBudget(path)), 0
+        reader = _McapReader(contents, _ExpansionBudget(path))
         for code, body in _iter_records(file, end, contents):
             if code == _RecordCode.DATA_END:
                 return
-            for message in reader.read(code, body, torn=file.tell() == end):
-                yield message, 0
-            if file.tell() - reported > _READ_BYTES:
-                reported = file.tell()
-                yield None, reported
+            yield from reader.read(code, body, torn=file.tell() == end)
+            on_progress(file.tell())
         contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, '
                               'and was read up to there')
 
@@ -314,8 +308,7 @@ class _McapReader:
             elif code == _RecordCode.MESSAGE:
                 number, _, received, _ = struct.unpack_from('<HIQQ', body)
                 if channel := self._channels.get(number):
-                    yield Message(*channel, received,
-                                  _decompress_message(body[22:], self._budget))
+                    yield Message(*channel, received, _decompress_message(body[22:], self._budget))
             elif code == _RecordCode.SCHEMA:
                 kind, place = _read_text(body, 2)
                 definition, _ = _read_text(body, _read_text(body, place)[1])
@@ -496,7 +489,8 @@ _MESSAGES_QUERY = """
 _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
-def _read_database(source: Path, path: Path, contents: Contents) -> _Messages:
+def _read_database(source: Path, path: Path, contents: Contents,
+                   on_progress: OnProgress) -> Iterator[Message]:
     with _open_database(source, path) as (database, tables):
         channels, budget = _read_topics(database, tables, path, contents), _ExpansionBudget(path)
         size, last, count = path.stat().st_size, sys.maxsize, 0
@@ -505,13 +499,13 @@ def _read_database(source: Path, path: Path, contents: Contents) -> _Messages:
         try:
             for row, topic, received, data in database.execute(_MESSAGES_QUERY):
                 count += 1
-                message = None
+                if count % 4096 == 0:
+                    on_progress(int(size * row / last))
                 if channel := channels.get(topic):
                     if isinstance(received, int) and isinstance(data, bytes):
-                        message = Message(*channel, received, _decompress_message(data, budget))
+                        yield Message(*channel, received, _decompress_message(data, budget))
                     else:
                         contents.skipped_parts += 1
-                yield message, int(size * row / last) if count % 4096 == 0 else 0
         except _DATABASE_ERRORS as error:
             contents.notes.append(f'{path.name} is damaged after {count} messages '
                                   f'({_describe_database_error(error)}), and was read up to there')

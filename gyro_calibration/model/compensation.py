@@ -168,8 +168,7 @@ def uncertainty_covariance(model: GyroModel) -> np.ndarray:
 
     """
     blocks = [] if model.covariance is None else [model.covariance]
-    blocks += [np.diag([getattr(model.tolerance, name) ** 2])
-               for name in model.active_tolerances]
+    blocks += [np.diag([getattr(model.tolerance, name) ** 2]) for name in model.active_tolerances]
     if model.self_calibration is not None:
         known = model.self_calibration.covariance
         blocks.append(np.full((2, 2), np.nan) if known is None else np.array(known))

@@ -518,10 +518,8 @@ def add_effects(effects: Iterable[Effect]) -> None:
     """
     Add effects of the user to the catalogue, for models and for the diagnosis of logs.
 
-    Raises
-    ------
-    ValueError : an item is no `Effect`, its name is taken, a nonlinear parameter that is to be
-        fitted has no initial values, or the columns do not match the coefficients
+    Raise `ValueError` for an item that is no `Effect`, a name that is taken, a nonlinear parameter
+    to be fitted without initial values, or columns that do not match the coefficients.
 
     """
     rate = np.linspace(-1.0, 1.0, 5)

@@ -240,8 +240,7 @@ def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
 
 def format_model(model: GyroModel) -> str:
     """Return the text of a model file."""
-    content: dict[str, Any] = {'format': FORMAT, 'version': VERSION}
-    content['effects'] = effects = dict[str, Any]()
+    effects: dict[str, Any] = {}
     for term in model.terms:
         named: dict[str, Any] = {parameter.name: value
                                  for parameter, value in zip(term.effect.parameters, term.values)}
@@ -250,24 +249,19 @@ def format_model(model: GyroModel) -> str:
                 int, term.effect.coefficients[-1].name[1:].split('w'))
             named = {'orders': [rate_order, temperature_order], **named}
         effects[term.effect.name] = named
-    if model.covariance is not None:
-        content['covariance'] = model.covariance.tolist()
     ranges = {'rate': model.rate_range, 'temperature': model.temperature_range}
-    content['valid'] = {name: list(values)
-                        for name, values in ranges.items() if all(map(math.isfinite, values))}
-    content['reference_temperature'] = model.reference_temperature
-    content['noise'] = dict(vars(model.noise))
-    if model.noise_bounds:
-        content['noise_bounds'] = {name: list(ends) for name, ends in model.noise_bounds.items()}
-    content['gyro'] = dict(model.gyro)
-    content['origin'] = dict(model.origin)
-    if model.self_calibration is not None:
-        content['self_calibration'] = run = dict(vars(model.self_calibration))
-        covariance = run.pop('covariance')
-        if covariance is not None:
-            run['covariance'] = [list(row) for row in covariance]
-            run['standard_deviations'] = dict(
-                zip(('scale_factor_error', 'bias'), model.self_calibration.standard_deviations))
-    if model.tolerance != Tolerance():
-        content['tolerance'] = dict(vars(model.tolerance))
-    return format_settings(content)
+    run = model.self_calibration and dict(vars(model.self_calibration))
+    if run and model.self_calibration and (covariance := run.pop('covariance')):
+        run['covariance'] = [list(row) for row in covariance]
+        run['standard_deviations'] = dict(
+            zip(('scale_factor_error', 'bias'), model.self_calibration.standard_deviations))
+    content = {
+        'format': FORMAT, 'version': VERSION, 'effects': effects,
+        'covariance': None if model.covariance is None else model.covariance.tolist(),
+        'valid': {name: list(values)
+                  for name, values in ranges.items() if all(map(math.isfinite, values))},
+        'reference_temperature': model.reference_temperature, 'noise': dict(vars(model.noise)),
+        'noise_bounds': {name: list(ends) for name, ends in model.noise_bounds.items()} or None,
+        'gyro': dict(model.gyro), 'origin': dict(model.origin), 'self_calibration': run,
+        'tolerance': None if model.tolerance == Tolerance() else dict(vars(model.tolerance))}
+    return format_settings({name: value for name, value in content.items() if value is not None})

@@ -120,8 +120,7 @@ def constant_rate_motion(segments: list[tuple[float, float]], ramp: float = 0.5)
     return motion_from_rates(np.array(time), np.array(rate))
 
 
-def _turns_and_rests(first_rest: float,
-                     turns: Iterable[tuple[float, float, float]]) -> Motion:
+def _turns_and_rests(first_rest: float, turns: Iterable[tuple[float, float, float]]) -> Motion:
     """Return the motion of turns of (duration, s, rate, deg/s, duration of the rest after, s)."""
     return constant_rate_motion([(first_rest, 0.0), *(
         stretch for duration, rate, rest in turns for stretch in ((duration, rate), (rest, 0.0)))])
@@ -205,15 +204,10 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
              generator: np.random.Generator | None = None,
              temperature: Number | None = None) -> Log:
     """
-    Return the log of a simulated gyro.
+    Return the log of a simulated gyro, as `api.simulate`, with the true motion as reference.
 
-    Parameters
-    ----------
-    model : effects and noise of the gyro
-    motion : its true motion, kept in the log as the reference
-    sample_rate : Hz
-    generator : source of the noise; without one there is none
-    temperature : degC, of all samples or of each, shape (n,); default: the reference temperature
+    Without a generator there is no noise; without a temperature, degC, of all samples or of each,
+    it is the reference temperature.
 
     """
     time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate

@@ -37,29 +37,16 @@ from scipy.signal import lfilter
 
 @dataclass(frozen=True)
 class LookAlikes:
-    """
-    Two causes that have the same column under some conditions.
-
-    Attributes
-    ----------
-    confounding_conditions : arguments of `session` under which they are confounded
-    separating_conditions : arguments of `session` under which they are distinguishable; None if no
-        recording with this reference is
-    fixed_parts : recordings -> shapes and signs of effects, if only these are confounded
-    multiple : of the minimum detectable effect
-    figures : noise of the gyro; None for any
-    duration_factor : ratio of the durations of the separating and the first recording
-    needs_model : they show only if a model has bias and scale factor error
-
-    """
+    """Two causes that have the same column under some conditions, arguments of `session`."""
 
     confounding_conditions: Mapping[str, Any]
-    separating_conditions: Mapping[str, Any] | None
+    separating_conditions: Mapping[str, Any] | None  # None if none are with this reference
+    # recordings -> shapes and signs of effects, if only these are confounded
     fixed_parts: FixedParts | None = None
-    multiple: float = 4.0
-    figures: NoiseFigures | None = None
-    duration_factor: float = 1.0
-    needs_model: bool = False
+    multiple: float = 4.0  # of the minimum detectable effect
+    figures: NoiseFigures | None = None  # noise of the gyro; None for any
+    duration_factor: float = 1.0  # of the separating recording to the first one
+    needs_model: bool = False  # they show only if a model has bias and scale factor error
 
 
 def _shape(effect: str, **parts: float) -> FixedParts:
@@ -112,19 +99,7 @@ LOOK_ALIKES: Mapping[tuple[str, str], LookAlikes] = {
 def hide_look_alike(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *,
                     multiple: float | None = None, noise: str = 'white',
                     duration: float = 900.0, sample_rate: float = 50.0) -> HiddenLog:
-    """
-    Hide one of a pair where it cannot be distinguished from the other.
-
-    Parameters
-    ----------
-    pair : a key of `LOOK_ALIKES`
-    hidden : one of the pair
-    generator : source of all that is random
-    multiple : of the minimum detectable effect; that of the pair where it is None
-    noise : as for `hide`, where the pair says nothing of it
-    duration, sample_rate : s and Hz
-
-    """
+    """Hide one of a pair of `LOOK_ALIKES` where it cannot be distinguished, as `hide` does."""
     twins = LOOK_ALIKES[pair]
     return hide([hidden], multiple or twins.multiple, generator, noise=noise, duration=duration,
                 sample_rate=sample_rate, figures=twins.figures,
@@ -134,14 +109,7 @@ def hide_look_alike(pair: tuple[str, str], hidden: str, generator: np.random.Gen
 
 def record_separating(pair: tuple[str, str], log: HiddenLog,
                       generator: np.random.Generator) -> HiddenLog:
-    """
-    Record the gyro again, under conditions that distinguish the pair; single events do not recur.
-
-    Raises
-    ------
-    ValueError : no recording with this reference distinguishes them
-
-    """
+    """Record the gyro again, where the pair is distinguishable; single events do not recur."""
     twins, first = LOOK_ALIKES[pair], log.session
     if twins.separating_conditions is None:
         raise ValueError(f'{pair[0]} and {pair[1]} are distinguished by another reference alone')
@@ -200,8 +168,7 @@ def hide_with_reference(names: Sequence[str], multiple: float, generator: np.ran
         columns['reference_heading_rad'] = np.floor(heading / size) * size
     else:
         factor = math.exp(-1.0 / (SIDE_SLIP_TIME * sample_rate))
-        slip = SIDE_SLIP * lfilter(
-            [1.0], [1.0, -factor], math.sqrt(1.0 - factor ** 2) * white)
+        slip = SIDE_SLIP * lfilter([1.0], [1.0, -factor], math.sqrt(1.0 - factor ** 2) * white)
         slip *= 1.0 + SIDE_SLIP_GROWTH * np.abs(rate)
         delay = generator.uniform(-0.2, 0.7)
         fixes = np.arange(time[0], time[-1], 1.0 / reference.size)

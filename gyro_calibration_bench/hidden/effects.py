@@ -47,31 +47,26 @@ WITHOUT_COLUMN = {*MODEL_FINDINGS, *COUNTED_FAULTS, *STEP_EFFECTS, 'unit_error'}
 
 @dataclass(frozen=True)
 class EffectForm:
-    """
-    How an effect is drawn and what it adds.
+    """How an effect is drawn and what it adds."""
 
-    Attributes
-    ----------
-    error : (session, resulting rate w, size, shapes) -> its addition to output less reference,
-        rad/s
-    unit : of the leading parameter, which is named like the effect
-    shapes : (sessions, generator) -> the other parameters
-    stage : where it acts
-    is_linear : the error is in proportion to the size
-    is_signed : the size may be negative
-    max_size : (sessions) -> the largest reasonable size
-    is_single_event : it is in one of several recordings only; `shapes` has its number as 'run'
-
-    """
-
-    error: Callable[[Session, np.ndarray, float, Shapes], np.ndarray]
-    unit: str
+    # (session, resulting rate w, shapes) -> its addition to output less reference, rad/s, for a
+    # size of 1; of an effect that is not linear (session, w, size, shapes) -> the same
+    formula: Callable[..., np.ndarray]
+    unit: str  # of the leading parameter, which is named like the effect
+    # (sessions, generator) -> the other parameters
     shapes: Callable[[list[Session], np.random.Generator], Shapes] = lambda sessions, generator: {}
-    stage: str = 'sum'
-    is_linear: bool = True
-    is_signed: bool = True
+    stage: str = 'sum'  # where it acts
+    is_linear: bool = True  # the error is in proportion to the size
+    is_signed: bool = True  # the size may be negative
+    # (sessions) -> the largest reasonable size
     max_size: Callable[[list[Session]], float] = lambda sessions: math.inf
+    # it is in one of several recordings only; `shapes` has its number as 'run'
     is_single_event: bool = False
+
+    def error(self, session: Session, w: np.ndarray, size: float, shapes: Shapes) -> np.ndarray:
+        """Return the addition to output less reference, rad/s."""
+        return (size * self.formula(session, w, shapes) if self.is_linear
+                else self.formula(session, w, size, shapes))
 
 
 def top_rate(sessions: list[Session]) -> float:
@@ -81,11 +76,6 @@ def top_rate(sessions: list[Session]) -> float:
 
 def _log_uniform(generator: np.random.Generator, low: float, high: float) -> float:
     return math.exp(generator.uniform(math.log(low), math.log(high)))
-
-
-def _linear_error(formula: Callable[[Session, np.ndarray, Shapes], np.ndarray]) -> Callable[[
-        Session, np.ndarray, float, Shapes], np.ndarray]:
-    return lambda session, w, size, shapes: size * formula(session, w, shapes)
 
 
 def _draw_phase(sessions: list[Session], generator: np.random.Generator) -> Shapes:
@@ -126,19 +116,6 @@ def thermal_branch(session: Session, threshold: float = 5e-4) -> np.ndarray:
 def vibration_power(session: Session) -> np.ndarray:
     """Return the mean square of the vibration over a second, (m/s²)²."""
     return uniform_filter1d(session.vibration ** 2, round(1.0 / session.interval))
-
-
-def _sine_error(session: Session, w: np.ndarray, k: float, shapes: Shapes) -> np.ndarray:
-    return np.sin(k * w) / k - w
-
-
-def _dead_zone_error(session: Session, w: np.ndarray, half_width: float,
-                     shapes: Shapes) -> np.ndarray:
-    return np.where(np.abs(w) < half_width, -w, 0.0)
-
-
-def _saturation_error(session: Session, w: np.ndarray, limit: float, shapes: Shapes) -> np.ndarray:
-    return np.clip(w, -limit, limit) - w
 
 
 def sensed_rate(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0,
@@ -184,81 +161,76 @@ def _slip_times(shapes: Shapes) -> list[float]:
     return [value for name, value in shapes.items() if name.startswith('slip_time')]
 
 
-def _eccentricity_rate(session: Session, shapes: Shapes) -> np.ndarray:
-    return session.rate * np.sin(session.heading + shapes['phase'])
-
-
-def _no_column(session: Session, w: np.ndarray, size: float, shapes: Shapes) -> np.ndarray:
+def _no_column(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
     raise NotImplementedError('faults of samples have no column')
 
 
 FORMS: Mapping[str, EffectForm] = {
-    'bias': EffectForm(_linear_error(lambda session, w, shapes: np.ones_like(w)), 'rad/s'),
-    'scale_factor_error': EffectForm(_linear_error(lambda session, w, shapes: w), '1'),
-    'scale_factor_asymmetry': EffectForm(_linear_error(lambda session, w, shapes: np.abs(w)), '1'),
-    'quadratic_nonlinearity': EffectForm(_linear_error(lambda session, w, shapes: w ** 2),
-                                         's/rad'),
-    'cubic_nonlinearity': EffectForm(_linear_error(lambda session, w, shapes: w ** 3), 's²/rad²'),
-    'sine_response': EffectForm(_sine_error, 's', is_linear=False, is_signed=False,
+    'bias': EffectForm(lambda session, w, shapes: np.ones_like(w), 'rad/s'),
+    'scale_factor_error': EffectForm(lambda session, w, shapes: w, '1'),
+    'scale_factor_asymmetry': EffectForm(lambda session, w, shapes: np.abs(w), '1'),
+    'quadratic_nonlinearity': EffectForm(lambda session, w, shapes: w ** 2, 's/rad'),
+    'cubic_nonlinearity': EffectForm(lambda session, w, shapes: w ** 3, 's²/rad²'),
+    'sine_response': EffectForm(lambda session, w, k, shapes: np.sin(k * w) / k - w, 's',
+                                is_linear=False, is_signed=False,
                                 max_size=lambda sessions: 1.5 / top_rate(sessions)),
     'bias_temperature': EffectForm(
-        _linear_error(lambda session, w, shapes: session.temperature - REFERENCE_TEMPERATURE),
-        'rad/s/K'),
+        lambda session, w, shapes: session.temperature - REFERENCE_TEMPERATURE, 'rad/s/K'),
     'bias_temperature_quadratic': EffectForm(
-        _linear_error(lambda session, w, shapes:
-                      (session.temperature - REFERENCE_TEMPERATURE) ** 2), 'rad/s/K²'),
+        lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) ** 2,
+        'rad/s/K²'),
     'scale_factor_temperature': EffectForm(
-        _linear_error(lambda session, w, shapes:
-                      (session.temperature - REFERENCE_TEMPERATURE) * w), '1/K'),
+        lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) * w, '1/K'),
     'bias_temperature_rate': EffectForm(
-        _linear_error(lambda session, w, shapes: temperature_rate(session)), 'rad/s/(K/s)'),
+        lambda session, w, shapes: temperature_rate(session), 'rad/s/(K/s)'),
     'thermal_lag': EffectForm(
-        _linear_error(lambda session, w, shapes: lag(session.temperature, session.interval, shapes[
-            'time_constant']) - session.temperature), 'rad/s/K', _time_constant_drawer(0.03, 0.3)),
+        lambda session, w, shapes: lag(session.temperature, session.interval, shapes[
+            'time_constant']) - session.temperature, 'rad/s/K', _time_constant_drawer(0.03, 0.3)),
     'thermal_hysteresis': EffectForm(
-        _linear_error(lambda session, w, shapes: thermal_branch(session)), 'rad/s'),
+        lambda session, w, shapes: thermal_branch(session), 'rad/s'),
     'warm_up': EffectForm(
-        _linear_error(lambda session, w, shapes: np.exp(-session.time / shapes['time_constant'])),
-        'rad/s', _time_constant_drawer(0.03, 0.35)),
-    'rate_ramp': EffectForm(_linear_error(lambda session, w, shapes: session.time), 'rad/s²'),
+        lambda session, w, shapes: np.exp(-session.time / shapes['time_constant']), 'rad/s',
+        _time_constant_drawer(0.03, 0.35)),
+    'rate_ramp': EffectForm(lambda session, w, shapes: session.time, 'rad/s²'),
     'bias_step': EffectForm(
-        _linear_error(lambda session, w, shapes:
-                      (session.time >= shapes['step_time']).astype(float)), 'rad/s',
+        lambda session, w, shapes: (session.time >= shapes['step_time']).astype(float), 'rad/s',
         _draw_step_time, is_single_event=True),
     'heading_sensitivity': EffectForm(
-        _linear_error(lambda session, w, shapes: np.sin(session.heading + shapes['phase'])),
-        'rad/s', _draw_phase),
+        lambda session, w, shapes: np.sin(session.heading + shapes['phase']), 'rad/s',
+        _draw_phase),
     'acceleration_sensitivity': EffectForm(
-        _linear_error(lambda session, w, shapes: session.specific_force), '(rad/s)/(m/s²)'),
+        lambda session, w, shapes: session.specific_force, '(rad/s)/(m/s²)'),
     'vibration_rectification': EffectForm(
-        _linear_error(lambda session, w, shapes: vibration_power(session)), '(rad/s)/(m/s²)²'),
+        lambda session, w, shapes: vibration_power(session), '(rad/s)/(m/s²)²'),
     'supply_sensitivity': EffectForm(
-        _linear_error(lambda session, w, shapes: session.supply - REFERENCE_SUPPLY), 'rad/s/V'),
+        lambda session, w, shapes: session.supply - REFERENCE_SUPPLY, 'rad/s/V'),
     'interference_tone': EffectForm(
-        _linear_error(lambda session, w, shapes: np.sin(2.0 * math.pi * shapes[
-            'frequency'] * session.time + shapes['phase'])), 'rad/s', _draw_tone, is_signed=False),
+        lambda session, w, shapes: np.sin(2.0 * math.pi * shapes['frequency'] * session.time
+                                          + shapes['phase']), 'rad/s', _draw_tone,
+        is_signed=False),
     'bandwidth': EffectForm(_signal_error('bandwidth'), 's', stage='signal', is_linear=False,
                             is_signed=False, max_size=lambda sessions: 1.0),
     'time_offset': EffectForm(_signal_error('time_offset'), 's', stage='signal', is_linear=False,
                               max_size=lambda sessions: 0.5),
     'clock_rate': EffectForm(_signal_error('clock_rate'), '1', stage='signal', is_linear=False,
                              max_size=lambda sessions: 0.01),
-    'dead_zone': EffectForm(_dead_zone_error, 'rad/s', is_linear=False, is_signed=False,
-                            max_size=lambda sessions: 0.3 * top_rate(sessions)),
-    'saturation': EffectForm(_saturation_error, 'rad/s', stage='output', is_linear=False,
-                             is_signed=False, max_size=top_rate),
+    'dead_zone': EffectForm(
+        lambda session, w, half_width, shapes: np.where(np.abs(w) < half_width, -w, 0.0), 'rad/s',
+        is_linear=False, is_signed=False, max_size=lambda sessions: 0.3 * top_rate(sessions)),
+    'saturation': EffectForm(lambda session, w, limit, shapes: np.clip(w, -limit, limit) - w,
+                             'rad/s', stage='output', is_linear=False, is_signed=False,
+                             max_size=top_rate),
     'quantization': EffectForm(_no_column, 'rad/s', stage='output', is_signed=False),
     'outliers': EffectForm(_no_column, '1', stage='samples', is_signed=False),
     'stuck_samples': EffectForm(_no_column, '1', stage='samples', is_signed=False),
     'dropped_samples': EffectForm(_no_column, '1', stage='samples', is_signed=False),
     'reference_once_per_rev': EffectForm(
-        lambda session, w, size, shapes: -size * _eccentricity_rate(session, shapes), '1',
-        _draw_phase, stage='reference', is_signed=False),
-    'reference_scale': EffectForm(lambda session, w, size, shapes: -size * session.rate, '1',
+        lambda session, w, shapes: -(session.rate * np.sin(session.heading + shapes['phase'])),
+        '1', _draw_phase, stage='reference', is_signed=False),
+    'reference_scale': EffectForm(lambda session, w, shapes: -session.rate, '1',
                                   stage='reference'),
-    'reference_slip': EffectForm(
-        lambda session, w, size, shapes: -size * _slip_rate(session, shapes), 'rad', _draw_slips,
-        stage='reference', is_single_event=True),
+    'reference_slip': EffectForm(lambda session, w, shapes: -_slip_rate(session, shapes), 'rad',
+                                 _draw_slips, stage='reference', is_single_event=True),
     'reference_quantization': EffectForm(_no_column, 'rad', stage='reference', is_signed=False),
     'unit_error': EffectForm(_no_column, '1', stage='unit', is_signed=False),
     'angle_random_walk': EffectForm(_no_column, 'rad/√s', stage='noise'),
@@ -270,11 +242,9 @@ FORMS: Mapping[str, EffectForm] = {
 def effect_errors(form: EffectForm, size: float, shapes: Shapes,
                   sessions: list[Session]) -> list[np.ndarray]:
     """Return the addition of an effect to output less reference of each recording, rad/s."""
-    return [
-        form.error(each, each.rate, size, shapes)
-        if not form.is_single_event or shapes['run'] == run else np.zeros(len(each.time))
-        for run, each in enumerate(sessions)
-    ]
+    return [form.error(each, each.rate, size, shapes)
+            if not form.is_single_event or shapes['run'] == run else np.zeros(len(each.time))
+            for run, each in enumerate(sessions)]
 
 
 #: What a wrong unit multiplies the output by; and delays, in samples.
@@ -308,28 +278,10 @@ def _draw_telegraph(sessions: list[Session], generator: np.random.Generator) -> 
     return {f'jump_time_{number}': float(at) for number, at in enumerate(times)}
 
 
-def _telegraph_level(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
-    return np.searchsorted(np.array(list(shapes.values())), session.time) % 2.0
-
-
 def _heading_harmonic(number: int) -> EffectForm:
     return EffectForm(
-        _linear_error(
-            lambda session, w, shapes: np.sin(number * session.heading + shapes['phase'])),
-        'rad/s', _draw_phase)
-
-
-def _temperature_times_heading(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
-    return (session.temperature - shapes['middle']) * np.sin(session.heading + shapes['phase'])
-
-
-def _resonance(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
-    """Return a bump over the speed, as of something that resonates at one."""
-    return np.exp(-0.5 * ((np.abs(w) - shapes['speed']) / shapes['width']) ** 2)
-
-
-def _supply_parabola(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
-    return (session.supply - shapes['middle']) ** 2
+        lambda session, w, shapes: np.sin(number * session.heading + shapes['phase']), 'rad/s',
+        _draw_phase)
 
 
 OUTSIDE_CATALOGUE: Mapping[str, EffectForm] = {
@@ -337,38 +289,41 @@ OUTSIDE_CATALOGUE: Mapping[str, EffectForm] = {
     'third_harmonic_of_heading': _heading_harmonic(3),
     'gear_of_heading': _heading_harmonic(7),
     'wave_over_rate': EffectForm(
-        _linear_error(lambda session, w, shapes: np.sin(2.0 * math.pi * w / shapes[
-            'period'] + shapes['phase'])), 'rad/s', lambda sessions, generator: {
-                'period': top_rate(sessions) / generator.uniform(3.0, 6.0),
-                **_draw_phase(sessions, generator)
-            }),
+        lambda session, w, shapes: np.sin(2.0 * math.pi * w / shapes['period'] + shapes['phase']),
+        'rad/s', lambda sessions, generator: {
+            'period': top_rate(sessions) / generator.uniform(3.0, 6.0),
+            **_draw_phase(sessions, generator)}),
     'resonance_at_a_speed': EffectForm(
-        _linear_error(_resonance), 'rad/s', lambda sessions, generator: {
+        lambda session, w, shapes: np.exp(
+            -0.5 * ((np.abs(w) - shapes['speed']) / shapes['width']) ** 2), 'rad/s',
+        lambda sessions, generator: {
             'speed': top_rate(sessions) * generator.uniform(0.2, 0.8),
-            'width': top_rate(sessions) * generator.uniform(0.03, 0.1)
-        }),
+            'width': top_rate(sessions) * generator.uniform(0.03, 0.1)}),
     'wave_over_temperature': EffectForm(
-        _linear_error(lambda session, w, shapes: np.sin(
-            2.0 * math.pi * session.temperature / shapes['period'] + shapes['phase'])), 'rad/s',
+        lambda session, w, shapes: np.sin(
+            2.0 * math.pi * session.temperature / shapes['period'] + shapes['phase']), 'rad/s',
         _draw_temperature_wave),
     'temperature_times_heading': EffectForm(
-        _linear_error(_temperature_times_heading), 'rad/s/K', lambda sessions, generator: {
+        lambda session, w, shapes: (session.temperature - shapes['middle'])
+        * np.sin(session.heading + shapes['phase']), 'rad/s/K', lambda sessions, generator: {
             'middle': _median([session.temperature for session in sessions]),
-            **_draw_phase(sessions, generator)
-        }),
+            **_draw_phase(sessions, generator)}),
     'bias_pulse': EffectForm(
-        _linear_error(lambda session, w, shapes: np.exp(-0.5 * (
-            (session.time - shapes['pulse_time']) / shapes['width']) ** 2)), 'rad/s', _draw_pulse,
-        is_single_event=True),
-    'telegraph': EffectForm(_linear_error(_telegraph_level), 'rad/s', _draw_telegraph),
+        lambda session, w, shapes: np.exp(
+            -0.5 * ((session.time - shapes['pulse_time']) / shapes['width']) ** 2), 'rad/s',
+        _draw_pulse, is_single_event=True),
+    'telegraph': EffectForm(
+        lambda session, w, shapes: np.searchsorted(list(shapes.values()), session.time) % 2.0,
+        'rad/s', _draw_telegraph),
     'supply_parabola': EffectForm(
-        _linear_error(_supply_parabola), 'rad/s/V²', lambda sessions, generator:
-        {'middle': float(np.quantile(sessions[0].supply, generator.uniform(0.35, 0.65)))}),
+        lambda session, w, shapes: (session.supply - shapes['middle']) ** 2, 'rad/s/V²',
+        lambda sessions, generator: {
+            'middle': float(np.quantile(sessions[0].supply, generator.uniform(0.35, 0.65)))}),
     'supply_times_rate': EffectForm(
-        _linear_error(lambda session, w, shapes: (session.supply - shapes['middle']) * w), '1/V',
+        lambda session, w, shapes: (session.supply - shapes['middle']) * w, '1/V',
         lambda sessions, generator: {'middle': _median([session.supply for session in sessions])}),
     'force_times_rate': EffectForm(
-        _linear_error(lambda session, w, shapes: (session.tilt_force - shapes['middle']) * w),
-        '1/(m/s²)', lambda sessions, generator:
-        {'middle': _median([session.tilt_force for session in sessions])}),
+        lambda session, w, shapes: (session.tilt_force - shapes['middle']) * w, '1/(m/s²)',
+        lambda sessions, generator: {
+            'middle': _median([session.tilt_force for session in sessions])}),
 }

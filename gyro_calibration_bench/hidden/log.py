@@ -65,30 +65,18 @@ BIAS_DEVIATION, BIAS_SPREAD, MAX_SCALE_FACTOR_ERROR = 3e-3, 3e-4, 0.02
 
 @dataclass(frozen=True)
 class Cause:
-    """
-    One hidden effect.
+    """One hidden effect."""
 
-    Attributes
-    ----------
-    name : in the catalogue, or outside it
-    size : the leading parameter as added, in SI; for a figure of the noise its value
-    shapes : the other parameters
-    unit : of the size
-    minimum_detectable : size that is just detected alone; for saturation a limit, for a figure of
-        the noise a change; nan without meaning
-    multiple : of the minimum detectable effect, that is hidden
-    apart : the multiple that is independent of the other hidden effects
-    likeness : of an effect outside the catalogue, the share that the best effect in it explains
-
-    """
-
-    name: str
-    size: float
-    shapes: Shapes
-    unit: str
+    name: str  # in the catalogue, or outside it
+    size: float  # the leading parameter as added, in SI; for a figure of the noise its value
+    shapes: Shapes  # the other parameters
+    unit: str  # of the size
+    # size that is just detected alone; for saturation a limit, for a figure of the noise a change;
+    # nan without meaning
     minimum_detectable: float
-    multiple: float
-    apart: float = math.nan
+    multiple: float  # of the minimum detectable effect, that is hidden
+    apart: float = math.nan  # the multiple that is independent of the other hidden effects
+    # of an effect outside the catalogue, the share that the best effect in it explains
     likeness: float = math.nan
 
     @property
@@ -99,24 +87,13 @@ class Cause:
 
 @dataclass(frozen=True)
 class Gyro:
-    """
-    A hidden gyro, which can be recorded again under other conditions.
+    """A hidden gyro, which can be recorded again under other conditions."""
 
-    Attributes
-    ----------
-    causes : what is hidden
-    figures : its noise
-    scale_factor_error : 1
-    biases : of the recordings that the sizes are for, rad/s
-    bias_spread : standard deviation of the bias from one power-on to the next, rad/s
-
-    """
-
-    causes: tuple[Cause, ...]
+    causes: tuple[Cause, ...]  # what is hidden
     figures: NoiseFigures
-    scale_factor_error: float
-    biases: tuple[float, ...]
-    bias_spread: float
+    scale_factor_error: float  # 1
+    biases: tuple[float, ...]  # of the recordings that the sizes are for, rad/s
+    bias_spread: float  # standard deviation of the bias between power-ons, rad/s
 
     def bias_of(self, run: int, generator: np.random.Generator) -> float:
         """Return the bias of one recording, rad/s; a new one for an unplanned recording."""
@@ -128,44 +105,27 @@ class Gyro:
         return next((cause.size for cause in self.causes if cause.name == name), 0.0)
 
     def has(self, name: str) -> bool:
-        """Tell whether an effect is hidden."""
         return any(cause.name == name for cause in self.causes)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """
-    The truth about one recording.
-
-    Attributes
-    ----------
-    gyro : the hidden gyro
-    names : of the hidden effects
-    bias, scale_factor_error : of this recording, rad/s and 1
-    expected : figures of a model that knows all but what is hidden: bias, scale_factor_error,
-        angle_random_walk, bias_instability, rate_random_walk, in SI; for effects that are findings
-        only against a model
-    rate, heading : true, rad/s and rad, at the rows of the log
-    added_rate : by all effects, bias and scale included, to the true rate; without noise, rad/s
-    reference : rate that the reference states, rad/s
-    noise : the noise that was added, rad/s
-    prediction : the output predicted with all but the noise known, rad/s
-    is_good : False at rows whose sample is an outlier or repeated
-
-    """
+    """The truth about one recording, at the rows of its log."""
 
     gyro: Gyro
-    names: tuple[str, ...]
-    bias: float
-    scale_factor_error: float
+    names: tuple[str, ...]  # of the hidden effects
+    bias: float  # of this recording, rad/s
+    scale_factor_error: float  # 1
+    # a model that knows all but what is hidden, in SI: bias, scale_factor_error,
+    # angle_random_walk, bias_instability, rate_random_walk
     expected: Mapping[str, float]
-    rate: np.ndarray
-    heading: np.ndarray
-    added_rate: np.ndarray
-    reference: np.ndarray
-    noise: np.ndarray
-    prediction: np.ndarray
-    is_good: np.ndarray
+    rate: np.ndarray  # true, rad/s
+    heading: np.ndarray  # true, rad
+    added_rate: np.ndarray  # by all effects, bias and scale included, without noise, rad/s
+    reference: np.ndarray  # rate that the reference states, rad/s
+    noise: np.ndarray  # that was added, rad/s
+    prediction: np.ndarray  # output with all but the noise known, rad/s
+    is_good: np.ndarray  # False where the sample is an outlier or repeated
 
     def __getitem__(self, name: str) -> Cause:
         return next(cause for cause in self.gyro.causes if cause.name == name)
@@ -197,7 +157,7 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float],
          figures: NoiseFigures | None = None, conditions: Mapping[str, Any] | None = None,
          fixed_parts: FixedParts | None = None, against_a_model: bool = False) -> list[HiddenLog]:
     """
-    Hide effects in recordings of a random gyro under random conditions.
+    Hide effects in recordings of a random gyro under random conditions, and return a log of each.
 
     Parameters
     ----------
@@ -216,10 +176,6 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float],
     fixed_parts : recordings -> name of an effect -> its parts that are not random: its shapes, its
         'sign', or its 'size' in SI, which determines the multiple
     against_a_model : a model with bias and scale is known, so that they hide nothing
-
-    Returns
-    -------
-    one log a recording
 
     """
     sessions = [session(generator, duration, sample_rate, **(conditions or {}))
@@ -250,10 +206,9 @@ def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float],
     gyro = Gyro((), figures, scale, tuple(biases.tolist()), BIAS_SPREAD)
     metric = InformationMetric(sessions, figures, encoder_step)
     sizing = _Sizing(sessions, gyro, metric, known_nuisances)
-    causes += [
-        _draw_cause(name, multiples[name], generator, sizing, (fixed_parts or {}).get(name, {}))
-        for name in names if ALL[name].stage != 'noise'
-    ]
+    causes += [_draw_cause(name, multiples[name], generator, sizing,
+                           (fixed_parts or {}).get(name, {}))
+               for name in names if ALL[name].stage != 'noise']
     return replace(gyro, causes=_with_remaining_multiples(causes, sizing))
 
 
@@ -401,34 +356,35 @@ def record(gyro: Gyro, conditions: Session, generator: np.random.Generator, *,
                  0.0)
     w = sensed_rate(conditions, gyro.size_of('time_offset') + delay, gyro.size_of('clock_rate'),
                     gyro.size_of('bandwidth'))
-    prediction = w + _sum_of_errors(gyro, conditions, w, bias, run)
-    white, slow = generate_noise(gyro.figures, len(w), conditions.interval, generator)
-    output, wanted = (_finish_output(gyro,
-                                     prediction + white + slow), _finish_output(gyro, prediction))
-    reference_rate, reference_heading = _stated_reference(gyro, conditions, run)
-    columns = {
-        'time_s': conditions.time,
-        'gyro_rad_s': output,
-        **_measured_conditions(conditions, generator)
-    }
-    columns |= _reference_columns(gyro, reference_rate, reference_heading, reference, encoder_step)
-    columns, good, kept = _add_sample_faults(gyro, columns, generator, conditions)
-    rows = np.flatnonzero(kept)
-    truth = Truth(gyro, tuple(cause.name for cause in gyro.causes), bias, gyro.scale_factor_error,
-                  _expected_model(gyro, bias, expected), conditions.rate[rows],
-                  conditions.heading[rows], (prediction - conditions.rate)[rows],
-                  reference_rate[rows], (white + slow)[rows], wanted[rows], good[rows])
-    return HiddenLog(columns, truth, conditions)
-
-
-def _sum_of_errors(gyro: Gyro, each: Session, w: np.ndarray, bias: float, run: int) -> np.ndarray:
-    """Return what adds to the resulting rate, without noise, rad/s."""
-    total = bias + gyro.scale_factor_error * w
+    added = bias + gyro.scale_factor_error * w
     for cause in gyro.causes:
         form = ALL[cause.name]
         if form.stage == 'sum' and not (form.is_single_event and cause.shapes['run'] != run):
-            total = total + form.error(each, w, cause.size, cause.shapes)
-    return total
+            added = added + form.error(conditions, w, cause.size, cause.shapes)
+    prediction = w + added
+    white, slow = generate_noise(gyro.figures, len(w), conditions.interval, generator)
+    output, wanted = (_finish_output(gyro, each) for each in (prediction + white + slow,
+                                                              prediction))
+    reference_rate, reference_heading = _stated_reference(gyro, conditions, run)
+    columns = {'time_s': conditions.time, 'gyro_rad_s': output,
+               **_measured_conditions(conditions, generator)}
+    if step := gyro.size_of('reference_quantization') or encoder_step:
+        columns['reference_heading_rad'] = np.round(reference_heading / step) * step
+    else:
+        both = {'reference_rate_rad_s': reference_rate, 'reference_heading_rad': reference_heading}
+        columns |= {name: column for name, column in both.items()
+                    if reference == 'both' or reference in name}
+    columns, good, kept = _add_sample_faults(gyro, columns, generator, conditions)
+    rows, figures = np.flatnonzero(kept), expected or gyro.figures
+    model = {'bias': bias, 'scale_factor_error': gyro.scale_factor_error,
+             'angle_random_walk': figures.angle_random_walk,
+             'bias_instability': figures.equivalent_floor,
+             'rate_random_walk': figures.rate_random_walk}
+    truth = Truth(gyro, tuple(cause.name for cause in gyro.causes), bias, gyro.scale_factor_error,
+                  model, conditions.rate[rows], conditions.heading[rows],
+                  (prediction - conditions.rate)[rows], reference_rate[rows],
+                  (white + slow)[rows], wanted[rows], good[rows])
+    return HiddenLog(columns, truth, conditions)
 
 
 def _finish_output(gyro: Gyro, signal: np.ndarray) -> np.ndarray:
@@ -457,15 +413,6 @@ def _stated_reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, 
             if cause.name == 'reference_slip':
                 heading = heading + cause.size * slip_angle(each, cause.shapes)
     return rate, heading
-
-
-def _reference_columns(gyro: Gyro, rate: np.ndarray, heading: np.ndarray, kind: str,
-                       encoder_step: float) -> dict[str, np.ndarray]:
-    step = gyro.size_of('reference_quantization') or encoder_step
-    if step:
-        return {'reference_heading_rad': np.round(heading / step) * step}
-    both = {'reference_rate_rad_s': rate, 'reference_heading_rad': heading}
-    return {name: column for name, column in both.items() if kind == 'both' or kind in name}
 
 
 def _measured_conditions(each: Session, generator: np.random.Generator) -> dict[str, np.ndarray]:
@@ -519,15 +466,3 @@ def _turning_rows(each: Session, count: int, generator: np.random.Generator,
         if len(chosen) < count and all(abs(row - other) > apart for other in chosen):
             chosen.append(int(row))
     return chosen
-
-
-def _expected_model(gyro: Gyro, bias: float, expected: NoiseFigures | None) -> dict[str, float]:
-    """Return the values of a model without the hidden effects."""
-    figures = expected or gyro.figures
-    return {
-        'bias': bias,
-        'scale_factor_error': gyro.scale_factor_error,
-        'angle_random_walk': figures.angle_random_walk,
-        'bias_instability': figures.equivalent_floor,
-        'rate_random_walk': figures.rate_random_walk
-    }

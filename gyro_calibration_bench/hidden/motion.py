@@ -35,31 +35,17 @@ class Motion:
 
 @dataclass(frozen=True)
 class Session:
-    """
-    One recording without a gyro: arrays of shape (n,), true and without noise.
+    """One recording without a gyro: arrays of shape (n,), true and without noise."""
 
-    Attributes
-    ----------
-    motion : for times between the samples
-    time : since power-on, s
-    rate, heading : rad/s and rad
-    temperature : of the gyro, degC
-    supply : V
-    tilt_force : what of the specific force does not vibrate, m/s²
-    vibration : the rest of it
-    moving : True where it turns, or has turned or will turn within a second
-
-    """
-
-    motion: Motion
-    time: np.ndarray
-    rate: np.ndarray
-    heading: np.ndarray
-    temperature: np.ndarray
-    supply: np.ndarray
-    tilt_force: np.ndarray
-    vibration: np.ndarray
-    moving: np.ndarray
+    motion: Motion  # for times between the samples
+    time: np.ndarray  # since power-on, s
+    rate: np.ndarray  # rad/s
+    heading: np.ndarray  # rad
+    temperature: np.ndarray  # of the gyro, degC
+    supply: np.ndarray  # V
+    tilt_force: np.ndarray  # what of the specific force does not vibrate, m/s²
+    vibration: np.ndarray  # the rest of it
+    moving: np.ndarray  # it turns, or has turned or will turn within a second
 
     @property
     def interval(self) -> float:
@@ -80,7 +66,6 @@ def session(generator: np.random.Generator, duration: float = 900.0, sample_rate
 
     Parameters
     ----------
-    generator : source of all that is random
     duration, sample_rate : s and Hz
     motion : rich, one_speed (never at rest), two_way (one speed both ways, and rest), slow (below
         0.3 rad/s), smooth (slow swings only)
@@ -138,18 +123,15 @@ def _rich_motion(generator: np.random.Generator, duration: float, top: float) ->
     count = round(duration / KNOT_INTERVAL)
     pieces = [_rest_piece(generator, top, 10.0, 30.0)]
     length = len(pieces[0])
-    kinds = list(PIECES)
     while length < count:
         # each kind comes once before any comes again, so that a log of some minutes has them all
-        order = generator.permutation(len(kinds))
-        for number in order:
-            pieces.append(PIECES[kinds[number]](generator, top))
+        for number in generator.permutation(len(PIECES)):
+            pieces.append(PIECES[number](generator, top))
             if generator.random() < 0.4:
                 pieces.append(_rest_piece(generator, top))
         length = sum(len(piece) for piece in pieces)
-    knots = gaussian_filter1d(
-        np.concatenate(pieces)[:count],
-        generator.uniform(0.1, 0.3) / KNOT_INTERVAL)
+    knots = gaussian_filter1d(np.concatenate(pieces)[:count],
+                              generator.uniform(0.1, 0.3) / KNOT_INTERVAL)
     knots[-round(5.0 / KNOT_INTERVAL):] = 0.0
     return gaussian_filter1d(knots, 0.1 / KNOT_INTERVAL)
 
@@ -200,8 +182,8 @@ def _reversal_piece(generator: np.random.Generator, top: float) -> np.ndarray:
 
 def _swing_piece(generator: np.random.Generator, top: float) -> np.ndarray:
     time = KNOT_INTERVAL * np.arange(_draw_length(generator, 8.0, 20.0))
-    return generator.uniform(0.2,
-                             1.0) * top * np.sin(2.0 * np.pi * generator.uniform(0.1, 1.0) * time)
+    high = generator.uniform(0.2, 1.0) * top
+    return high * np.sin(2.0 * np.pi * generator.uniform(0.1, 1.0) * time)
 
 
 def _wander_piece(generator: np.random.Generator, top: float) -> np.ndarray:
@@ -218,17 +200,8 @@ def _eighth_turn_piece(generator: np.random.Generator, top: float) -> np.ndarray
     return np.tile(np.concatenate([move, np.zeros(_draw_length(generator, 1.0, 2.5))]), 8)
 
 
-PIECES = {
-    'rest': _rest_piece,
-    'turn': _turn_piece,
-    'staircase': _staircase_piece,
-    'ramp': _ramp_piece,
-    'slow_sweep': _slow_sweep_piece,
-    'reversals': _reversal_piece,
-    'swing': _swing_piece,
-    'wander': _wander_piece,
-    'eighths': _eighth_turn_piece
-}
+PIECES = (_rest_piece, _turn_piece, _staircase_piece, _ramp_piece, _slow_sweep_piece,
+          _reversal_piece, _swing_piece, _wander_piece, _eighth_turn_piece)
 
 
 def _two_way_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
@@ -239,9 +212,8 @@ def _two_way_motion(generator: np.random.Generator, duration: float, top: float)
             pieces += [_rest_piece(generator, top, 20.0, 40.0),
                        np.full(_draw_length(generator, 30.0, 60.0), sign * top)]
         length = sum(len(piece) for piece in pieces)
-    return gaussian_filter1d(
-        np.concatenate([*pieces[:-1], _rest_piece(generator,
-                                                  top)])[:round(duration / KNOT_INTERVAL)], 2.0)
+    knots = np.concatenate([*pieces[:-1], _rest_piece(generator, top)])
+    return gaussian_filter1d(knots[:round(duration / KNOT_INTERVAL)], 2.0)
 
 
 def _smooth_motion(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:

@@ -38,24 +38,13 @@ KINDS = ('white', 'walk', 'flicker', 'gauss_markov', 'mixed')
 
 @dataclass(frozen=True)
 class NoiseFigures:
-    """
-    The noise of one gyro, in SI.
+    """The noise of one gyro, in SI."""
 
-    Attributes
-    ----------
-    angle_random_walk : N, rad/√s
-    bias_instability : B, rad/s, with the spectrum B² / (2 pi f)
-    rate_random_walk : K, rad/s/√s
-    correlated : standard deviation of a Gauss-Markov process, rad/s
-    correlation_time : its time constant, s
-
-    """
-
-    angle_random_walk: float
-    bias_instability: float = 0.0
-    rate_random_walk: float = 0.0
-    correlated: float = 0.0
-    correlation_time: float = 60.0
+    angle_random_walk: float  # N, rad/√s
+    bias_instability: float = 0.0  # B, rad/s, with the spectrum B² / (2 pi f)
+    rate_random_walk: float = 0.0  # K, rad/s/√s
+    correlated: float = 0.0  # standard deviation of a Gauss-Markov process, rad/s
+    correlation_time: float = 60.0  # its time constant, s
 
     @property
     def equivalent_floor(self) -> float:
@@ -165,8 +154,8 @@ class Whitening:
         for place, process in enumerate(slow):
             inner = 1.0 / process.innovation ** 2
             band[width, :, place] = inner * (1.0 + process.factor ** 2)
-            band[width, 0,
-                 place] = (1.0 / process.first_deviation ** 2 + inner * process.factor ** 2)
+            band[width, 0, place] = (1.0 / process.first_deviation ** 2
+                                     + inner * process.factor ** 2)
             band[width, -1, place] = inner
             band[0, 1:, place] = -inner * process.factor
         for later in range(self._slow_count):

@@ -45,14 +45,8 @@ class InformationMetric:
     """
     Information of recordings of one gyro on an effect, beside a bias of each and one scale.
 
-    Parameters
-    ----------
-    sessions : the recordings
-    figures : the noise
-    encoder_step : of the reference's heading, rad
-    thin : average so many samples to one first, which keeps what is slow
-
-    A nuisance known from a model ('bias', 'scale') can be left out.
+    The encoder's step is in rad; `thin` samples are averaged to one first, which keeps what is
+    slow. A nuisance known from a model ('bias', 'scale') can be left out.
 
     """
 
@@ -65,9 +59,8 @@ class InformationMetric:
                                           for number, each in enumerate(sessions)]
                           for run in range(len(sessions))}
         self.nuisances['scale'] = [each.rate for each in sessions]
-        self.nuisances = ({
-            name: block_averages(columns, thin) for name, columns in self.nuisances.items()
-        })
+        self.nuisances = {name: block_averages(columns, thin)
+                          for name, columns in self.nuisances.items()}
         self._solved = {name: self.solve(columns) for name, columns in self.nuisances.items()}
 
     def solve(self, columns: Columns) -> Columns:
@@ -107,17 +100,7 @@ def _inner_product(a: Columns, b: Columns) -> float:
 
 def solve_size(norm: Callable[[float], float], wanted: float, guess_size: float,
                max_size: float) -> float:
-    """
-    Return the size at which a norm that grows with it has a wanted value, or the largest size.
-
-    Parameters
-    ----------
-    norm : size -> norm
-    wanted : its value
-    guess_size : a guess of the size
-    max_size : the largest size
-
-    """
+    """Return the size at which a norm that grows with it has a wanted value, or the largest."""
     guess = min(guess_size, max_size)
     quick = _solve_by_powers(norm, wanted, guess, max_size)
     return quick if quick is not None else _solve_by_brackets(norm, wanted, guess, max_size)
@@ -136,9 +119,8 @@ def _solve_by_powers(norm: Callable[[float], float], wanted: float, size: float,
         if next_size == size:
             return size
         next_value = norm(next_size)
-        power = float(
-            np.clip(
-                math.log((next_value + 1e-300) / value) / math.log(next_size / size), 0.5, 4.0))
+        power = float(np.clip(
+            math.log((next_value + 1e-300) / value) / math.log(next_size / size), 0.5, 4.0))
         size, value = next_size, next_value
     return None
 
@@ -180,10 +162,7 @@ class Likeness:
     """
     The columns of all effects of the catalogue in some recordings, over a grid of their shapes.
 
-    Parameters
-    ----------
-    sessions : the recordings
-    figures : the noise, in whose covariance the share of a column is counted
+    The share of a column is counted in the covariance of the noise.
 
     """
 
@@ -225,12 +204,8 @@ def _candidate_columns(name: str, sessions: list[Session]) -> Iterator[list[Colu
         for size in _candidate_sizes(name, sessions):
             phases = ([{'phase': 0.0}, {'phase': 0.5 * math.pi}]
                       if name in ('heading_sensitivity', 'reference_once_per_rev') else [{}])
-            yield [
-                effect_errors(FORMS[name], size, {
-                    **shapes,
-                    **phase
-                }, sessions) for phase in phases
-            ]
+            yield [effect_errors(FORMS[name], size, {**shapes, **phase}, sessions)
+                   for phase in phases]
 
 
 def _candidate_shapes(name: str, sessions: list[Session]) -> Iterator[Shapes]:
