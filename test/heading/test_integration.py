@@ -141,16 +141,20 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
     tracker = HeadingTracker(XV3500, uncertainty_covariance(model),
                              Settings(false_alarms=0.0, threshold=settings))
-    headings = []
+    headings, variances = [], []
     for index in range(len(time)):
         assert not tracker.add(float(time[index]) + offset, float(rate[index]),
                                sensitivity[:, index])
         headings.append(tracker.heading)
+        variances.append(tracker.variance)
     integrator = BlockIntegrator(settings, XV3500, uncertainty_covariance(model))
     _, heading, deviation = integrator.add(time, rate, sensitivity)
     assert integrator.intervals.lost_samples == tracker.intervals.lost_samples == 26
     # Stamps near 1e9 s have steps of 0.1 us.
     assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
+    # the tracker counts the calibration's part once a second
+    around_the_gap = slice(1980, 2000)
+    assert deviation[around_the_gap] ** 2 == pytest.approx(variances[around_the_gap], rel=1e-2)
     tracker.finish()
     assert math.sqrt(tracker.variance) == pytest.approx(deviation[-1], rel=1e-3)
     deleted = integrate(time, rate)[-1] - heading[-1]
