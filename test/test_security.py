@@ -17,7 +17,6 @@ from xml.etree import ElementTree
 import pytest
 from rig import rested
 from test_layers import calls, FILES, imports
-import yaml
 
 try:
     from nav_msgs.msg import Odometry
@@ -72,12 +71,6 @@ def test_a_kind_of_message_chooses_no_module_that_a_recorder_imports(kind):
     from gyro_calibration.ros.recorder_node import load_message_class
     with pytest.raises(ImportError, match='no kind of messages'):
         load_message_class(kind)
-
-
-def test_yaml_is_read_as_plain_data():
-    from gyro_calibration.model import settings_file
-    assert 'yaml.load(text, _Loader)' in Path(settings_file.__file__).read_text()
-    assert issubclass(settings_file._Loader, yaml.BaseLoader), 'it constructs texts and lists only'
 
 
 # The policy of a secured graph
