@@ -283,12 +283,6 @@ def test_no_file_is_no_fault(tmp_path):
     assert message == '' and not table.entries and table.run == 0
 
 
-def whole(tmp_path):
-    """Return the text of a good file."""
-    write_bias_table(tmp_path / 'good.yaml', jumped()[0], 0.0)
-    return (tmp_path / 'good.yaml').read_bytes()
-
-
 DAMAGES = {
     'empty': lambda text: b'', 'truncated': lambda text: text[:len(text) // 2],
     'garbage': lambda text: bytes(range(256)) * 4,
@@ -307,7 +301,9 @@ DAMAGES = {
 
 @pytest.mark.parametrize('damage', DAMAGES.values(), ids=DAMAGES.keys())
 def test_a_damaged_file_is_reported_in_one_sentence_and_kept(tmp_path, damage):
-    path, content = tmp_path / 'table.yaml', damage(whole(tmp_path))
+    path = tmp_path / 'table.yaml'
+    write_bias_table(path, jumped()[0], 0.0)
+    content = damage(path.read_bytes())
     path.write_bytes(content)
     table, message = read_bias_table(path, MODEL)
     assert 'cannot be read' in message and '\n' not in message

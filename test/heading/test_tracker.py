@@ -37,11 +37,6 @@ KNOWN = np.diag([SCALE ** 2, BIAS ** 2 + XV3500.allan_floor ** 2])
 INTERVAL = 0.05
 
 
-def sensitivity_of(rate):
-    """Return what rates change by with s and b, shape (2, n)."""
-    return -np.vstack([rate, np.ones(len(rate))])
-
-
 def gyro(motion, generator, noise=XV3500, bias=None):
     """Return time, true rate, heading, and rates of a gyro calibrated on the 20 s before."""
     known, time = round(20.0 / INTERVAL), np.arange(0.0, motion.duration, INTERVAL)
@@ -53,8 +48,8 @@ def gyro(motion, generator, noise=XV3500, bias=None):
 
 
 def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False):
-    return track(time, rate, sensitivity_of(rate), noise, KNOWN, settings or Settings(),
-                 wheels, hindsight)
+    return track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, KNOWN,
+                 settings or Settings(), wheels, hindsight)
 
 
 # the filter
