@@ -128,7 +128,12 @@ def answers(generator, curve, runs=5, rests=12, **given):
         table.begin_run()
         at_begin = _predicted(table, history, run, 0, 0.0)
         said = learn(table, history, run, slice(0, rests // 2))
-        middle = _middle(table, history, run, rests // 2, generator.uniform(-8.0, 8.0))
+        rest, further = rests // 2, generator.uniform(-8.0, 8.0)
+        temperature, time = history.temperature[run, rest], history.time[run, rest]
+        change = history.curve(temperature + further) - history.curve(temperature)
+        difference, variance = table.bias_difference(temperature, temperature + further, time)
+        middle = (*_predicted(table, history, run, rest, further), difference - change,
+                  math.sqrt(variance), change)
         said = np.array(
             [bool(text) for text in said + learn(table, history, run, slice(rests // 2, None))])
         outlier = history.outlier[run]
@@ -142,14 +147,6 @@ def _predicted(table, history, run, rest, further):
     bias, variance = table.predict(temperature + further, time)
     return (bias - history.bias[run, rest] - history.curve(temperature + further)
             + history.curve(temperature), math.sqrt(variance))
-
-
-def _middle(table, history, run, rest, further):
-    temperature, time = history.temperature[run, rest], history.time[run, rest]
-    change = history.curve(temperature + further) - history.curve(temperature)
-    difference, variance = table.bias_difference(temperature, temperature + further, time)
-    return (*_predicted(table, history, run, rest, further), difference - change,
-            math.sqrt(variance), change)
 
 
 def carried_answers(generator, curve, runs=4, rests=12, **given):

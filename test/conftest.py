@@ -341,12 +341,13 @@ def hold_node(ros_domain, monkeypatch):
 class Ros:
     """A node in the process of the test, with an executor that spins in a thread."""
 
-    def __init__(self):
+    def __init__(self, domain=None):
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
         self._context = rclpy.Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(context=self._context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
         self.node = rclpy.create_node('test_client', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -368,11 +369,11 @@ class Ros:
         """Return a publisher with the quality of a sensor, if nothing else is said."""
         return self.node.create_publisher(message_type, topic, quality or _sensor_quality())
 
-    def call(self, service_type, name):
+    def call(self, service_type, name, **request):
         """Call a service, and return the future of its response."""
         client = self.node.create_client(service_type, name)
         assert client.wait_for_service(30.0), f'no service {name} within 30 s'
-        return client.call_async(service_type.Request())
+        return client.call_async(service_type.Request(**request))
 
     def close(self):
         """Join the thread and leave nothing behind."""

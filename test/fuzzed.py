@@ -45,7 +45,7 @@ from gyro_calibration.driver.protocols import (
     Sample,
     Settings,
 )
-from gyro_calibration.driver.protocols.protocol import LineSplitter, Splitter
+from gyro_calibration.driver.protocols.protocol import LineSplitter
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.files import MAX_MAGNITUDE
 from gyro_calibration.heading.bias_table import (
@@ -173,7 +173,9 @@ def _check_account(wire: _Wire, data: bytes, used: int) -> None:
     """Check that every byte is accounted for, little is held back, and garbage costs one line."""
     good, splitter = b''.join(wire.frames), wire.protocol.splitter()
     splitter.feed(data)
-    found, wanted = len(splitter.feed(good)), len(_clean(wire).feed(good))
+    synchronized = wire.protocol.splitter()  # knows where the next frame begins
+    synchronized.feed(wire.protocol.preamble)
+    found, wanted = len(splitter.feed(good)), len(synchronized.feed(good))
     assert found >= wanted - isinstance(splitter, LineSplitter), 'garbage costs more than itself'
     splitter = wire.protocol.splitter()
     if zlib.crc32(data) % 16 == 0:
@@ -187,13 +189,6 @@ def _check_account(wire: _Wire, data: bytes, used: int) -> None:
         framed, splitter.discarded_bytes, ends, len(data))
     assert (splitter.discarded_bytes - before <= HELD
             and sum(frame.skipped_bytes for frame in frames) <= before and used <= len(frames))
-
-
-def _clean(wire: _Wire) -> Splitter:
-    """Return a splitter that knows where the next frame begins."""
-    splitter = wire.protocol.splitter()
-    splitter.feed(wire.protocol.preamble)
-    return splitter
 
 
 def _decoder_seeds(wire: _Wire) -> list[bytes]:

@@ -178,10 +178,6 @@ def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
                for name in EXECUTABLES)
     assert parts == {str(file.relative_to(ROOT))
                      for file in (ROOT / 'gyro_calibration').rglob('*.*') if file.suffix != '.pyc'}
-    check_metadata(wheel)
-
-
-def check_metadata(wheel):
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     metadata, = importlib.metadata.distributions(path=[str(wheel)])
     assert metadata.version == manifest.findtext('version')

@@ -17,7 +17,6 @@ from xml.etree import ElementTree
 import pytest
 from rig import rested
 from test_layers import calls, FILES, imports
-import yaml
 
 try:
     from nav_msgs.msg import Odometry
@@ -33,10 +32,6 @@ POLICY = ElementTree.parse(ROOT / 'config/sros2/policy.xml').getroot()
 ENCLAVES = {enclave.get('path').rpartition('/')[2]: enclave for enclave in POLICY.iter('enclave')}
 
 # What the package may import, run and start
-
-
-def belongs(name, roots):
-    return any(name == root or name.startswith(f'{root}.') for root in roots)
 
 
 NETWORK = {'socket', 'socketserver', 'ssl', 'asyncio', 'http', 'urllib.request', 'xmlrpc',
@@ -57,7 +52,7 @@ PROCESSES = {'subprocess', 'pty.spawn', *(f'os.{start}{how}' for start in ('exec
     ids=['the network', 'code from data', 'processes', 'workers', 'YAML'])
 def test_no_file_but_those_excepted_uses(forbidden, excepted):
     assert {path.name for path in FILES for name in imports(path) | calls(path)
-            if belongs(name, forbidden)} == excepted
+            if any(name == root or name.startswith(f'{root}.') for root in forbidden)} == excepted
 
 
 def test_only_the_command_line_runs_a_file_that_the_user_names():
@@ -72,12 +67,6 @@ def test_a_kind_of_message_chooses_no_module_that_a_recorder_imports(kind):
     from gyro_calibration.ros.recorder_node import load_message_class
     with pytest.raises(ImportError, match='no kind of messages'):
         load_message_class(kind)
-
-
-def test_yaml_is_read_as_plain_data():
-    from gyro_calibration.model import settings_file
-    assert 'yaml.load(text, _Loader)' in Path(settings_file.__file__).read_text()
-    assert issubclass(settings_file._Loader, yaml.BaseLoader), 'it constructs texts and lists only'
 
 
 # The policy of a secured graph

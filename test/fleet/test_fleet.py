@@ -120,17 +120,13 @@ def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_p
         'b.csv': '7', 'x/bag': '', 'c.csv': '', '.mcap': ''}
 
 
-def _mcap(said):
-    pairs = b''.join(text(name) + text(value) for name, value in said.items())
-    return MCAP + record(1, bytes(8)) + record(
-        0x0C, text('gyro') + struct.pack('<I', len(pairs)) + pairs)
-
-
 def test_notes_metadata_and_names_say_what_a_table_does_not(tmp_path):
+    pairs = b''.join(map(text, ('unit', '9', 'Drive', 'm', 'temperature', '21.5 degC')))
+    metadata = record(0x0C, text('gyro') + struct.pack('<I', len(pairs)) + pairs)
     written = {
         'plain.csv': b'# Movella DOT unit 1, RTK course; drive h, 2024\ntime_s,gyro_dps\n',
         'keyed.csv': b'# unit: SN-12, type: DOT\n# date: 2026-03-01\ntime_s,gyro_dps\n',
-        'bag.mcap': _mcap({'unit': '9', 'Drive': 'm', 'temperature': '21.5 degC'}),
+        'bag.mcap': MCAP + record(1, bytes(8)) + metadata,
         'rc_car_h_unit3.csv': b'time_s,gyro_dps\n', 'aimless.csv': b'# a drive in town\nx\n'}
     for name, content in written.items():
         (tmp_path / name).write_bytes(content)

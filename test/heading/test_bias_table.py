@@ -33,7 +33,6 @@ from gyro_calibration.heading.bias_table import (
     Entry,
     Jump,
     MAX_ENTRIES,
-    MIN_WRITE_INTERVAL,
     model_digest,
     Prior,
     read_bias_table,
@@ -284,12 +283,6 @@ def test_no_file_is_no_fault(tmp_path):
     assert message == '' and not table.entries and table.run == 0
 
 
-def whole(tmp_path):
-    """Return the text of a good file."""
-    write_bias_table(tmp_path / 'good.yaml', jumped()[0], 0.0)
-    return (tmp_path / 'good.yaml').read_bytes()
-
-
 DAMAGES = {
     'empty': lambda text: b'', 'truncated': lambda text: text[:len(text) // 2],
     'garbage': lambda text: bytes(range(256)) * 4,
@@ -308,7 +301,9 @@ DAMAGES = {
 
 @pytest.mark.parametrize('damage', DAMAGES.values(), ids=DAMAGES.keys())
 def test_a_damaged_file_is_reported_in_one_sentence_and_kept(tmp_path, damage):
-    path, content = tmp_path / 'table.yaml', damage(whole(tmp_path))
+    path = tmp_path / 'table.yaml'
+    write_bias_table(path, jumped()[0], 0.0)
+    content = damage(path.read_bytes())
     path.write_bytes(content)
     table, message = read_bias_table(path, MODEL)
     assert 'cannot be read' in message and '\n' not in message
@@ -364,16 +359,3 @@ def test_a_clock_that_is_set_moves_all_dates_since_the_table_began_and_no_others
     assert table.jumps[-1].time == begin + step + 300.0, 'that of what was held back'
     table.mark_written(begin + step + 420.0)
     assert not table.is_write_due(begin + step + 1e4)
-
-
-def test_it_is_written_seldom_and_only_when_it_learned():
-    table = BiasTable(MODEL)
-    assert not table.is_write_due(0.0) and not table.is_write_due(0.0, ending=True)
-    table.add(20.0, 0.0, WHITE, 0.0)
-    assert table.is_write_due(0.0)
-    table.mark_written(0.0)
-    assert not table.is_write_due(MIN_WRITE_INTERVAL, ending=True)
-    table.add(25.0, 0.0, WHITE, 60.0)
-    assert [table.is_write_due(now) for now in (60.0, MIN_WRITE_INTERVAL - 1.0, MIN_WRITE_INTERVAL,
-                                                -MIN_WRITE_INTERVAL)] == [False, False, True, True]
-    assert table.is_write_due(60.0, ending=True)

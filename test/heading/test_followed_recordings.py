@@ -27,8 +27,11 @@ from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.motion import CALIBRATION_MOTION, motion_from_headings
 from gyro_calibration.model.noise import Noise
+from gyro_calibration.ros.calibration_session import ODOMETRY
+from gyro_calibration.ros.inputs import Velocity
 import numpy as np
 import pytest
+from rig import Rig
 
 FOLLOWED = 300.0
 STARTS = (0.0, 290.0, 580.0, 870.0, 1160.0)
@@ -125,6 +128,27 @@ def test_on_the_stamps_as_they_are_too(recording, seconds):
     print(f'{name} {seconds:g} s: inside 95 % in {100.0 * np.array(inside)} % of the time')
     assert (not found if name == 'yaw_fast'
             else len(found) >= len(STARTS) - 1 and np.mean(inside) >= 0.9)
+
+
+def test_a_node_that_is_calibrated_by_odometry_on_20_s_follows_the_encoder_for_five_minutes(
+        tmp_path, data):
+    log = read(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
+    part = log.time < FOLLOWED
+    time, output, heading = (log.time[part], -log.output[part],
+                             log.reference_heading[part] - log.reference_heading[0])
+    rig = Rig(tmp_path, model='', stationary_threshold=0.0, calibration_reference=ODOMETRY)
+    rig.begin(ODOMETRY)
+    answers, found = [], []
+    for stamp, rate, turned in zip(time.tolist(), output.tolist(), heading.tolist()):
+        nanoseconds = round(1e9 * stamp)
+        rig.clock.now = 1000.0 + stamp
+        rig.pipeline.add_odometry(nanoseconds, math.remainder(turned, math.tau), Velocity())
+        found.append(rig.pipeline.add_sample(nanoseconds, rate).heading)
+        if rig.session.run and rig.ended:
+            answers.append(rig.session.conclude())
+    assert answers and answers[0][0], answers
+    error, pure = np.array(found) - found[0] - heading, integrate(time, output) - heading
+    assert rms(error) < rms(pure) / 3.0, (rms(error), rms(pure), answers)
 
 
 @pytest.mark.parametrize('name, change', [('slow', 0.3), ('fast', 0.1)])

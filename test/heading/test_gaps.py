@@ -20,11 +20,9 @@ import math
 
 from faulty_heading import one
 from gyro_calibration.heading.integration import (
-    BlockIntegrator,
     gap_variances,
     integrate,
     Intervals,
-    Threshold,
 )
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, write_log
@@ -217,27 +215,6 @@ def test_a_correction_waits_for_motion_also_with_other_settings():
         headings.append(tracker.heading)
     assert tracker.is_resting and math.sqrt(tracker.variance) > 1.0 * DEGREE
     assert np.ptp(headings[2900:]) == 0.0
-
-
-def test_a_log_in_blocks_says_the_same_as_sample_by_sample():
-    generator = np.random.default_rng(5)
-    true = driven(30.0, generator)
-    comes = kept(len(true), 0.05, 20, generator)
-    time = (np.arange(len(true)) * INTERVAL)[comes]
-    rate = (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes]
-    tracked = track(time, rate, sensitivity_of(rate), WHITE, KNOWN, Settings(false_alarms=0.0))
-    integrator, cuts = BlockIntegrator(Threshold(0.0), WHITE, KNOWN), np.array([100, 101, 900])
-    split = (np.split(time, cuts), np.split(rate, cuts),
-             np.split(sensitivity_of(rate), cuts, axis=1))
-    parts = [integrator.add(*part) for part in zip(*split)]
-    heading, deviation = (np.concatenate([part[place] for part in parts]) for place in (1, 2))
-    assert heading == pytest.approx(tracked.heading, abs=1e-9)
-    # sample by sample the calibration's part is counted once a second
-    assert (deviation ** 2 == pytest.approx(tracked.variance, rel=1e-3)
-            and integrator.intervals.lost_samples == tracked.intervals.lost_samples > 0)
-    whole = track(np.arange(len(true)) * INTERVAL, true, sensitivity_of(true), WHITE, KNOWN,
-                  Settings(false_alarms=0.0))
-    assert whole.variance[-1] < 0.7 * tracked.variance[-1]
 
 
 @pytest.mark.parametrize('option', [(), ('--rest',)])

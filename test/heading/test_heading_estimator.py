@@ -117,16 +117,6 @@ def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_be
             and live.age(later) == pytest.approx(300.0 * 86400.0))
 
 
-def test_a_clock_that_is_set_by_seconds_lets_the_tracker_go_on():
-    live = begun()
-    for index in range(10):
-        live.add(INTERVAL * index, 0.0, NOW)
-    before = live.restart_count
-    live.shift_clock(5.0)
-    live.add(INTERVAL * 10, 0.0, NOW + 5.0)
-    assert live.restart_count == before
-
-
 def test_an_uncalibrated_gyro_learns_its_bias_at_rest_but_not_its_scale():
     gyro = Gyro(begun(GyroModel(noise=NOISE)), bias=0.3 * DEGREE).go(60.0)
     stood = gyro.error

@@ -37,11 +37,6 @@ KNOWN = np.diag([SCALE ** 2, BIAS ** 2 + XV3500.allan_floor ** 2])
 INTERVAL = 0.05
 
 
-def sensitivity_of(rate):
-    """Return what rates change by with s and b, shape (2, n)."""
-    return -np.vstack([rate, np.ones(len(rate))])
-
-
 def gyro(motion, generator, noise=XV3500, bias=None):
     """Return time, true rate, heading, and rates of a gyro calibrated on the 20 s before."""
     known, time = round(20.0 / INTERVAL), np.arange(0.0, motion.duration, INTERVAL)
@@ -53,8 +48,8 @@ def gyro(motion, generator, noise=XV3500, bias=None):
 
 
 def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False):
-    return track(time, rate, sensitivity_of(rate), noise, KNOWN, settings or Settings(),
-                 wheels, hindsight)
+    return track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, KNOWN,
+                 settings or Settings(), wheels, hindsight)
 
 
 # the filter
@@ -139,38 +134,25 @@ def test_the_variance_after_a_calibration_is_that_of_the_noise():
 # rest and motion
 
 
-def test_a_rest_determines_the_bias_as_well_as_stated():
-    errors = []
-    for seed in range(40):
-        generator = np.random.default_rng(seed)
-        bias = BIAS * generator.standard_normal()
-        time, _, _, rate = gyro(motion_from_rates(np.array([0.0, 40.0]), np.zeros(2)), generator,
-                                Noise(XV3500.angle_random_walk), bias=-bias)
-        tracker = HeadingTracker(Noise(XV3500.angle_random_walk), KNOWN, Settings())
-        for at, value in zip(time, rate):
-            tracker.add(at, value, np.array([-value, -1.0]))
-        found, deviation = tracker.bias
-        assert deviation < 0.7 * BIAS
-        errors.append((found - bias) / deviation)
-    assert np.mean(np.square(errors)) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 40))
-
-
-def test_rests_of_less_than_two_seconds_between_turns_show_the_bias():
-    """After ten rests of 1.6 s it is known to a third of before, and as well as stated."""
-    errors, deviations, wide = [], [], np.diag([SCALE ** 2, (0.2 * DEGREE) ** 2])
-    for seed in range(10):
+@pytest.mark.parametrize('motion, before, share, runs', [
+    (constant_rate_motion([(40, 0)]), BIAS, 0.7, 40),
+    (constant_rate_motion([(1.6, 0), (2, 45)] * 10), 0.2 * DEGREE, 1.0 / 3.0, 10)],
+    ids=['one of 40 s', 'ten of 1.6 s between turns'])
+def test_rests_determine_the_bias_as_well_as_stated(motion, before, share, runs):
+    """It is known to a share of the standard deviation of before."""
+    errors, deviations, white = [], [], Noise(XV3500.angle_random_walk)
+    for seed in range(runs):
         generator = np.random.default_rng([6, seed])
-        bias = 0.2 * DEGREE * generator.standard_normal()
-        time, _, _, rate = gyro(constant_rate_motion([(1.6, 0), (2, 45)] * 10), generator,
-                                Noise(XV3500.angle_random_walk), bias=-bias)
-        tracker = HeadingTracker(Noise(XV3500.angle_random_walk), wide, Settings())
+        bias = before * generator.standard_normal()
+        time, _, _, rate = gyro(motion, generator, white, bias=-bias)
+        tracker = HeadingTracker(white, np.diag([SCALE ** 2, before ** 2]), Settings())
         for at, value in zip(time, rate):
             tracker.add(at, value, np.array([-value, -1.0]))
         found, deviation = tracker.bias_for(np.array([0.0, -1.0]))
         deviations.append(deviation)
         errors.append((found - bias) / deviation)
-    assert np.median(deviations) < 0.2 * DEGREE / 3.0
-    low, high = rms_bounds(10)
+    assert np.median(deviations) < share * before
+    low, high = rms_bounds(runs)
     assert low < math.sqrt(np.mean(np.square(errors))) < high, errors
 
 

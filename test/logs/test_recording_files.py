@@ -26,7 +26,7 @@ from gyro_calibration.logs.cdr import (
     serialize,
     TEMPERATURE,
 )
-from gyro_calibration.logs.log import LogError, read_log, write_log
+from gyro_calibration.logs.log import LogError, read_log, select_rows, write_log
 from gyro_calibration.logs.recording import read_recording, split_blocks, Topics
 from gyro_calibration.logs.ros_bag import is_recording
 import numpy as np
@@ -52,19 +52,12 @@ def gyro(make, time, rate, **how):
     return [(at, make.imu(at, value, **how)) for at, value in zip(time, rate, strict=True)]
 
 
-def measured(data):
-    """Return 800 samples of a gyro on a turntable, with a reference heading."""
-    log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
-    return replace(log, **{name: values[:800] for name, values in vars(log).items()
-                           if isinstance(values, np.ndarray)})
-
-
 # Storage
 
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_a_recording_holds_what_the_log_held(data, tmp_path, kind):
-    log = measured(data)
+    log = select_rows(read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz'), slice(800))
     folder = write(tmp_path / 'bag', of_log(log), **KINDS[kind])
     # As a folder, and as a file without metadata.yaml.
     for path in (folder, shutil.copy(file_of(folder), tmp_path)):

@@ -115,16 +115,6 @@ def rest(mean, count, seed=0):
     return mean + 1e-3 * np.random.default_rng(seed).standard_normal(count)
 
 
-def with_other_axes(message):
-    """Fill in what another driver measures: rates about x and y, and accelerations."""
-    message.angular_velocity.x, message.angular_velocity.y = 0.1, -0.2
-    message.angular_velocity_covariance = [1e-4, 1e-6, 0.0, 1e-6, 2e-4, 0.0, 0.0, 0.0, 9.0]
-    acceleration = message.linear_acceleration
-    acceleration.x, acceleration.y, acceleration.z = 0.3, 0.4, 9.8
-    message.linear_acceleration_covariance = [0.5, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.7]
-    return message
-
-
 @pytest.fixture
 def hold(hold_node, tmp_path):
     (tmp_path / 'model.yaml').write_text(MODEL)
@@ -150,7 +140,13 @@ def test_what_is_published(hold, tmp_path):
     held.tick()  # now it knows who subscribes
     for number in range(100):
         held.send('/imu/data_raw', sample(number, 0.5))
-    held.send('/imu/data_raw', with_other_axes(sample(100, 0.5)))
+    message = sample(100, 0.5)  # with the other axes, of a driver that measures them
+    message.angular_velocity.x, message.angular_velocity.y = 0.1, -0.2
+    message.angular_velocity_covariance = [1e-4, 1e-6, 0.0, 1e-6, 2e-4, 0.0, 0.0, 0.0, 9.0]
+    acceleration = message.linear_acceleration
+    acceleration.x, acceleration.y, acceleration.z = 0.3, 0.4, 9.8
+    message.linear_acceleration_covariance = [0.5, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.7]
+    held.send('/imu/data_raw', message)
     imus, headings, rates = (held.sent[topic] for topic in ('/imu/data', '/heading', '/yaw_rate'))
     assert len(imus) == len(headings) == len(rates) == 101
     imu, heading, rate = imus[-1], headings[-1], rates[-1]

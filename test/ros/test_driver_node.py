@@ -231,35 +231,6 @@ def test_a_node_reports_in_its_namespace_also_without_gyro_samples_and_clock(
 # As a robot runs it: its own process, a pseudo-terminal for the gyro, and DDS
 
 
-class Robot:
-
-    def __init__(self, ros, start_node, wait_until, port, protocol, parameters):
-
-        self._wait_until = wait_until
-        self.rates = ros.collect(Imu, 'imu/data_raw')
-        self.temperatures = ros.collect(Temperature, 'imu/temperature')
-        self.diagnostics = ros.collect(DiagnosticArray, '/diagnostics', 10)
-        self.node = start_node('driver_node', {'port': port, 'protocol': protocol, **parameters})
-
-    def wait(self, condition, what):
-        self._wait_until(condition, 60.0, f'{what}; output:\n{self.node.output}')
-
-    def reports(self, words, level):
-        def found():
-            statuses = [array.status[0] for array in self.diagnostics]
-            return [status for status in statuses
-                    if words in status.message and status.level == level]
-        self.wait(found, words)
-        return found()[-1]
-
-
-@pytest.fixture
-def robot(ros, start_node, wait_until):
-    def start(port, protocol='csv', **parameters):
-        return Robot(ros, start_node, wait_until, port, protocol, parameters)
-    return start
-
-
 def counting(frequency=100.0):
     """Return the samples of a gyro whose rate is its number in 1e-4 rad/s, to show holes."""
     return (Sample(1e-4 * number, 31.5, number / frequency) for number in itertools.count())
@@ -269,29 +240,24 @@ def seconds(message):
     return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
 
 
-def interrupt_often(node):
-    """
-    End a node as under a launch file, where Ctrl-C comes twice: from the terminal and from launch.
-
-    It ends with code 0 all the same, or the fixture fails.
-
-    """
-    for _ in range(40):
-        node.interrupt()
-    assert node.stop() == 0
-
-
-def test_a_gyro_is_published_end_to_end(robot, ros):
+def test_a_gyro_is_published_end_to_end(ros, start_node, wait_until):
     """A replay at 1 kHz waits for a driver that a busy machine holds up: no sample is lost."""
+    rates = ros.collect(Imu, 'imu/data_raw')
+    temperatures = ros.collect(Temperature, 'imu/temperature')
+    reports = ros.collect(DiagnosticArray, '/diagnostics', 10)
     with Emulator(find_protocol('csv'), counting(500.0), speed=2.0, wait_for_reader=True) as gyro:
-        driver = robot(gyro.path, frame_id='my_gyro')
-        driver.wait(lambda: len(driver.rates) > 3000 and len(driver.temperatures) > 3000,
-                    'samples')
-        status = driver.reports('samples come', DiagnosticStatus.OK)
+        node = start_node('driver_node', {'port': gyro.path, 'protocol': 'csv',
+                                          'frame_id': 'my_gyro'})
+        wait_until(lambda: len(rates) > 3000 and len(temperatures) > 3000, 60.0, 'samples')
+        wait_until(lambda: any((array.status[0].level, array.status[0].message) == (
+            DiagnosticStatus.OK, 'samples come') for array in reports), 60.0, 'samples come')
         offered = [ros.node.get_publishers_info_by_topic(topic)[0].qos_profile
                    for topic in ('/imu/data_raw', '/imu/temperature')]
-        interrupt_often(driver.node)
-    rates, temperatures = list(driver.rates), list(driver.temperatures)
+        # under a launch file Ctrl-C comes twice: from the terminal and from launch
+        for _ in range(40):
+            node.interrupt()
+        assert node.stop() == 0
+    rates, temperatures, status = list(rates), list(temperatures), reports[-1].status[0]
     numbers = [round(1e4 * message.angular_velocity.z) for message in rates]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     stamps = [seconds(message) for message in rates]

@@ -55,11 +55,6 @@ class Turning:
                     for number in itertools.count())
 
 
-def turned(first, last):
-    """Return the angle that it turns from a sample to another, by their numbers."""
-    return ((last - first) * FIRST + 0.5 * STEP * (last ** 2 - first ** 2)) / RATE
-
-
 class Heard:
 
     def __init__(self, ros, wait_until, namespace=''):
@@ -82,7 +77,8 @@ class Heard:
 
     def error(self, first, last):
         """Return what the heading is off by from one place of the lists to another, rad."""
-        truth = turned(self.numbers[first], self.numbers[last])
+        begin, end = self.numbers[first], self.numbers[last]
+        truth = ((end - begin) * FIRST + 0.5 * STEP * (end ** 2 - begin ** 2)) / RATE
         return abs(math.remainder(self.headings[last] - self.headings[first] - truth,
                                   2.0 * math.pi))
 
@@ -132,7 +128,9 @@ def test_two_compensation_nodes_go_on_through_any_order_of_starting_and_a_driver
         for heard in (first, second):
             heard.more(200)
             assert heard.missing() == 0 and heard.error(0, -1) < NEARLY
-        _kill(driver)
+        driver.waited = True
+        os.killpg(driver.process.pid, signal.SIGKILL)
+        driver.process.wait()
         # a new one may come within half a second, which is no gap; samples may be on their way
         time.sleep(1.5)
         before = {heard: len(heard.numbers) - 1 for heard in (first, second)}
@@ -155,12 +153,6 @@ def test_two_compensation_nodes_go_on_through_any_order_of_starting_and_a_driver
         _, again = compensation()
         again.more(100)
         assert again.missing() == 0 and again.error(0, -1) < NEARLY
-
-
-def _kill(node):
-    node.waited = True
-    os.killpg(node.process.pid, signal.SIGKILL)
-    node.process.wait()
 
 
 _HANGING = """
@@ -274,25 +266,17 @@ def values_of(diagnostics, key):
 SOAK = Path(__file__).parents[2] / 'benchmarks' / 'soak.py'
 
 
-def soaked(*words):
-    command = [sys.executable, SOAK, '--json', *words]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=4000, check=False)
-    assert result.returncode == 0, result.stderr
-    return [json.loads(line) for line in result.stdout.splitlines()]
-
-
-@pytest.fixture
-def quiet():
-    """Skip where so much else runs that 1 kHz cannot be kept up with, whatever the nodes do."""
+@pytest.mark.parametrize('minutes', [0.1, pytest.param(60, marks=pytest.mark.evidence)])
+def test_no_sample_is_lost_between_the_line_and_the_corrected_rates(ros_domain, minutes):
+    """At 1 kHz; what memory does shows in the hour, in 6 s it only must not run away."""
     load, cores = os.getloadavg()[0], os.cpu_count()
     if load > 4.0 * cores:
         pytest.skip(f'the load average is {load:.0f} on {cores} cores: run it alone')
-
-
-@pytest.mark.parametrize('minutes', [0.1, pytest.param(60, marks=pytest.mark.evidence)])
-def test_no_sample_is_lost_between_the_line_and_the_corrected_rates(ros_domain, quiet, minutes):
-    """At 1 kHz; what memory does shows in the hour, in 6 s it only must not run away."""
-    found = soaked('--minutes', str(minutes), '--patient')[0]
+    result = subprocess.run(
+        [sys.executable, SOAK, '--json', '--minutes', str(minutes), '--patient'],
+        capture_output=True, text=True, timeout=4000, check=False)
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout.splitlines()[0])
     assert found['sent'] == 60000 * minutes
     assert found['missing'] == 0 and found['repeated'] == 0
     assert found['read_by_driver'] == found['sent_with_leading'] and found['lost_by_driver'] == 0

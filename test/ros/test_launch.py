@@ -13,9 +13,9 @@
 from importlib.util import find_spec
 from pathlib import Path
 import random
-import time
 import unittest
 
+from conftest import Ros, wait_until
 import pytest
 
 # No import of ROS 2 and no skip at module level: launch_testing imports each test module while it
@@ -62,65 +62,41 @@ class TestGraph(unittest.TestCase):
     """While the nodes run."""
 
     def setUp(self):
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
-        self.node = rclpy.create_node('test_launch', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        self.ros = Ros(DOMAIN)
 
     def tearDown(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.context.shutdown()
-
-    def spin_until(self, condition, each_turn=lambda: None):
-        """Spin for at most 20 s, since discovery takes 0.3 s or 3 s, at random."""
-        deadline = time.monotonic() + 20.0
-        while not condition() and time.monotonic() < deadline:
-            each_turn()
-            self.executor.spin_once(timeout_sec=0.01)
-        return condition()
+        self.ros.close()
 
     def test_a_launch_argument_goes_before_the_file(self):
         from rcl_interfaces.srv import GetParameters
-        client = self.node.create_client(GetParameters, '/robot/driver_node/get_parameters')
-        assert self.spin_until(client.service_is_ready), 'no driver'
-        answer = client.call_async(
-            GetParameters.Request(names=['port', 'frame_id', 'use_sim_time']))
-        assert self.spin_until(answer.done), 'no answer'
+        answer = self.ros.call(GetParameters, '/robot/driver_node/get_parameters',
+                               names=['port', 'frame_id', 'use_sim_time'])
+        wait_until(answer.done, what='an answer')
         port, frame, simulated = answer.result().values
         assert (port.string_value, frame.string_value) == ('/nonexistent/gyro', 'gyro_link')
         assert simulated.bool_value is False
 
     def test_the_topics_of_a_shared_base_are_received(self):
         for topic in ('/base/odom', '/base/cmd_vel'):
-            assert self.spin_until(lambda: self.node.count_subscribers(topic)), topic  # noqa: B023
+            wait_until(lambda: self.ros.node.count_subscribers(topic), what=topic)  # noqa: B023
 
     def test_the_heading_follows_the_raw_output(self):
-        from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import Imu
         headings = self.headings('/robot/heading')
-        publisher = self.node.create_publisher(Imu, '/robot/imu/data_raw', qos_profile_sensor_data)
-        assert self.spin_until(lambda: headings,
-                               lambda: publisher.publish(self.sample(Imu()))), 'no heading'
+        publisher = self.ros.publisher(Imu, '/robot/imu/data_raw')
+        wait_until(lambda: publisher.publish(self.sample(Imu())) or headings, what='a heading')
 
     def test_the_demo_has_a_heading(self):
         headings = self.headings('/heading')
-        assert self.spin_until(lambda: headings), 'no heading'
+        wait_until(lambda: headings, what='a heading')
 
     def headings(self, topic):
         from geometry_msgs.msg import PoseWithCovarianceStamped
-        from rclpy.qos import qos_profile_sensor_data
-        headings = []
-        self.node.create_subscription(PoseWithCovarianceStamped, topic, headings.append,
-                                      qos_profile_sensor_data)
-        return headings
+        return self.ros.collect(PoseWithCovarianceStamped, topic)
 
     def sample(self, message):
         """Fill in 0.1 rad/s now, and no acceleration or orientation in the form of REP-145."""
-        message.header.stamp = self.node.get_clock().now().to_msg()
+        message.header.stamp = self.ros.node.get_clock().now().to_msg()
         message.angular_velocity.z = 0.1
         message.orientation_covariance[0] = message.linear_acceleration_covariance[0] = -1.0
         return message

@@ -394,28 +394,22 @@ def test_a_turn_between_two_rests_while_two_publishers_send_is_in_the_variance(t
     assert not rig.pipeline.conflict and 2.0 < abs(error) < 3.0 * deviation, (error, deviation)
 
 
-@pytest.mark.parametrize('pause, interval', [(0.4, INTERVAL), (1.5, 0.006), (1.5, 0.05)])
-def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path, pause, interval):
+STARTED_AGAIN = {  # pause, s, samples after it and interval, s
+    'soon': [(0.4, 400, INTERVAL)], 'faster': [(1.5, 667, 0.006)], 'slower': [(1.5, 80, 0.05)],
+    'late at first': [(1.5, 1, INTERVAL), (0.04, 1, INTERVAL), (0.0, 3, 3e-4),
+                      (0.0, 100, INTERVAL)]}
+
+
+@pytest.mark.parametrize('pieces', STARTED_AGAIN.values(), ids=STARTED_AGAIN)
+def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path, pieces):
     """Its dead predecessor is listed for up to 20 s; the stamps show that one alone sends."""
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(300, 0.5))
     rig.publishers = ['/driver_node', '/driver_node']
     rig.pipeline.update_publishers(rig.publishers)
-    rig.skip(pause)
-    rig.feed(np.full(round(4.0 / interval), 0.5), interval=interval)
-    assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
-
-
-def test_samples_that_a_new_driver_sends_late_at_first_are_not_those_of_a_second_one(tmp_path):
-    rig = Rig(tmp_path, model='')
-    rig.feed(np.full(300, 0.5))
-    rig.publishers = ['/driver_node', '/driver_node']
-    rig.pipeline.update_publishers(rig.publishers)
-    for seconds in (1.5, 0.04):
-        rig.skip(seconds)
-        rig.feed([0.5])
-    rig.feed(np.full(3, 0.5), interval=3e-4)
-    rig.feed(np.full(100, 0.5))
+    for pause, count, interval in pieces:
+        rig.skip(pause)
+        rig.feed(np.full(count, 0.5), interval=interval)
     assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
 
 
@@ -598,26 +592,17 @@ def test_a_simulation_that_is_set_back_begins_the_integration_anew(tmp_path):
 # The monitor of noise and bias
 
 
-def monitored(tmp_path, outputs, **parameters):
-    rig = Rig(tmp_path, model=CERTAIN, **parameters)
-    rig.feed(outputs, SLOW)
-    return rig
-
-
 @pytest.mark.parametrize('moved, parameters', [(0.15 * DEGREE, {}), (1.0 * DEGREE, {}),
                                                (0.15 * DEGREE, {'stationary_threshold': 0.0})],
                          ids=['below the threshold', 'above the threshold', 'without a threshold'])
-def test_a_bias_that_moved_raises_an_alarm(tmp_path, moved, parameters):
-    rig = monitored(tmp_path, noisy(42.0, bias=0.01 + moved), **parameters)
+def test_a_bias_that_moved_raises_an_alarm_which_a_calibration_at_rest_ends(
+        tmp_path, moved, parameters):
+    rates = noisy(90.0, bias=0.01 + moved)
+    rig = Rig(tmp_path, model=CERTAIN, **parameters)
+    rig.feed(rates[:1050], SLOW)
     monitor = rig.pipeline.monitor
     assert monitor.last_rest.bias == pytest.approx(moved, abs=1e-3) and not monitor.noise_alarm
     assert 'sigma of the model: calibrate' in monitor.bias_alarm
-
-
-def test_a_calibration_at_rest_ends_the_alarm(tmp_path):
-    rates = noisy(90.0, bias=0.01 + 0.2 * DEGREE, seed=1)
-    rig = monitored(tmp_path, rates[:1050])
-    assert rig.pipeline.monitor.bias_alarm
     rig.begin(REST)
     rig.feed(rates[1050:1450], SLOW)
     success, message = rig.session.conclude()

@@ -60,21 +60,17 @@ def test_the_table_is_written_seldom_and_only_if_it_learned_something(remember, 
     memory.store_table(NOW, is_final=True)
     assert not (tmp_path / 'biases.yaml').exists()
     taught(memory)
-    memory.store_table(NOW)
-    taught(memory, 35.0)
-    memory.store_table(NOW + 0.9 * MIN_WRITE_INTERVAL)
-    assert memory.table_written_time == NOW
-    memory.store_table(NOW + 1.1 * MIN_WRITE_INTERVAL)
-    assert memory.table_written_time == NOW + 1.1 * MIN_WRITE_INTERVAL
-
-
-def test_a_damaged_table_is_reported_and_kept(remember, tmp_path):
-    memory = remember(biases='entries: [')
-    assert 'cannot be read' in memory.table_hint
-    taught(memory)
-    memory.store_table(NOW, is_final=True)
-    assert ((tmp_path / 'biases.yaml.kept-1').read_text() == 'entries: ['
-            and 'is now in' in memory.table_hint)
+    # time, whether it learned another bias since, whether it ends, when it was written last
+    for temperature, (later, learned, ends, written) in enumerate([
+            (0.0, False, False, 0.0), (MIN_WRITE_INTERVAL, False, True, 0.0),
+            (60.0, True, False, 0.0), (MIN_WRITE_INTERVAL - 1.0, False, False, 0.0),
+            (MIN_WRITE_INTERVAL, False, False, MIN_WRITE_INTERVAL),
+            (MIN_WRITE_INTERVAL + 60.0, True, True, MIN_WRITE_INTERVAL + 60.0),
+            (0.0, True, False, 0.0)]):  # a clock that was set back
+        if learned:
+            taught(memory, 30.0 + 5.0 * temperature)
+        memory.store_table(NOW + later, is_final=ends)
+        assert memory.table_written_time == NOW + written, later
 
 
 def test_a_folder_that_cannot_be_written_to_is_reported_and_not_tried_each_second(tmp_path):
