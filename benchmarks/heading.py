@@ -139,7 +139,7 @@ def _looks(drive: Drive) -> np.ndarray:
 
 
 @lru_cache(1)
-def _knows_rests(known: Known) -> list[Estimate]:
+def _given_rests(known: Known) -> list[Estimate]:
     """Return the bounds of who is told the rests, live and with hindsight."""
     looks = _looks(known.drive)
     return [Estimate(heading, variance[looks])
@@ -170,7 +170,7 @@ def rows(settings: Mapping[str, Mapping[str, float]]) -> dict[str, Row]:
     for name, best in settings.items():
         found |= {f'{name}, as published': partial(_by_peer, name, None),
                   f'{name}, best settings': partial(_by_peer, name, best)}
-    found |= {f'knows the rests, {way}': lambda known, place=place: _knows_rests(known)[place]
+    found |= {f'given the rests, {way}': lambda known, place=place: _given_rests(known)[place]
               for place, way in ways}
     return found | {
         'knows s and b(t)': lambda known: Estimate(bounds.knows_errors(known.drive)),

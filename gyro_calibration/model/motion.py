@@ -190,14 +190,15 @@ def read_motion(path: str | Path) -> Motion:
 
 def _parse_number(path: str | Path, row: list[str], place: int, header: list[str]) -> float:
     """Return a number; nan is one where a reference may be lost."""
+    text = row[place] if place < len(row) else ''
     try:
-        value = float(row[place])
-    except (IndexError, ValueError):
+        value = float(text)
+    except ValueError:
         value = math.inf
     if abs(value) <= MAX_MAGNITUDE or value != value and header[place].startswith('reference_'):
         return value
-    raise MotionError(f'{path}: column {header[place]} holds something that is not a finite '
-                      'number; correct or remove the row')
+    raise MotionError(f'{path}: column {header[place]}: {excerpt(text) or "an empty cell"} is not '
+                      'a finite number; correct or remove the row')
 
 
 def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
