@@ -33,7 +33,12 @@ from gyro_calibration.heading.heading_estimator import (
     HeadingEstimator,
     TEMPERATURE_TIMEOUT,
 )
-from gyro_calibration.heading.integration import BlockIntegrator, Intervals, Threshold
+from gyro_calibration.heading.integration import (
+    BlockIntegrator,
+    Intervals,
+    MAX_GAP,
+    Threshold,
+)
 from gyro_calibration.heading.log_compensation import (
     LogCompensation,
     no_plausible_row_message,
@@ -86,12 +91,16 @@ _MISSING_INPUTS = {
 }
 
 
+_INTERVAL_REMEDY = 'check the unit of time_s, or give the sample rate with --rate'
+
+
 @dataclass
 class _Totals:
     """Counts over the blocks so far; heading and deviation of the last sample, rad."""
 
     counts: Counter[str] = field(default_factory=Counter)
     longest_gap: float = 0.0
+    usual_interval: float = 0.0
     unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
@@ -101,6 +110,7 @@ class _Totals:
     def add(self, piece: CompensatedBlock) -> None:
         log, columns = piece.log, piece.columns
         self.longest_gap = piece.intervals.longest_gap
+        self.usual_interval = piece.intervals.usual_interval
         self.counts['lost_samples'] = piece.intervals.lost_samples
         without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
         self.counts.update(
@@ -216,6 +226,10 @@ def track_log(log: Log, model: GyroModel, hindsight: bool, name: str) -> Compens
     if log.temperature is not None and not plausible_rows(model, log).any():
         raise DataRefused(f'{name}: {no_plausible_row_message(model)}')
     rows = rows_of(log, known)
+    interval = float(np.median(np.diff(np.asarray(rows.time))))
+    if interval > MAX_GAP:
+        raise DataRefused(f'{name}: the samples are {interval:g} s apart, and standstill '
+                          f'detection needs at least one in {MAX_GAP:g} s; {_INTERVAL_REMEDY}')
     time, output = LogCompensation(model).true_time(np.asarray(rows.time)), np.asarray(rows.output)
     estimator, start_date = _make_estimator(model, rows, hindsight)
     # the state of the wheels
@@ -284,13 +298,17 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Totals) -> Answ
               if quantity in found.unknown and model.uses_channel(channel)]
     lines += [f'{term.effect.name}: {term.effect.not_compensated}' for term in model.terms
               if term.effect.not_compensated]
+    if MAX_GAP < found.usual_interval < math.inf:
+        lines.append(f'The samples are {found.usual_interval:g} s apart, and the heading is that '
+                     f'of a rate which is constant meanwhile; {_INTERVAL_REMEDY}.')
     for name, words in (
             ('rows_without_output',
              'rows have no output of the gyro; the heading is integrated across them.'),
             ('refused_samples', 'rows have an implausible rate or temperature and are not used; '
              'they count as lost.'),
-            ('lost_samples', 'samples are lost; the heading is integrated over the gaps, and its '
-             'standard deviation includes them.'),
+            ('lost_samples', 'samples are lost; the heading is integrated over gaps of up to '
+             f'{MAX_GAP:g} s, not over longer ones, in which the robot may have turned to any '
+             'direction; its standard deviation includes both.'),
             ('temperature_clipped',
              'rows are outside the calibrated temperatures; the correction is extrapolated, and '
              'the standard deviation increases.'),

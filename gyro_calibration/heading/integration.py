@@ -169,6 +169,8 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
             ends * surplus * (0.5 * surplus + usual))
 
 
+#: Longest gap in the stamps that is integrated, s, unless the samples are as far apart.
+MAX_GAP = 1.0
 #: Duration, s, of the rates that show how the robot moves in a gap.
 RECENT_DURATION = 2.0
 
@@ -299,8 +301,8 @@ class BlockIntegrator:
     """
     Filter and integrate a log block by block, with the same result as in one piece.
 
-    The result is that of a `tracker.HeadingTracker` that does not detect rest, for a log without
-    gaps longer than its `maximum_gap`.
+    The result is that of a `tracker.HeadingTracker` that does not detect rest. Over a gap longer
+    than `MAX_GAP` nothing is integrated: the robot may have turned to any direction.
 
     Attributes
     ----------
@@ -343,11 +345,13 @@ class BlockIntegrator:
         before = min(carried, 1)
         time, rate = time[carried - before:], rate[carried - before:]
         rows = np.hstack([self._last_rows, np.vstack([filtered, kept, kept * sensitivity])])
-        grown = np.array(
-            [integrate(time, row, begin) for row, begin in zip(rows, self._integrals)])
         interval, step, used = np.diff(time), np.diff(rate), rows[1] > 0.0
         usual, lost = self.intervals.add_many(interval)
-        gaps = np.flatnonzero((lost > 0) & (used[1:] | used[:-1]))
+        is_long = (lost > 0) & (interval > MAX_GAP)
+        observed = time - np.cumsum(np.append(0.0, is_long * interval))
+        grown = np.array(
+            [integrate(observed, row, begin) for row, begin in zip(rows, self._integrals)])
+        gaps = np.flatnonzero((lost > 0) & ~is_long & (used[1:] | used[:-1]))
         motion, by_noise = gap_variances(self._noise, usual[gaps], lost[gaps], interval[gaps],
                                          step[gaps])
         begins, ends = (np.searchsorted(recent[0], each) for each in (
@@ -357,6 +361,8 @@ class BlockIntegrator:
         unseen: Array = np.zeros(len(time))
         unseen[0] = self._gap_variance
         unseen[gaps + 1] = np.maximum(motion, varied) + by_noise
+        fastest = np.maximum(np.abs(rate[1:]), np.abs(rate[:-1]))
+        unseen[1:][is_long] = (fastest * interval)[is_long] ** 2 + math.tau ** 2
         unseen = np.cumsum(unseen)
         self._last_rows, self._integrals = rows[:, -1:], grown[:, -1]
         self._gap_variance = float(unseen[-1])

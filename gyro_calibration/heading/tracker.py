@@ -28,6 +28,7 @@ import math
 from gyro_calibration.heading.integration import (
     gap_variances,
     Intervals,
+    MAX_GAP,
     MAX_RATE,
     RECENT_DURATION,
     Threshold,
@@ -106,7 +107,7 @@ class Settings:
 
     false_alarms: float = 0.1
     threshold: Threshold = field(default_factory=lambda: Threshold(0.0))
-    maximum_gap: float = 1.0
+    maximum_gap: float = MAX_GAP
 
 
 @dataclass(frozen=True)

@@ -232,6 +232,12 @@ def parse(data: bytes, layout: MessageLayout) -> tuple[int, tuple[float, ...]]:
     return int(numbers[0]) * NSEC_PER_SEC + int(numbers[1]), numbers[2:]
 
 
+def parse_frame(data: bytes) -> str:
+    """Return the frame_id of a message that `parse` reads."""
+    length = _UNPACK_LENGTH['<' if data[1] else '>'](data, 12)[0]
+    return data[16:15 + length].decode(errors='replace')
+
+
 def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:
     """Return a message with a header (stamp in ns since 1970) and numbers, as `parse` reads it."""
     text = frame.encode() + b'\0'

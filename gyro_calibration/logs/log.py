@@ -19,7 +19,7 @@ names each column with its unit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 import csv
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -350,19 +350,17 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
                    texts: tuple[str, ...], quantity: str) -> Array:
     if quantity in _NULLABLE_QUANTITIES:
         texts = tuple(text.strip() or 'nan' for text in texts)
+    found: list[float] = []
     try:
-        values = np.array(texts, dtype=np.float64)
+        found.extend(map(_to_number, texts))
     except ValueError:
-        row = 0  # the first that is no number
-        with suppress(ValueError):
-            for text in texts:
-                float(text)
-                row += 1
+        row = len(found)  # the first that is no number
         remedy = ('give seconds, or the sample rate with --rate'
                   if quantity == 'time' else 'leave the cell empty if the value is lost'
                   if quantity in _NULLABLE_QUANTITIES else 'correct or remove the row')
         raise LogError(f'{path}: line {line_numbers[row]}, column {column}: '
                        f'{reprlib.repr(texts[row])} is not a number; {remedy}') from None
+    values = np.array(found)
     wrong = _mask_invalid(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -371,6 +369,12 @@ def _parse_numbers(path: str | Path, line_numbers: Sequence[int], column: str,
         raise LogError(f'{path}: line {line_numbers[row]}, column {column}: {excerpt(texts[row])} '
                        f'is {fault}; remove the row')
     return values
+
+
+def _to_number(text: str) -> float:
+    if '_' in text or not text.isascii():  # which Python reads, as 10 in 1_0
+        raise ValueError(text)
+    return float(text)
 
 
 def _mask_invalid(values: Array, quantity: str) -> Mask:

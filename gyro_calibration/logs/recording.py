@@ -88,6 +88,7 @@ class _TopicBuffer:
         self.topic, self.kind, self.damaged_count = topic, kind, 0
         self._layout = cdr.parse_layout(definition, axis)
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
+        self.frames = dict[str, int]()  # number of messages of each
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -100,6 +101,8 @@ class _TopicBuffer:
         except (MessageError, OverflowError):
             self.damaged_count += 1
             return
+        frame = cdr.parse_frame(message.data)
+        self.frames[frame] = self.frames.get(frame, 0) + 1
         self._stamps.append(stamp)
         self._numbers.extend([numbers[place] for place in self._layout.quantities.values()])
 
@@ -299,6 +302,11 @@ class _LogBuilder:
         if series.damaged_count:
             self._notes.append(f'{series.damaged_count} messages of {topic} could not be read and '
                                'were left out')
+        if len(series.frames) > 1:
+            frames = [f'{count} of {name or "none"}' for name, count in series.frames.items()]
+            raise LogError(f'{self._path}: the messages of {topic} have several frames, '
+                           f'{_join_names(frames[:4])}, as of several sensors; record each on a '
+                           'topic of its own')
         return series.sort_by_arrival()
 
     def _order_samples(self, gyro: _TopicSeries, rate: float | None) -> _TopicSeries:

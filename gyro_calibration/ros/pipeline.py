@@ -38,7 +38,7 @@ from gyro_calibration.heading.heading_estimator import (
     HeadingEstimator,
     TEMPERATURE_TIMEOUT,
 )
-from gyro_calibration.heading.integration import Threshold
+from gyro_calibration.heading.integration import MAX_GAP, Threshold
 from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
@@ -72,8 +72,8 @@ PARAMETERS = (
     Parameter('wheels', 'none', 'What shows the tracker whether the robot moves.',
               choices=('none', 'odom', 'cmd_vel', 'both')),
     Parameter('cmd_vel_stamped', False, 'Whether cmd_vel is a TwistStamped.'),
-    Parameter('maximum_gap', 1.0, 'Over a longer gap in the stamps nothing is integrated.', 's',
-              (0.01, 60.0)),
+    Parameter('maximum_gap', MAX_GAP, 'Over a longer gap in the stamps nothing is integrated.',
+              's', (0.01, 60.0)),
     Parameter('stationary.method', 'rest',
               'How standstill is found: by the statistics of the rate, by the threshold filter, '
               'or not at all.', dynamic=True, choices=('rest', 'threshold', 'none')),

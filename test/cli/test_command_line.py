@@ -159,6 +159,17 @@ def test_compensate_looks_for_no_rests_where_the_noise_is_not_known(run, model, 
     assert code == 2 and 'allan' in text and not (tmp_path / 'out.csv').exists()
 
 
+@pytest.mark.parametrize('words', [(), ('--rest',), ('--hindsight',)])
+def test_compensate_does_not_take_another_unit_of_time_for_seconds(run, tmp_path, words):
+    (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
+    (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ''.join(
+        f'{1_700_000_000_000 + 10 * row},1.0\n' for row in range(300)))  # in ms
+    code, out, error = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'noisy.yaml',
+                           '--out', tmp_path / 'out.csv', *words)
+    assert code == bool(words) and '10 s apart' in (error if words else out)
+    assert 'check the unit of time_s' in (error if words else out)
+
+
 def test_compensate_gives_rates_alone_for_a_rate_table(run, model, tmp_path):
     (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n0,0\n10,9.1\n')
     assert run('compensate', tmp_path / 'table.csv', '--model', model,
