@@ -61,7 +61,8 @@ class RepeatedOutputDetector:
 
     20 equal values in 0.25 s count as repeated if odometry shows a different rate, if the noise is
     larger than the steps of the output, or if chance is excluded. Some gyros report zero at rest:
-    a repeated zero counts only after a deceleration that no robot has, 20 rad/s².
+    a repeated zero counts only after a deceleration that no robot has, 20 rad/s², or if a whole
+    stretch at rest had the noise of the model before the first such zero.
 
     """
 
@@ -69,8 +70,10 @@ class RepeatedOutputDetector:
         """Start without samples; `noise` is that of the model."""
         self._noise, self._step, self._changes = noise, math.inf, 0
         self._value, self._since, self._count, self._had_sudden_stop = math.nan, 0.0, 0, False
+        self._reports_zero = False
 
-    def add(self, time: float, output: float, odometry_rate: float) -> bool:
+    def add(self, time: float, output: float, odometry_rate: float,
+            has_noise_at_rest: bool = False) -> bool:
         """Add a sample, s and rad/s, and the rate by odometry or 0; tell if it is repeated."""
         if output != self._value:
             step = abs(output - self._value)
@@ -87,8 +90,11 @@ class RepeatedOutputDetector:
                 and abs(output - odometry_rate) > 0.5 * abs(odometry_rate)):
             return True
         sample = self._noise.angle_random_walk / math.sqrt(lasts / self._count)
+        self._reports_zero = self._reports_zero or output == 0.0 and not (
+            has_noise_at_rest or self._had_sudden_stop)
         # the step of the output is known after 100 changes
-        if output == 0.0 and not self._had_sudden_stop or self._changes <= 100 or not sample:
+        if (output == 0.0 and self._reports_zero and not self._had_sudden_stop
+                or self._changes <= 100 or not sample):
             return False
         # probability of one more equal sample, for low noise around the value; that of all must be
         # below e^-100, since it is e^-25 for a gyro that sends each sample four times
@@ -102,7 +108,8 @@ class HealthMonitor:
     Monitor of noise and bias at rest on a robot.
 
     `noise_alarm` and `bias_alarm` are a sentence each, or ''; `last_rest` is the last stretch at
-    rest, or None, and `examined_count` the number of them.
+    rest, or None, `examined_count` the number of them, and `has_noise_at_rest` whether one had the
+    noise and the bias of the model.
 
     """
 
@@ -122,7 +129,7 @@ class HealthMonitor:
         self._step = math.inf
         self.noise_alarm = self.bias_alarm = ''
         self.last_rest: RestResult | None = None
-        self.examined_count = 0
+        self.examined_count, self.has_noise_at_rest = 0, False
 
     @property
     def is_enabled(self) -> bool:
@@ -157,6 +164,8 @@ class HealthMonitor:
                                bias_variance, age, is_announced)
         if rest is not None:
             self.last_rest, self.examined_count = rest, self.examined_count + 1
+            self.has_noise_at_rest = (self.has_noise_at_rest
+                                      or rest.is_noise_normal and rest.is_bias_normal)
             self._rests = [*self._rests, rest][-_DECIDING_STRETCHES:]
             self._set_alarms(rest)
         return rest

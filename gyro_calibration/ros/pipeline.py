@@ -160,8 +160,9 @@ class Pipeline:
     Computes corrected rates and the heading from raw samples.
 
     `conflict` says why samples cannot be used, `publisher_conflict` that the graph lists several
-    publishers, `repeat_fault` that the gyro repeats one value, and `clock_fault` that stamps and
-    clock advance differently, each in a sentence or ''.
+    publishers, `repeat_fault` that the gyro repeats one value, `frame_fault` that the samples come
+    in another frame than the first, and `clock_fault` that stamps and clock advance differently,
+    each in a sentence or ''.
 
     """
 
@@ -197,6 +198,7 @@ class Pipeline:
         self._last_time, self._usual_interval = -math.inf, math.inf
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
         self._frame: str | None = None
+        self._first_frame = self.frame_fault = ''
         self.publisher_conflict, self._interleaved_count = '', 0
         self._last_arrival, self._backlog = clock.steady(), 0.0  # delay of the last samples, ns
         self._trusted_heading = 0.0, 0.0
@@ -314,9 +316,10 @@ class Pipeline:
             self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
         if frame != self._frame:
             before, self._frame = self._frame, frame
-            if before is not None:
-                self._note_jump(
-                    now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
+            if before is None:
+                self._first_frame = frame
+            else:
+                self._note_frame(now, before, frame)
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
@@ -361,6 +364,18 @@ class Pipeline:
                                          run is not None and run.kind == REST)
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
+
+    def _note_frame(self, now: float, before: str, frame: str) -> None:
+        """Note that the samples come in another frame, and end a run."""
+        self.frame_fault = '' if frame == self._first_frame else (
+            f'samples on imu/data_raw come in the frame {frame}, and came in {self._first_frame}: '
+            'if this is another gyro or mounting, give its model and start the node again')
+        if self.frame_fault:
+            self.journal.event = self.frame_fault
+            if self.session.run:
+                self.session.end(self.frame_fault)
+        self._note_jump(now,
+                        f'samples of the frames {before} and {frame} alternate on imu/data_raw')
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
@@ -438,7 +453,8 @@ class Pipeline:
 
     def _check_repeats(self, time: float, output: float, now: float) -> None:
         """Detect a repeated value, and add an unknown turn to the heading."""
-        if not self._repeat_detector.add(time, output, self.wheels.turn_rate(now)):
+        if not self._repeat_detector.add(time, output, self.wheels.turn_rate(now),
+                                         self.monitor.has_noise_at_rest):
             self.repeat_fault = ''
         elif not self.repeat_fault:
             self.repeat_fault = (f'the gyro repeats the rate {output:g} rad/s: it is dead or '

@@ -186,11 +186,14 @@ def coarse(step):
 
 
 REPEATED = {  # outputs, what comes then, rate of the odometry, whether it is a fault
-    'zero at rest': (noisy(10.0), np.zeros(3000), None, False),
+    'zero at rest': (noisy(5.0), np.zeros(3000), None, False),
     'coarse steps': (noisy(10.0), np.round(noisy(120.0) / 0.02) * 0.02, None, False),
     'each sample four times': (noisy(10.0), np.repeat(noisy(30.0), 4), None, False),
     'zero after a stop of a robot': (noisy(10.0, 0.9), stop(5.0), None, False),
     'zero where no robot stops so fast': (noisy(10.0, 0.9), stop(100.0), None, True),
+    'zero after noise at rest': (noisy(15.0), np.zeros(3000), None, True),
+    'zero at each rest': (np.concatenate([noisy(5.0), np.zeros(100), noisy(30.0)]), np.zeros(3000),
+                          None, False),
     'saturated': (coarse(0.002), np.full(500, 0.3), None, True),
     'saturated, or by chance, in coarse steps': (coarse(0.02), np.full(500, 0.3), None, False),
     'zero where odometry turns': ([], np.zeros(50), 0.3, True),
@@ -354,6 +357,17 @@ def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     assert rig.outputs[-1].heading < 0.5 * 0.2
     rig.feed(np.full(150, 0.5))
     assert not rig.pipeline.conflict
+
+
+def test_samples_in_another_frame_are_a_warning_until_the_first_returns(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN)
+    rig.feed(noisy(2.0), SLOW)
+    rig.pipeline.add_sample(rig.fed + 5 * 10 ** 6, 0.0, frame='other')
+    assert ('in the frame other' in rig.pipeline.frame_fault == rig.journal.event
+            and not rig.pipeline.conflict)
+    rig.clock.now += 5.0
+    rig.feed(noisy(1.0), SLOW)
+    assert not rig.pipeline.frame_fault
 
 
 def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_path):
