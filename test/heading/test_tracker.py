@@ -54,16 +54,15 @@ def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False
 
 # the filter
 
-def random_parts(generator, noise, count=14):
+def random_parts(generator, noise):
     """Return random turns and an unseen one, which of them are rests, and the state before."""
-    durations = generator.uniform(0.3, 3.0, count)
+    durations = generator.uniform(0.3, 3.0, 14)
     parts = [RateIntegral(duration, 0.02 * generator.standard_normal() * duration,
                           np.array([-0.3 * generator.standard_normal(), -duration]))
              for duration in durations]
-    resting = list(generator.random(count) < 0.5)
+    resting = list(generator.random(14) < 0.5)
     parts.append(RateIntegral(5.0, 0.0, np.zeros(2), lost_variance=1e-4, is_unobserved=True))
-    half = count // 2
-    return (parts[half:] + parts[:half], resting[half:] + [False] + resting[:half],
+    return (parts[7:] + parts[:7], resting[7:] + [False] + resting[:7],
             initial_state(noise, np.diag([1e-4, 1e-5]), age=0.0))
 
 
