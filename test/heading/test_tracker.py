@@ -252,19 +252,6 @@ def test_noise_that_is_twice_what_the_model_claims_is_learned():
     assert found.resting[(true == 0.0) & (time > 20.0)].mean() > 0.9
 
 
-def test_a_gap_and_a_jump_of_the_clock_leave_the_heading_where_it_was():
-    tracker = HeadingTracker(XV3500, KNOWN, Settings())
-    tracker.add(0.0, 0.5, np.array([-0.5, -1.0]))
-    tracker.add(0.1, 0.5, np.array([-0.5, -1.0]))
-    before, variance = tracker.heading, tracker.variance
-    assert 'no samples for 3600' in tracker.add(3600.1, 0.5, np.array([-0.5, -1.0]))
-    assert tracker.heading == before and tracker.variance > variance + 1.0
-    assert 'jumps back' in tracker.add(5.0, 0.5, np.array([-0.5, -1.0]))
-    assert tracker.heading == before and tracker.variance > math.tau ** 2
-    tracker.add(5.1, 0.5, np.array([-0.5, -1.0]))
-    assert tracker.heading == pytest.approx(before + 0.05)
-
-
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
 def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(noise, later):
