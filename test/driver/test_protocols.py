@@ -108,13 +108,6 @@ def test_decoding_undoes_encoding(name):
         assert sample.output == pytest.approx(part * largest, abs=0.51 * step(name), rel=1e-7)
 
 
-@pytest.mark.parametrize('force', [9.81, -9.81, 0.0, 98.0665, None])
-@pytest.mark.parametrize('name', ['kvh_1750', 'witmotion'])
-def test_a_specific_force_keeps_its_sign(name, force):
-    sample, = sent(name, Sample(0.1, specific_force=force))
-    assert sample.specific_force == (force if force is None else pytest.approx(force, abs=0.003))
-
-
 @pytest.mark.parametrize('name', ALL)
 def test_a_temperature_that_cannot_be_sent_does_not_stop_an_emulated_gyro(name):
     """A log has nan where its sensor failed."""
