@@ -44,15 +44,15 @@ class History:
     outlier: np.ndarray  # whether that was off
 
 
-def linear(generator, size=1.0):
+def linear(generator):
     """Return a bias over temperature with one coefficient, drawn as the prior has it."""
-    slope = generator.normal(0.0, size * Prior().coefficient)
+    slope = generator.normal(0.0, Prior().coefficient)
     return lambda temperature: slope * (temperature - 25.0)
 
 
-def cubic(generator, size=1.0):
+def cubic(generator):
     """Return a bias over temperature whose slope is a parabola of the size of the prior."""
-    first, second, third = generator.normal(0.0, size * Prior().coefficient / np.sqrt(3.0)
+    first, second, third = generator.normal(0.0, Prior().coefficient / np.sqrt(3.0)
                                             * np.array([1.0, np.sqrt(3.0), np.sqrt(5.0)]))
 
     def curve(temperature):
@@ -102,9 +102,9 @@ def learn(table, history, run, rests=slice(None)):
     return [table.add(temperature, bias, WHITE, time) for temperature, bias, time in rows]
 
 
-def learned(history, runs, model=MODEL):
+def learned(history, runs):
     """Return a table after some runs, in the next."""
-    table = BiasTable(model)
+    table = BiasTable(MODEL)
     for run in range(runs):
         table.begin_run()
         learn(table, history, run)

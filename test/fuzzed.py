@@ -201,11 +201,6 @@ def _decoder_seeds(wire: _Wire) -> list[bytes]:
 WIRES = {name: _wire(protocol) for name, protocol in PROTOCOLS.items()}
 
 
-def _parts(wire: _Wire) -> tuple[bytes, ...]:
-    """Return whole frames with their checks, which no fuzzer guesses, and their beginning."""
-    return (wire.frames[0][:4], *(frame[:64] for frame in wire.frames[:2]))
-
-
 def check_listening(data: bytes) -> bool:
     found = recognize_protocol(data)
     assert 0.0 <= found.explained_share <= 1.0 and found.summary
@@ -527,8 +522,10 @@ _TABLE = (b'entries', b'jumps', b'standard_deviation', b'time', b'run', b'bias',
           b'model', b'1e-9', b'1e9')
 
 TARGETS: dict[str, Target] = {
+    # made of whole frames with their checks, which no fuzzer guesses, and their beginning
     **{f'decoder {name}':
-       Target(partial(check_decoder, wire), partial(_decoder_seeds, wire), 256, _parts(wire), 2.0)
+       Target(partial(check_decoder, wire), partial(_decoder_seeds, wire), 256,
+              (wire.frames[0][:4], *(frame[:64] for frame in wire.frames[:2])), 2.0)
        for name, wire in WIRES.items()},
     'listening': Target(check_listening, _listening_seeds, 1024),
     'sample clock': Target(check_clock, _clock_seeds, 512),

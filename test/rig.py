@@ -163,7 +163,7 @@ class Rig:
             self.step()
         return until()
 
-    def feed(self, outputs, interval=INTERVAL, temperature=None, force=None, moving=None):
+    def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None):
         """
         Play outputs of a gyro, rad/s, without the robot; return what came out for each.
 
@@ -182,7 +182,7 @@ class Rig:
                 self.pipeline.add_temperature(stamp, float(each))
             if moving is not None:
                 self.pipeline.add_odometry(stamp, 0.0, Velocity(angular=(0.0, 0.0, moving)))
-            found.append(self.pipeline.add_sample(stamp, float(output), force, self.receivers))
+            found.append(self.pipeline.add_sample(stamp, float(output), receivers=self.receivers))
             self.outputs += [found[-1]] if found[-1] else []
             self.guards()
         return found
@@ -220,10 +220,10 @@ class Rig:
         assert self.session.cancel()[0]
         return self.session.conclude()
 
-    def drive_to(self, rate=0.7):
-        """Begin a calibration that drives the robot; return when it turns faster than a rate."""
+    def drive_to(self):
+        """Begin a calibration that drives the robot; return when it turns at 0.7 rad/s."""
         assert not self.begin()
-        assert self.go(10.0, lambda: abs(self.robot.rate) > rate)
+        assert self.go(10.0, lambda: abs(self.robot.rate) > 0.7)
 
     def stopped_after(self, since):
         """Return how long after a time the last command to turn was followed by a zero, s."""

@@ -177,14 +177,6 @@ def test_the_example_of_a_diagnosis_still_says_what_the_pages_show(run, tmp_path
     assert run(*compensate)[0] == 0
 
 
-def off(path):
-    """Return the mean error of the heading of a compensated log, and of the gyro alone, deg."""
-    log = read_log(path)
-    true = log.reference_heading - log.reference_heading[0]
-    headings = np.array(log.others['heading_rad'], float), integrate(log.time, log.output)
-    return [float(np.degrees(np.abs(each - true).mean())) for each in headings]
-
-
 def test_the_quickstarts_run_as_written_and_give_the_numbers_that_are_shown(
         run, tmp_path, monkeypatch):
     for folder in ('samples', 'config'):
@@ -195,7 +187,10 @@ def test_the_quickstarts_run_as_written_and_give_the_numbers_that_are_shown(
     for command in COMMAND.findall(page.replace('\\\n', ' ')):
         code, answers[command.split()[0]], error = run(*shlex.split(command))
         assert code == 0, error
-    after, before = off('heading.csv')
+    log = read_log('heading.csv')
+    true = log.reference_heading - log.reference_heading[0]
+    after, before = (float(np.degrees(np.abs(each - true).mean())) for each in (
+        np.array(log.others['heading_rad'], float), integrate(log.time, log.output)))
     shown = re.search(r'falls from ([\d.]+) to ([\d.]+) deg\.', page)
     assert [float(each) for each in shown.groups()] == pytest.approx([before, after], rel=0.1)
     found = re.search(r'Error ([\d.]+) deg/s rms before, .*; ([\d.]+) in sweeps', answers['fit'])

@@ -82,21 +82,17 @@ def test_bloom_finds_a_dated_section_of_the_version_in_the_changelog():
     assert dates[gyro_calibration.__version__]
 
 
-def imported():
-    """Return the libraries that the package and its launch files import, as rosdep calls them."""
+def test_the_manifest_names_exactly_what_is_imported():
+    """By the names of rosdep, which has no mcap; the rest only a fleet of logs needs."""
     names = {name for folder in ('gyro_calibration', 'launch')
              for file in (ROOT / folder).rglob('*.py') for name in imports(file)}
     roots = ({name.partition('.')[0] for name in names} - sys.stdlib_module_names
              - {'gyro_calibration', 'gyro_calibration_reproduction'})
-    return {f'python3-{root}' if root in {'numpy', 'scipy', 'serial', 'yaml', 'tqdm', 'matplotlib'}
-            else root for root in roots}
-
-
-def test_the_manifest_names_exactly_what_is_imported():
-    """But mcap, which rosdep does not know, and what only a fleet of logs needs."""
+    python = {'numpy', 'scipy', 'serial', 'yaml', 'tqdm', 'matplotlib'}
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
-    assert {element.text for element in manifest.iter('exec_depend')} == imported() - {
-        'mcap', 'distributed', 'pyarrow'}
+    assert {element.text for element in manifest.iter('exec_depend')} == {
+        f'python3-{root}' if root in python else root
+        for root in roots - {'mcap', 'distributed', 'pyarrow'}}
 
 
 def test_every_launcher_is_the_same_and_can_be_executed():

@@ -43,17 +43,15 @@ def reproduced(source, runs=FEW):
 
 
 def ours(source, quantity, runs=FEW):
-    found = [each for each in reproduced(source, runs).comparisons if each.quantity == quantity]
-    assert len(found) == 1, [each.quantity for each in reproduced(source, runs).comparisons]
-    return found[0]
+    found, = (each for each in reproduced(source, runs).comparisons if each.quantity == quantity)
+    return found
 
 
 def numbers(source, words, runs=FEW):
     """Return the numbers of the contradiction whose sentence holds these words."""
-    found = [each.numbers
-             for each in reproduced(source, runs).contradictions if words in each.sentence]
-    assert len(found) == 1, words
-    return found[0]
+    found, = (each.numbers
+              for each in reproduced(source, runs).contradictions if words in each.sentence)
+    return found
 
 
 # verdicts

@@ -203,16 +203,3 @@ def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
                       if check.add(at, rate, rate) else None, 0.0)
     assert len(complete) == 5 and all(rest is not None and math.isfinite(rest.noise_ratio)
                                       and rest.is_noise_normal for rest in complete)
-
-
-@tries(60)
-@hypothesis.given(
-    st.lists(st.tuples(DEGC.filter(lambda degc: degc is not None), FINITE,
-                       st.floats(0.0, 1.7e308), FINITE), max_size=12), FINITE, FINITE)
-def test_a_bias_table_stays_finite(rests, temperature, time):
-    table = BiasTable(GyroModel(noise=NOISE))
-    for degc, bias, variance, when in rests:
-        table.add(degc, bias, variance, when)
-    bias, variance = table.predict(temperature, time)
-    assert math.isfinite(bias) and (variance >= 0.0 if table.entries else variance == math.inf)
-    assert all(map(math.isfinite, table.bias_difference(temperature, 25.0, time)))

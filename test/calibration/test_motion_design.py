@@ -41,6 +41,7 @@ from gyro_calibration.model.motion import (
 )
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
+from plan import followed
 import pytest
 import yaml
 
@@ -161,13 +162,6 @@ def test_flicker_and_random_walk_part_the_bias_from_that_of_the_drive_as_simulat
         assert low < np.std(differences, ddof=1) / math.sqrt(both ** 2 - white ** 2) < high
 
 
-def followed(motion, late, lag):
-    """Return the sampled rate of a robot with a delay and a first-order lag, s."""
-    rate = motion.rate_at(np.arange(20001) / 1000.0 - late)
-    response = np.exp(-np.arange(2000) / 1000.0 / lag) if lag else np.ones(1)
-    return np.convolve(rate, response / response.sum())[:20001:10]
-
-
 FOLLOWED = {'as planned': ('a cable', 0.0, 0.0),
             'late by 0.05 s, lag of 0.1 s': ('limited jerk', 0.05, 0.1)}
 
@@ -176,7 +170,7 @@ FOLLOWED = {'as planned': ('a cable', 0.0, 0.0),
 def test_fits_scatter_as_predicted(name, late, lag):
     """200 runs are in the benchmark."""
     motion, errors = planned(name).motion, []
-    rate = followed(motion, late, lag)
+    rate = followed(motion, TIME, late, lag)
     for seed in range(20):
         fit = fit_likelihood(
             TIME, rate + simulate_noise(WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])),

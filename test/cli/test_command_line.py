@@ -300,18 +300,13 @@ def test_emulate_prints_its_path_first_and_sends_the_model(model, tmp_path):
     assert not (tmp_path / 'gyro').exists(), 'the link was left behind'
 
 
-@pytest.fixture
-def demo(ros_domain, tmp_path):
-    """Run the demonstration as a person would, and return its folder, time and process."""
-    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    return subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo',
-                           '--out', tmp_path / 'demo', '--seed', '2', '--json'],
-                          capture_output=True, text=True, timeout=240), tmp_path / 'demo'
-
-
 def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_picture_table_and_log(
-        demo):
-    process, folder = demo
+        ros_domain, tmp_path):
+    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    folder = tmp_path / 'demo'
+    process = subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo',
+                              '--out', folder, '--seed', '2', '--json'],
+                             capture_output=True, text=True, timeout=240)
     assert process.returncode == 0 and 'Traceback' not in process.stderr, process.stderr
     errors = json.loads(process.stdout)['mean_error_deg']
     assert max(errors['both'], errors['rests tracked']) < 0.6 * errors['pure integration']

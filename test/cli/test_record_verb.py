@@ -313,14 +313,6 @@ def test_wrong_use_is_one_sentence_and_leaves_no_file(run, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
-@contextlib.contextmanager
-def angles(link, rate=100.0):
-    """Send the angles of a gyro at 0.1 rad/s, at another sample rate than a new one does."""
-    samples = (Sample(0.1, 25.0, time=number / rate) for number in range(10 ** 6))
-    with Emulator(find_protocol('kvh_1750'), samples, Settings(sample_rate=rate), link=link):
-        yield
-
-
 @pytest.mark.parametrize(('options', 'seconds', 'rate', 'factor'), [
     ([], 6, 1.0, 1000.0),  # the period of the samples is known after 4 s
     pytest.param(['--sample-rate', '100'], 2, 0.1, 100.0, marks=pytest.mark.evidence),
@@ -328,7 +320,9 @@ def angles(link, rate=100.0):
 ])
 def test_angles_at_another_rate_are_reported(run, tmp_path, options, seconds, rate, factor):
     """Where there is no remark is tested in test_driver_node.py, without a port."""
-    with angles(tmp_path / 'gyro'):
+    samples = (Sample(0.1, 25.0, time=number / 100.0) for number in range(10 ** 6))
+    with Emulator(find_protocol('kvh_1750'), samples, Settings(sample_rate=100.0),
+                  link=tmp_path / 'gyro'):
         words = ['--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--seconds', seconds]
         code, out, error = run('record', *words, '--out', tmp_path / 'a.csv', '--json', *options)
     log, remarks = read(tmp_path / 'a.csv'), ' '.join(json.loads(out)['remarks'])

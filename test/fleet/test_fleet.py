@@ -283,10 +283,10 @@ def test_where_nothing_can_be_done_one_sentence_says_why(tmp_path, capsys, make,
 
 # pooling
 
-def crossed(values, deviation=1e-6):
+def crossed(values):
     """Return values of units by drives, each with a small error of its own."""
     unit, drive = np.indices(values.shape).reshape(2, -1)
-    return Observations(values.ravel(), np.full(values.size, deviation), unit, drive)
+    return Observations(values.ravel(), np.full(values.size, 1e-6), unit, drive)
 
 
 def test_balanced_data_give_the_variances_of_an_analysis_of_variance():
@@ -352,7 +352,7 @@ def test_units_that_drift_apart_have_slopes_of_their_own():
     assert (whole.high - whole.low).min() > 2.0 * (apart.high - apart.low).max()
 
 
-def records(ramp=0.0, wander=1.0):
+def records(ramp=0.0):
     """Return records of five units on four drives, in which a ramp repeats or only wanders."""
     generator = np.random.default_rng(9)
     off = 0.1 * np.arange(4)
@@ -365,7 +365,7 @@ def records(ramp=0.0, wander=1.0):
          'noise': {'angle_random_walk': 1e-4},
          'values': {'bias': of(unit + 1e-3 * generator.standard_normal(), 1e-3, 'rad/s'),
                     'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')},
-         'slow': {'rate_ramp': of(ramp + wander * generator.standard_normal(), wander, 'rad/s²')}}
+         'slow': {'rate_ramp': of(ramp + generator.standard_normal(), 1.0, 'rad/s²')}}
         for unit in range(5) for drive in range(4)]
 
 

@@ -58,15 +58,15 @@ def driven(duration, generator):
     return np.convolve(rates, np.ones(30) / 30.0, 'same')[:round(duration / INTERVAL)]
 
 
-def lost_heading(true, comes, generator, noise=WHITE):
+def lost_heading(true, comes, generator):
     """Return the heading change by lost samples, rad, and the variance stated for it, rad²."""
     time = np.arange(len(true)) * INTERVAL
-    rate = true + simulate_noise(noise, len(true), INTERVAL, generator)
+    rate = true + simulate_noise(WHITE, len(true), INTERVAL, generator)
     intervals = np.diff(time[comes])
     usual, lost = Intervals().add_many(intervals)
     assert lost.sum() == (~comes).sum()
     gaps = lost > 0
-    of_gaps = gap_variances(noise, usual[gaps], lost[gaps], intervals[gaps],
+    of_gaps = gap_variances(WHITE, usual[gaps], lost[gaps], intervals[gaps],
                             np.diff(rate[comes])[gaps])
     return integrate(time[comes], rate[comes])[-1] - integrate(time, rate)[-1], np.sum(of_gaps)
 

@@ -36,10 +36,10 @@ INTERVAL = 0.01
 XV3500 = Noise(2.5 * DEGREE / 60)
 
 
-def noisy_robot(seed=0):
+def noisy_robot():
     """Return times and rates of the robot with the XV3500's white noise."""
     time = np.arange(16001) * INTERVAL
-    noise = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(seed))
+    noise = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
     return time, ROBOT_MOTION.rate_at(time) + noise
 
 

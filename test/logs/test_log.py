@@ -31,8 +31,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 
-def written(folder, text, name='log.csv'):
-    path = folder / name
+def written(folder, text):
+    path = folder / 'log.csv'
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
 

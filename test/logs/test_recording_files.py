@@ -564,29 +564,19 @@ def numbers_of(answer):
     return [float(answer)] if isinstance(answer, (int, float)) else []
 
 
-@pytest.fixture
-def recorded(run, tmp_path):
-    """Return the same simulated motion as a log and as a recording, and the model of its gyro."""
-    model = tmp_path / 'model.yaml'
+@pytest.mark.parametrize('verb', ['fit', 'self-calibrate', 'allan', 'diagnose', 'compensate'])
+def test_a_verb_answers_alike_for_a_recording_and_for_its_log(run, tmp_path, verb):
+    model, path = tmp_path / 'model.yaml', tmp_path / 'log.csv'
     model.write_text(
         'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: 0.01}}\n'
         'noise: {angle_random_walk: 0.0001}\n')
-
-    def recorded(motion):
-        path = tmp_path / 'log.csv'
-        assert run('simulate', '--model', model, '--motion', motion, '--out', path,
-                   '--sample-rate', 25, '--seed', 1)[0] == 0
-        log = replace(read_log(path), reference_rate=None)  # a pose has no rate
-        write_log(path, log)
-        return path, write(tmp_path / 'bag', of_log(log), storage='MCAP'), model
-    return recorded
-
-
-@pytest.mark.parametrize('verb', ['fit', 'self-calibrate', 'allan', 'diagnose', 'compensate'])
-def test_a_verb_answers_alike_for_a_recording_and_for_its_log(run, recorded, tmp_path, verb):
     motion = ('rest' if verb in ('allan', 'diagnose') else 'calibration'
               if verb == 'self-calibrate' else 'robot')
-    path, recording, model = recorded(motion)
+    assert run('simulate', '--model', model, '--motion', motion, '--out', path,
+               '--sample-rate', 25, '--seed', 1)[0] == 0
+    log = replace(read_log(path), reference_rate=None)  # a pose has no rate
+    write_log(path, log)
+    recording = write(tmp_path / 'bag', of_log(log), storage='MCAP')
     more = {'diagnose': ['--model', model, '--seed', 1],
             'compensate': ['--model', model, '--out', tmp_path / 'out.csv']}
     words = [verb, *more.get(verb, [])]

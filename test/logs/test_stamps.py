@@ -19,12 +19,11 @@ import pytest
 INTERVAL = 0.01
 
 
-def stalled(seconds, count=6000, begin=20.0):
+def stalled(seconds):
     """Return stamps of a host that stalls for some seconds, then takes 0.2 ms a sample."""
-    due = np.arange(count) * INTERVAL
-    late = begin + seconds + 2e-4 * np.arange(count)
-    first = int(np.searchsorted(due, begin))
-    return np.concatenate([due[:first], np.maximum(due[first:], late[:count - first])])
+    due = np.arange(6000) * INTERVAL
+    late = 20.0 + seconds + 2e-4 * np.arange(6000)
+    return np.concatenate([due[:2000], np.maximum(due[2000:], late[:4000])])
 
 
 @pytest.mark.parametrize('seconds', [0.05, 0.3, 1.0])

@@ -104,11 +104,11 @@ def test_a_simulated_gyro_is_compensated_to_the_true_rate_as_a_log_and_sample_by
     assert singly == pytest.approx(at_once, rel=0.0, abs=1e-13)
 
 
-def distorted(name, *values, rate_of=lambda time: np.sin(1.7 * time), generator=None):
+def distorted(name, *values, generator=None):
     """Return model, time, true rate and output of a gyro with one effect, at 1 kHz over 10 s."""
     model = GyroModel((Term(CATALOGUE[name], values),), noise=Noise(1e-4))
     time = np.arange(0.0, 10.0, 1e-3)
-    rate = rate_of(time)
+    rate = np.sin(1.7 * time)
     return model, time, rate, simulate_gyro_output(
         model, time, ChannelHistory().update(time).with_rate(rate, rate), generator)
 

@@ -111,8 +111,8 @@ def start(start_node, ros, wait_until, tmp_path):
     return start
 
 
-def rest(mean, count, seed=0):
-    return mean + 1e-3 * np.random.default_rng(seed).standard_normal(count)
+def rest(mean, count):
+    return mean + 1e-3 * np.random.default_rng(0).standard_normal(count)
 
 
 @pytest.fixture

@@ -82,11 +82,11 @@ def test_the_level_of_the_bias_is_used_up_and_not_only_kept():
     assert fewest(4000, 2.0 * level) <= misfits <= most(4000, 2.0 * level)
 
 
-def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12, age=600.0):
+def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12):
     """Feed a check as the node does."""
     for number, output in enumerate(np.ravel(outputs).tolist()):
         if check.add(begin + number * INTERVAL, output, output):
-            check.examine_stretch(bias_variance, age, promised)
+            check.examine_stretch(bias_variance, 600.0, promised)
     return check
 
 

@@ -45,9 +45,9 @@ KNOWN = ('effects: {bias: {bias: 0.01}}\n'
 CERTAIN = KNOWN + 'covariance: [[1.0e-8]]\norigin: {date: "2023-11-14T22:00:00+00:00"}\n'
 
 
-def noisy(seconds, rate=0.0, bias=BIAS, seed=0, scale=1.0):
+def noisy(seconds, rate=0.0, bias=BIAS, seed=0):
     """Return what a gyro with the noise of the model reports while it turns at a rate."""
-    deviation = scale * math.sqrt(Noise(NOISE).rate_variance(SLOW))
+    deviation = math.sqrt(Noise(NOISE).rate_variance(SLOW))
     return rate + bias + deviation * np.random.default_rng(seed).standard_normal(
         round(seconds / SLOW))
 
