@@ -261,7 +261,8 @@ def _residual_chart(curve: Curve, place: int) -> Chart:
     unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
     lines = _before_and_after(factor * curve.before, factor * curve.after,
                               factor * curve.deviation)
-    return Chart(name, title, 'Mean of the residual, with 95 % bands of noise alone.', *_horizontal(curve), 'residual', unit, lines)
+    return Chart(name, title, 'Mean of the residual, with 95 % bands of noise alone.',
+                 *_horizontal(curve), 'residual', unit, lines)
 
 
 def _heading_chart(curve: HeadingCurve) -> Chart:
