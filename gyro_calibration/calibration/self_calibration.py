@@ -282,8 +282,8 @@ def refuse_one_speed(motion: Motion, limits: RunLimits) -> None:
 def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) -> None:
     """Refuse a run that is not the whole profile, another unit or sign, or one speed alone."""
     if not np.isfinite(motion.heading).all():
-        raise DataRefused('the reference was lost somewhere: '
-                          'leave those points out, or run again')
+        raise DataRefused('the reference heading has points without a value: '
+                          'leave them out, or run again')
     covered = float(time[-1] - time[0])
     if covered < 0.9 * motion.duration - 2.0 * limits.max_time_offset:
         raise DataRefused(f"the samples cover {covered:.1f} s of the {motion.name}'s "

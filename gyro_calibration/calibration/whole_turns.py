@@ -117,7 +117,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
             'both ends, or the gyro still warms up; wait, and run again')
     if abs(bias) > limits.max_bias:
         raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
-                          f'{limits.max_bias / DEGREE:g} deg/s: did the robot rest at both ends?')
+                          f'{limits.max_bias / DEGREE:g} deg/s: let the robot rest at both ends')
     integral = np.interp((begin, end), time, integrate(time, rate))
     gyro_angle = float(integral[1] - integral[0]) - bias * duration
     count = _count_turns(gyro_angle / math.tau, turns, limits)
@@ -126,7 +126,7 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     if abs(scale - 1.0) > limits.max_scale_factor_error:
         raise DataRefused(f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
                           f'{100 * limits.max_scale_factor_error:.0f} %: count the turns again, '
-                          'and look at the sensitivity')
+                          'and check the sensitivity')
     angle_variance = (white_density * duration + variance * duration ** 2
                       + (scale * mark_deviation) ** 2)
     shared = -variance * duration / true_angle

@@ -54,7 +54,7 @@ def run(given: argparse.Namespace) -> Answer:
     if given.out is None:
         return Answer([text.rstrip('\n')], data)
     write_atomically(given.out, text.encode())
-    lines = [f'written to {given.out}.']
+    lines = [f'Written to {given.out}.']
     if noise_figures.wander.density and given.to == 'sdf':
         lines.append('One Gauss-Markov process replaces the drift of the bias: the Allan '
                      f'deviation is accurate to {100.0 * error:.0f} % up to {given.span:g} s.')

@@ -137,7 +137,7 @@ def _sections(diagnosis: Diagnosis) -> Iterator[tuple[str, Iterable[Markup]]]:
     yield 'The model', [
         element('p', 'This is the extended model, as model.yaml has it; compensate, simulate and '
                 'the compensation node take it as it is.' if is_model_extended(diagnosis)
-                else 'The model is as it was.'),
+                else 'The model is unchanged.'),
         element('pre', element('code', format_model(diagnosis.model)), tabindex='0',
                 class_='scroll')]
     logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
@@ -203,7 +203,7 @@ def _trace_charts(trace: Trace) -> Iterator[Chart]:
     yield Chart('trace', 'Output of the gyro', 'Measured and simulated output over time.', 'time',
                 's', time, 'output', unit, lines)
     unit, factor = _rate_unit(measured - simulated)
-    yield Chart('difference', 'Measured less simulated', 'What the simulation leaves over time.',
+    yield Chart('difference', 'Measured less simulated', 'Residual over time.',
                 'time', 's', time, 'residual', unit,
                 _before_and_after(factor * (measured - simulated), factor * (measured - extended)))
 
@@ -240,7 +240,7 @@ def _error_charts(curve: Curve, place: int) -> Iterator[Chart]:
     if not np.array_equal(curve.before, curve.after, equal_nan=True):
         lines.append(Line('simulated, extended', 'after', factor * (measured - curve.after)))
     yield Chart(f'predicted-{place}', f'Error of the gyro along {readable_name(curve.along)}',
-                'Mean of output less true rate, as measured and as the simulation has it.',
+                'Mean of output less true rate, measured and simulated.',
                 *_horizontal(curve), 'error', unit, lines)
 
 
@@ -261,8 +261,8 @@ def _residual_chart(curve: Curve, place: int) -> Chart:
     unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
     lines = _before_and_after(factor * curve.before, factor * curve.after,
                               factor * curve.deviation)
-    return Chart(name, title, 'Mean of what the simulation leaves, with bands of 95 % by noise '
-                 'alone.', *_horizontal(curve), 'residual', unit, lines)
+    return Chart(name, title, 'Mean of the residual, with 95 % bands of noise alone.',
+                 *_horizontal(curve), 'residual', unit, lines)
 
 
 def _heading_chart(curve: HeadingCurve) -> Chart:

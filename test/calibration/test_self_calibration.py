@@ -176,7 +176,7 @@ REFUSED = {
                                      run()), CALIBRATION_MOTION, 'not a finite number'),
     'a lost reference': (TIME, run(),
                          motion_from_headings(TIME, np.where(TIME == 5.0, np.nan,
-                                                             RATE)), 'the reference was lost'),
+                                                             RATE)), 'points without a value'),
     'one speed': (TIME, run(), ONE_SPEED, 'the profile turns at one speed'),
     'half the motion': (TIME[:1000], run()[:1000], CALIBRATION_MOTION,
                         "the samples cover 10.0 s of the profile's 20.0 s"),
