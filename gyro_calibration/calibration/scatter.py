@@ -356,7 +356,7 @@ class Uncertainty:
 
     def _half_width(self, probability: float, offsets: Array, deviations: Array) -> Array:
         """Return half of the intervals about zero, of offsets and deviations (k, m)."""
-        deviations = np.maximum(deviations, 1e-300)
+        deviations = np.maximum(deviations, 1e-12 * deviations.max(axis=0) + 1e-300)
         low = np.zeros(offsets.shape[1])
         high = (2.0 * student.ppf(0.5 + 0.5 * probability, self.dof)
                 * (deviations + np.abs(offsets)).max(axis=0))

@@ -28,6 +28,7 @@ from gyro_calibration.calibration.likelihood import (
     GoodnessOfFit,
     MAX_NOISE_SIGMAS,
     MAX_TRACKING_LAG,
+    MIN_FIT_PROBABILITY,
     ScaleBiasFit,
 )
 from gyro_calibration.calibration.run_faults import (
@@ -46,7 +47,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.special import chdtrc, ndtri
+from scipy.special import chdtrc, ndtr, ndtri
 
 
 @dataclass(frozen=True)
@@ -307,9 +308,14 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
     excess_angle, sigmas = fit.stretch_residual
     s, b = fit.scale_factor_error, fit.bias
     deviation = float(np.nan_to_num(math.sqrt(fit.covariance[0, 0])))
-    slip = format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas)
     has_slipped = excess_angle > limits.max_stretch_residual and sigmas > MIN_SLIP_SIGMAS
-    if (has_slipped or abs(fit.time_offset) > largest_offset
+    slip = (format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas) if has_slipped
+            else '')
+    # against measured headings the deviations include the noise of mount and encoder
+    unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
+    strays = (motion.rate is not None and unexplained_angle > limits.max_unexplained_angle
+              and (fit.goodness is None or fit.goodness.noise_ratio > limits.max_noise_ratio))
+    if (has_slipped or strays or abs(fit.time_offset) > largest_offset
             or deviation > limits.max_scale_deviation):
         refuse_other_motion(run, motion, largest_offset, slip)
     if has_slipped:
@@ -327,14 +333,35 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           'or more often'
                           + (', and check that the profile is the one that was driven'
                              if motion.name == 'profile' else ''))
-    # against measured headings the deviations include the noise of mount and encoder
-    unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
-    if (motion.rate is not None and fit.goodness is not None and unexplained_angle
-            > limits.max_unexplained_angle and fit.goodness.noise_ratio > limits.max_noise_ratio):
-        raise DataRefused(f'the run is {fit.goodness.noise_ratio:.1f} times as noisy as the model '
-                          f'states, at most {limits.max_noise_ratio:g} are allowed: fasten the '
-                          'gyro, stop vibration, or measure the noise again (allan)')
+    if strays:
+        known = ('the noise of the gyro is not known' if fit.goodness is None else
+                 f'{fit.goodness.noise_ratio:.1f} times as much as the model states')
+        raise DataRefused(f'the heading strays from the {motion.name} by '
+                          f'{unexplained_angle / DEGREE:.1f} deg ({known}): check that the robot '
+                          'follows it, fasten the gyro, stop vibration, or measure the noise '
+                          'again (allan) and give the model')
     refuse_no_improvement(fit, limits.max_heading_error)
+
+
+def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
+    """
+    Return a remark on a scale factor error that gyros of a technology hardly have, or ''.
+
+    Parameters
+    ----------
+    prior_deviation : standard deviation of the scale factor error of such gyros, 1
+    reference : name of the motion
+
+    """
+    size = 100.0 * fit.scale_factor_error
+    sigmas = abs(fit.scale_factor_error) / math.hypot(
+        prior_deviation, float(np.nan_to_num(math.sqrt(fit.covariance[0, 0]))))
+    if 2.0 * float(ndtr(-sigmas)) > MIN_FIT_PROBABILITY:
+        return ''
+    return (f'a scale factor error of {size:.1f} % is {sigmas:.0f} standard deviations from what '
+            f'such gyros have (0 +- {100.0 * prior_deviation:g} %): compare the turn of the '
+            f'{reference} with a mark on the floor (calibrate by whole turns), and check radius '
+            'and track of the wheels, or the sensitivity of the gyro')
 
 
 #: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration
