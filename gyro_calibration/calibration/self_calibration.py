@@ -65,8 +65,9 @@ class RunLimits:
     # largest significant deviation of a stretch of the run from the profile, rad
     max_stretch_residual: float = 1.0 * DEGREE
     max_time_offset: float = 1.0  # largest lag of the gyro behind the profile, either way, s
-    # largest noise that accumulates in the heading, as a multiple of the known noise and as its
-    # heading error over the run, rad; a run that exceeds both is refused
+    # largest noise that accumulates in the heading, as a multiple of the known noise, or else of
+    # the white noise of the samples, and as its heading error over the run, rad; a run that
+    # exceeds both is refused
     max_noise_ratio: float = 8.0
     max_unexplained_angle: float = 1.0 * DEGREE
     rest_duration: float = 2.0  # length of the check after the run, s
@@ -200,7 +201,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
         s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
-    _refuse_fit(fit, run, motion, limits)
+    _refuse_fit(fit, run, motion, limits,
+                white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time)))))
     return fit
 
 
@@ -302,8 +304,14 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
         refuse_other_motion(run, motion, largest_offset)
 
 
-def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits) -> None:
-    """Refuse by the first cause found; causes that spoil later checks come first."""
+def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits,
+                white_noise: float) -> None:
+    """
+    Refuse by the first cause found; causes that spoil later checks come first.
+
+    `white_noise` is that of the samples, rad/√s.
+
+    """
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     excess_angle, sigmas = fit.stretch_residual
     s, b = fit.scale_factor_error, fit.bias
@@ -313,8 +321,10 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
             else '')
     # against measured headings the deviations include the noise of mount and encoder
     unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
+    noise_ratio = (fit.goodness.noise_ratio if fit.goodness
+                   else fit.angle_random_walk / max(white_noise, 1e-300))
     strays = (motion.rate is not None and unexplained_angle > limits.max_unexplained_angle
-              and (fit.goodness is None or fit.goodness.noise_ratio > limits.max_noise_ratio))
+              and noise_ratio > limits.max_noise_ratio)
     if (has_slipped or strays or abs(fit.time_offset) > largest_offset
             or deviation > limits.max_scale_deviation):
         refuse_other_motion(run, motion, largest_offset, slip)
@@ -334,12 +344,11 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           + (', and check that the profile is the one that was driven'
                              if motion.name == 'profile' else ''))
     if strays:
-        known = ('the noise of the gyro is not known' if fit.goodness is None else
-                 f'{fit.goodness.noise_ratio:.1f} times as much as the model states')
-        raise DataRefused(f'the heading strays from the {motion.name} by '
-                          f'{unexplained_angle / DEGREE:.1f} deg ({known}): check that the robot '
-                          'follows it, fasten the gyro, stop vibration, or measure the noise '
-                          'again (allan) and give the model')
+        known = 'the model states' if fit.goodness else 'its samples show'
+        raise DataRefused(f'the run is {noise_ratio:.1f} times as noisy as {known}, at most '
+                          f'{limits.max_noise_ratio:g} are allowed: check that the robot follows '
+                          f'the {motion.name}, fasten the gyro, stop vibration, or measure the '
+                          'noise again (allan)')
     refuse_no_improvement(fit, limits.max_heading_error)
 
 

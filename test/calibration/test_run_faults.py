@@ -100,7 +100,7 @@ def test_noise_beyond_the_models_is_reported_and_more_of_it_refused():
             and goodness.noise_ratio == pytest.approx(3.0, rel=0.4))
     assert 'more than the noise explains' in str(goodness)
     assert self_calibrate(TIME, output(), CALIBRATION_MOTION).goodness is None, 'no figures'
-    with pytest.raises(DataRefused, match='times as much as the model states|a slip or a bump'):
+    with pytest.raises(DataRefused, match='times as noisy as the model states|a slip or a bump'):
         self_calibrate(TIME, output(level=15.0), CALIBRATION_MOTION, noise=XV3500.noise,
                        limits=RunLimits(max_scale_deviation=1.0))
 
@@ -136,6 +136,15 @@ def test_a_run_of_which_a_part_is_short_is_refused_by_a_turn_that_explains_it():
     with pytest.raises(DataRefused, match='otherwise than the profile') as refused:
         self_calibrate(TIME, output() + short, CALIBRATION_MOTION)
     assert float(re.search(r'turned ([\d.]+) deg', str(refused.value))[1]) > 5.0
+
+
+def test_a_run_without_known_noise_is_judged_by_the_noise_of_its_samples():
+    """White noise of a gyro is no fault; a robot that swings about its profile is one."""
+    limits = RunLimits(max_scale_deviation=1.0, max_heading_error=math.tau)
+    assert self_calibrate(TIME, output(level=15.0), CALIBRATION_MOTION, limits=limits)
+    wander = 4.0 * DEGREE * np.sin(2.0 * math.pi * TIME / 3.1)
+    with pytest.raises(DataRefused, match='times as noisy as its samples show'):
+        self_calibrate(TIME, output() + wander, CALIBRATION_MOTION, limits=limits)
 
 
 def test_a_scale_factor_error_that_gyros_hardly_have_is_remarked_with_a_remedy():
