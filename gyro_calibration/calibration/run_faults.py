@@ -12,7 +12,7 @@
 Faults of a run that deviates from its profile: a name, a test and a remedy for each.
 
 The fault is the motion that explains the run best: the profile with one deviating stretch, driven
-faster or slower, begun late, or ended early.
+faster or slower, at limited rates, begun late, or ended early.
 
 """
 
@@ -131,7 +131,7 @@ def refuse_other_motion(run: RunPieces, motion: Motion, largest_offset: float,
 
     Parameters
     ----------
-    slip : message on a slip, where more is known of it than its pieces show
+    slip : message on a slip, where one is known better than the pieces show it
 
     Raises
     ------
@@ -170,7 +170,15 @@ def _try_motions(run: RunPieces, motion: Motion,
                  largest_offset: float) -> Iterator[tuple[float, str]]:
     """Give the unexplained part of a run by ends, speeds and starts, and the cause."""
     duration, is_profile = motion.duration, motion.name == 'profile'
+    interval = float(np.median(np.diff(run.edges)))
     for offset in _trial_offsets(largest_offset)[::2]:
+        whole = run.reference_angle(motion, offset)
+        largest = float(np.abs(whole).max())
+        for limit in np.arange(0.3, 0.97, 0.05) * largest if is_profile else ():
+            yield (run.fit_scale(np.clip(whole, -limit, limit))[0],
+                   f'the robot reached {limit / interval / DEGREE:.0f} deg/s where the profile '
+                   f'turns at {largest / interval / DEGREE:.0f} deg/s: raise its limit, or drive '
+                   'a slower profile')
         for end in np.arange(0.05, 0.97, 0.0125) * duration:
             yield (run.fit_scale(run.reference_angle(motion, offset, end=end))[0],
                    f"the robot stopped at about {end:.1f} s of the profile's {duration:.1f} s: "

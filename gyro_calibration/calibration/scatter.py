@@ -201,11 +201,24 @@ def _count_scatter_terms(dwells: Dwells) -> int:
 
 
 def find_inliers(dwells: Dwells) -> Mask:
-    """Return which dwells are not outlying, by a robust fit of the surface."""
-    surface = _smooth_surface(dwells)
-    residual = np.abs(robust_residual(surface, dwells.output - dwells.rate, 20))
+    """
+    Return which dwells are not outlying, by a robust fit of the surface.
+
+    Where there are dwells enough, each sweep has a bias and scale of its own besides: the fastest
+    dwells of a sweep whose scale differs are not outlying.
+
+    """
+    columns = _smooth_surface(dwells)
+    if _count_scatter_terms(dwells) == 4:
+        parts = cross_validation_parts(dwells)
+        own = (parts[:, None] == np.arange(parts.max() + 1)).astype(float)
+        turning = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
+        extended = _orthonormal_basis(np.column_stack([columns, own, own * turning[:, None]]))
+        if 2 * extended.shape[1] <= len(dwells):
+            columns = extended
+    residual = np.abs(robust_residual(columns, dwells.output - dwells.rate, 20))
     # Such a fit passes through as many dwells as it has columns; these are left out of the median.
-    spread = 1.4826 * float(np.median(np.sort(residual)[surface.shape[1]:]))
+    spread = 1.4826 * float(np.median(np.sort(residual)[columns.shape[1]:]))
     return (residual <= OUTLIER_THRESHOLD * spread + 1e-12) | (len(dwells) < _MIN_DWELLS)
 
 
@@ -228,6 +241,11 @@ def _smooth_surface(dwells: Dwells) -> Array:
     products = [rate ** i * temperature ** j for i, j in powers]
     columns = np.column_stack([*products[:4], np.abs(rate),
                                *products[4:]])[:, :max(len(rate) // 3, min(len(rate) - 1, 2))]
+    return _orthonormal_basis(columns)
+
+
+def _orthonormal_basis(columns: Array) -> Array:
+    """Return orthonormal columns that span others, shape (n, m)."""
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, sizes > 1e-4 * sizes[0]]
 
@@ -275,10 +293,12 @@ class Uncertainty:
 
     Few dwells and few sweeps do not determine how large the scatter is. So the distribution of the
     values is averaged over possible scatters, weighted by their restricted likelihood: that of the
-    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior
-    probability that sweeps have no common error is one half; otherwise its prior scale is the
-    scatter of a dwell (half Cauchy, Gelman 2006). The maximum of the likelihood alone would be at
-    zero in about half of the cases, and its intervals would be too narrow.
+    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior is
+    uniform in the logarithm of the variance of a sweep's own bias, or scale, that its scatter and
+    its dwells give together (Box and Tiao 1973, section 5.2): intervals of what differs between
+    sweeps alone are then those of Student's distribution with as many degrees of freedom as there
+    are sweeps more than values. The maximum of the likelihood alone would be at zero in about half
+    of the cases, and its intervals would be too narrow.
 
     Attributes
     ----------
@@ -286,8 +306,8 @@ class Uncertainty:
     offsets : from the values that were fitted to the middle of their distribution, shape (k, m)
     covariances : scale matrices of the distribution, shape (k, m, m)
     dof : of Student's distribution
-    sweep_scatter : root mean square over all possible scatters of the bias of a sweep, rad/s, and
-        of its scale factor, 1, shape (2,)
+    sweep_deviations : standard deviations of the bias of a sweep, rad/s, and of its scale factor,
+        1, shape (k, 2)
 
     """
 
@@ -295,7 +315,7 @@ class Uncertainty:
     offsets: Array
     covariances: Array
     dof: int
-    sweep_scatter: Array
+    sweep_deviations: Array
 
     @classmethod
     def from_fit(cls, dwells: Dwells, scatter: Scatter, columns: Array,
@@ -312,12 +332,11 @@ class Uncertainty:
 
         """
         lengths, deviation = np.linalg.norm(columns, axis=0), scatter.deviation(dwells)
-        dof, units = len(dwells) - len(lengths), np.array(
-            [rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
-        axes, priors = zip(*(_scatter_grid(size / unit) if _count_scatter_terms(dwells) == 4
-                             else (np.zeros(1), np.ones(1)) for size, unit in zip(
-                                 (scatter.sweep_bias, scatter.sweep_scale), units)))
-        sizes = [units * np.column_stack([np.full(len(axes[1]), bias), axes[1]])
+        dof, likeliest = len(dwells) - len(lengths), (scatter.sweep_bias, scatter.sweep_scale)
+        axes, priors = zip(*(_scatter_grid(size, variances) for size, variances in zip(
+            likeliest, _sweep_variances(dwells, deviation)))
+            if _count_scatter_terms(dwells) == 4 else ((np.zeros(1), np.ones(1)),) * 2)
+        sizes = [np.column_stack([np.full(len(axes[1]), bias), axes[1]])
                  for bias in axes[0]]  # in turn, for the memory
         log_determinant, misfit, offsets, inverses = (np.concatenate(each) for each in zip(*(
             _fit_values(dwells, deviation, columns / lengths, error, each) for each in sizes)))
@@ -326,24 +345,34 @@ class Uncertainty:
         likely = weights > 1e-4 * weights.sum()
         weights = weights[likely] / weights[likely].sum()
         size = misfit[likely] / dof
-        squares = np.concatenate(sizes)[likely] ** 2 * size[:, None]
         return cls(weights, offsets[likely] / lengths,
                    inverses[likely] * size[:, None, None] / np.outer(lengths, lengths), dof,
-                   np.sqrt(weights @ squares))
+                   np.concatenate(sizes)[likely] * np.sqrt(size)[:, None])
 
     def half_width(self, probability: float) -> Array:
         """Return half of the intervals about the fitted values of a probability, shape (m,)."""
-        deviations = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
-        low = np.zeros(self.offsets.shape[1])
+        return self._half_width(probability, self.offsets, np.sqrt(
+            np.diagonal(self.covariances, axis1=1, axis2=2)))
+
+    def _half_width(self, probability: float, offsets: Array, deviations: Array) -> Array:
+        """Return half of the intervals about zero, of offsets and deviations (k, m)."""
+        deviations = np.maximum(deviations, 1e-12 * deviations.max(axis=0) + 1e-300)
+        low = np.zeros(offsets.shape[1])
         high = (2.0 * student.ppf(0.5 + 0.5 * probability, self.dof)
-                * (deviations + np.abs(self.offsets)).max(axis=0))
+                * (deviations + np.abs(offsets)).max(axis=0))
         for _ in range(25):
             half = 0.5 * (low + high)
-            below, above = (student.cdf((end - self.offsets) / deviations, self.dof)
+            below, above = (student.cdf((end - offsets) / deviations, self.dof)
                             for end in (-half, half))
             narrow = self.weights @ (above - below) < probability
             low, high = np.where(narrow, half, low), np.where(narrow, high, half)
         return high
+
+    @property
+    def sweep_scatter(self) -> Array:
+        """Return deviations of bias and scale of another sweep, of which 1.96 hold 95 %, (2,)."""
+        return self._half_width(0.95, np.zeros_like(self.sweep_deviations),
+                                self.sweep_deviations) / NORMAL_QUANTILE_975
 
     def covariance(self) -> Array:
         """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""
@@ -352,12 +381,18 @@ class Uncertainty:
         return covariance * np.outer(widening, widening)
 
 
-def _scatter_grid(size: float) -> tuple[Array, Array]:
-    """Return possible sizes of a scatter, in that of dwells, about the likely one; and prior."""
-    logarithms = np.linspace(-3.0, 3.0, 25)
-    sizes = max(size, 0.1) * np.exp(logarithms)
-    prior = sizes / (math.pi * (1.0 + sizes ** 2)) * (logarithms[1] - logarithms[0])
-    return np.append(0.0, sizes), np.append(0.5, prior)
+def _sweep_variances(dwells: Dwells, deviation: Array) -> Array:
+    """Return the variance of bias and scale of each sweep by its dwells, shape (2, sweeps)."""
+    weights = np.column_stack([np.ones(len(dwells)), np.maximum(dwells.rate ** 2, 1e-18)])
+    return 1.0 / sum_by_part(weights / deviation[:, None] ** 2, cross_validation_parts(dwells)).T
+
+
+def _scatter_grid(size: float, variances: Array) -> tuple[Array, Array]:
+    """Return possible sizes of a scatter about the likely one, and their prior."""
+    typical = 1.0 / math.sqrt(float(np.mean(1.0 / variances)))
+    sizes = np.geomspace(max(0.3 * typical, size / 30.0), 100.0 * max(typical, size), 25)
+    prior = sizes ** 2 * np.sqrt(np.mean((sizes[:, None] ** 2 + variances) ** -2.0, axis=1))
+    return np.append(0.0, sizes), np.append(0.5 * prior[0], prior * math.log(sizes[1] / sizes[0]))
 
 
 # errors in another run

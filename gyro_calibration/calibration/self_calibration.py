@@ -28,6 +28,7 @@ from gyro_calibration.calibration.likelihood import (
     GoodnessOfFit,
     MAX_NOISE_SIGMAS,
     MAX_TRACKING_LAG,
+    MIN_FIT_PROBABILITY,
     ScaleBiasFit,
 )
 from gyro_calibration.calibration.run_faults import (
@@ -46,7 +47,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.special import chdtrc, ndtri
+from scipy.special import chdtrc, ndtr, ndtri
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,9 @@ class RunLimits:
     # largest significant deviation of a stretch of the run from the profile, rad
     max_stretch_residual: float = 1.0 * DEGREE
     max_time_offset: float = 1.0  # largest lag of the gyro behind the profile, either way, s
-    # largest noise that accumulates in the heading, as a multiple of the known noise and as its
-    # heading error over the run, rad; a run that exceeds both is refused
+    # largest noise that accumulates in the heading, as a multiple of the known noise, or else of
+    # the white noise of the samples, and as its heading error over the run, rad; a run that
+    # exceeds both is refused
     max_noise_ratio: float = 8.0
     max_unexplained_angle: float = 1.0 * DEGREE
     rest_duration: float = 2.0  # length of the check after the run, s
@@ -199,7 +201,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
         s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
-    _refuse_fit(fit, run, motion, limits)
+    _refuse_fit(fit, run, motion, limits,
+                white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time)))))
     return fit
 
 
@@ -301,15 +304,28 @@ def _refuse_run(time: Array, run: RunPieces, motion: Motion, limits: RunLimits) 
         refuse_other_motion(run, motion, largest_offset)
 
 
-def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits) -> None:
-    """Refuse by the first cause found; causes that spoil later checks come first."""
+def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLimits,
+                white_noise: float) -> None:
+    """
+    Refuse by the first cause found; causes that spoil later checks come first.
+
+    `white_noise` is that of the samples, rad/√s.
+
+    """
     largest_offset = limits.max_time_offset + MAX_TRACKING_LAG
     excess_angle, sigmas = fit.stretch_residual
     s, b = fit.scale_factor_error, fit.bias
     deviation = float(np.nan_to_num(math.sqrt(fit.covariance[0, 0])))
-    slip = format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas)
     has_slipped = excess_angle > limits.max_stretch_residual and sigmas > MIN_SLIP_SIGMAS
-    if (has_slipped or abs(fit.time_offset) > largest_offset
+    slip = (format_slip(motion, excess_angle, fit.stretch_interval[0], sigmas) if has_slipped
+            else '')
+    # against measured headings the deviations include the noise of mount and encoder
+    unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
+    noise_ratio = (fit.goodness.noise_ratio if fit.goodness
+                   else fit.angle_random_walk / max(white_noise, 1e-300))
+    strays = (motion.rate is not None and unexplained_angle > limits.max_unexplained_angle
+              and noise_ratio > limits.max_noise_ratio)
+    if (has_slipped or strays or abs(fit.time_offset) > largest_offset
             or deviation > limits.max_scale_deviation):
         refuse_other_motion(run, motion, largest_offset, slip)
     if has_slipped:
@@ -327,14 +343,34 @@ def _refuse_fit(fit: ScaleBiasFit, run: RunPieces, motion: Motion, limits: RunLi
                           'or more often'
                           + (', and check that the profile is the one that was driven'
                              if motion.name == 'profile' else ''))
-    # against measured headings the deviations include the noise of mount and encoder
-    unexplained_angle = fit.angle_random_walk * math.sqrt(motion.duration)
-    if (motion.rate is not None and fit.goodness is not None and unexplained_angle
-            > limits.max_unexplained_angle and fit.goodness.noise_ratio > limits.max_noise_ratio):
-        raise DataRefused(f'the run is {fit.goodness.noise_ratio:.1f} times as noisy as the model '
-                          f'states, at most {limits.max_noise_ratio:g} are allowed: fasten the '
-                          'gyro, stop vibration, or measure the noise again (allan)')
+    if strays:
+        known = 'the model states' if fit.goodness else 'its samples show'
+        raise DataRefused(f'the run is {noise_ratio:.1f} times as noisy as {known}, at most '
+                          f'{limits.max_noise_ratio:g} are allowed: check that the robot follows '
+                          f'the {motion.name}, fasten the gyro, stop vibration, or measure the '
+                          'noise again (allan)')
     refuse_no_improvement(fit, limits.max_heading_error)
+
+
+def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, reference: str) -> str:
+    """
+    Return a remark on a scale factor error that gyros of a technology hardly have, or ''.
+
+    Parameters
+    ----------
+    prior_deviation : standard deviation of the scale factor error of such gyros, 1
+    reference : name of the motion
+
+    """
+    size = 100.0 * fit.scale_factor_error
+    sigmas = abs(fit.scale_factor_error) / math.hypot(
+        prior_deviation, float(np.nan_to_num(math.sqrt(fit.covariance[0, 0]))))
+    if 2.0 * float(ndtr(-sigmas)) > MIN_FIT_PROBABILITY:
+        return ''
+    return (f'a scale factor error of {size:.1f} % is {sigmas:.0f} standard deviations from what '
+            f'such gyros have (0 +- {100.0 * prior_deviation:g} %): compare the turn of the '
+            f'{reference} with a mark on the floor (calibrate by whole turns), and check radius '
+            'and track of the wheels, or the sensitivity of the gyro')
 
 
 #: Duration of the drive, with a net turn of 360 degrees, for which the precision of a calibration

@@ -25,10 +25,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit
 from gyro_calibration.calibration.self_calibration import (
     check_rest,
     default_reference_errors,
+    describe_implausible_scale,
     find_rest_after,
     METHODS,
     ReferenceErrors,
@@ -134,9 +136,13 @@ def _calibrate_by_motion(given: argparse.Namespace, model: GyroModel, log: Log) 
         run = calibrate_run(log, model, motion, begin, given.method, reference)
     if given.picture:
         run.draw(given.picture)
+    lines = list(_fit_lines(run.fit, run.rest_check, given.method, motion.name))
+    technology = model.gyro.get('technology', 'mems')
+    if remark := describe_implausible_scale(
+            run.fit, TECHNOLOGY_PRIORS.get(technology, TECHNOLOGY_PRIORS['mems'])[0], motion.name):
+        lines.append(f'{remark[0].upper()}{remark[1:]}.')
     return _store_and_answer(given, model, log, run.fit, run.is_used, given.method,
-                             _fit_data(run.fit, run.rest_check),
-                             list(_fit_lines(run.fit, run.rest_check, given.method, motion.name)))
+                             _fit_data(run.fit, run.rest_check), lines)
 
 
 @dataclass(frozen=True)

@@ -467,9 +467,8 @@ def _minimum_detectable(named: NamedCauses, effect: Effect) -> float | None:
     if by_cubic is None:
         return None
     place, uncertainty = by_cubic.last_index(fitted), by_cubic.uncertainty
-    variance = np.tensordot(uncertainty.weights, uncertainty.covariances, axes=1)[place, place]
     size = float(uncertainty.half_width(1.0 - named.level(effect))[place]
-                 + norm.ppf(0.95) * math.sqrt(variance))
+                 + norm.ppf(0.95) * math.sqrt(uncertainty.covariance()[place, place]))
     own = _given_values(fit, SINE_RESPONSE)[0]
     return size if fitted is effect else math.sqrt(own ** 2 + 6.0 * size) - own
 

@@ -32,9 +32,11 @@ import os
 from pathlib import Path
 from types import SimpleNamespace
 
+from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.self_calibration import (
     calibrate_bias,
     check_rest,
+    describe_implausible_scale,
     find_rest_after,
     ReferenceErrors,
     RunLimits,
@@ -525,6 +527,8 @@ def fit_run(run: CalibrationRun, noise: Noise, date: str,
     remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
     if fit.goodness:
         remarks.append(str(fit.goodness))
+    if implausible := describe_implausible_scale(fit, TECHNOLOGY_PRIORS['mems'][0], motion.name):
+        remarks.append(implausible)
     # After odometry the robot may drive on; a profile ends at rest.
     after = (find_rest_after(time, rate, fit, motion, limits) if by_odometry
              else time > motion.duration + max(fit.time_offset, 0.0) + SETTLING_TIME)

@@ -15,7 +15,7 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells, dwells_from_table, select_dwells
 from gyro_calibration.calibration.rate_table import channels_of, fit_effects
-from gyro_calibration.calibration.scatter import estimate_scatter, Scatter
+from gyro_calibration.calibration.scatter import estimate_scatter, find_inliers, Scatter
 from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model.effects import (
     BIAS,
@@ -25,6 +25,7 @@ from gyro_calibration.model.effects import (
     rate_temperature_polynomial,
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
+    SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
     STATIC_EFFECTS,
 )
@@ -33,7 +34,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval2d
 import pytest
 from recovery import CUBIC, gyros, LINEAR, POLYNOMIAL, run, SINE, Table
-from scipy.stats import binom, chi2
+from scipy.stats import binom, chi2, linregress
 from scipy.stats import t as student
 
 #: Probability that a test of an estimator fails by chance.
@@ -80,6 +81,26 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs)
         assert held.min() >= binom.ppf(RARE / errors.shape[1], runs, 0.92)
         # Nor are they too wide: the values of a run are correlated, so a run counts once.
         assert chi2.ppf(RARE, runs) / runs < np.mean(errors ** 2) < chi2.ppf(1 - RARE, runs) / runs
+
+
+@pytest.mark.parametrize('count', [4, 6, 12])
+def test_intervals_of_a_slope_over_few_sweeps_are_those_of_student(count):
+    slopes = BIAS_TEMPERATURE, SCALE_FACTOR_TEMPERATURE
+    generator = np.random.default_rng(4)
+    for _ in range(3):
+        warm = np.linspace(-20.0, 20.0, count)
+        biases, scales = (size * generator.standard_normal(count) for size in (1e-3, 1e-3))
+        rate = np.tile(np.linspace(-2.0, 2.0, 11), count)
+        sweep = np.repeat(np.arange(count), 11)
+        table = dwells(rate, biases[sweep] + scales[sweep] * rate
+                       + 1e-5 * generator.standard_normal(len(rate)), 25.0 + warm[sweep],
+                       sweep=sweep)
+        fit = fit_effects(table, [BIAS, SCALE_FACTOR_ERROR, *slopes])
+        for slope, of_sweeps in zip(slopes, (biases, scales)):
+            # the regression of the sweeps, which the dwells give nearly without noise
+            regression = linregress(warm, of_sweeps)
+            half_width = student.ppf(0.975, count - 2) * regression.stderr
+            assert 1.96 * fit.effect_deviation(slope) == pytest.approx(half_width, rel=0.05)
 
 
 @pytest.mark.parametrize('name', [*gyros()])
@@ -172,10 +193,19 @@ def test_what_is_left_out_is_what_a_fit_without_the_sweep_gives():
 def test_what_one_sweep_alone_shows_cannot_be_left_out():
     table = measured(LINEAR, sweeps=4)
     rate = np.where(table.sweep == 0, table.rate, 0.0)
-    fit = fit_effects(replace(table, rate=rate, output=table.output - table.rate + rate),
+    fit = fit_effects(replace(table, rate=rate, output=table.output - 1.01 * (table.rate - rate)),
                       (BIAS, SCALE_FACTOR_ERROR))
     assert (np.isinf(fit.left_out_residual[table.sweep == 0]).all()
             and np.isfinite(fit.left_out_residual[table.sweep > 0]).all())
+
+
+def test_the_fast_dwells_of_a_sweep_of_another_scale_are_not_outlying():
+    generator = np.random.default_rng(5)
+    rate, sweep = np.tile(np.linspace(-2.0, 2.0, 11), 8), np.repeat(np.arange(8), 11)
+    error = 2e-3 * (sweep == 3) * rate + 5e-5 * generator.standard_normal(len(rate))
+    assert find_inliers(dwells(rate, error, sweep=sweep)).all()
+    error[36] += 5e-3
+    assert np.flatnonzero(~find_inliers(dwells(rate, error, sweep=sweep))).tolist() == [36]
 
 
 def test_an_outlying_dwell_is_not_fitted():

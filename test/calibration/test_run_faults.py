@@ -18,6 +18,7 @@ Self-calibration: bad runs are refused by name, good ones accepted, and rests ch
 from functools import cache
 import json
 import math
+import re
 
 from chance import fewest, most
 from fooled import LEVELS, tried, WAYS
@@ -29,6 +30,7 @@ from gyro_calibration.calibration.likelihood import (
 from gyro_calibration.calibration.run_faults import split_run
 from gyro_calibration.calibration.self_calibration import (
     check_rest,
+    describe_implausible_scale,
     find_rest_after,
     ReferenceErrors,
     RunLimits,
@@ -114,6 +116,43 @@ LONG = np.arange(2301) / 100.0
 def test_a_motion_that_ends_early_or_begins_late_is_reported_by_when(time, moved, said):
     with pytest.raises(DataRefused, match=said):
         self_calibrate(time, moved, CALIBRATION_MOTION, noise=XV3500.noise)
+
+
+@pytest.mark.parametrize('noise', [None, XV3500.noise], ids=['noise unknown', 'noise known'])
+@pytest.mark.parametrize('limit', [25, 35, 42])
+def test_a_robot_that_does_not_reach_the_rates_of_the_profile_is_refused_by_its_limit(
+        limit, noise):
+    commanded = CALIBRATION_MOTION.rate_at(TIME)
+    reached = np.clip(commanded, -limit * DEGREE, limit * DEGREE)
+    with pytest.raises(DataRefused, match='deg/s where the profile turns at 45 deg/s') as refused:
+        self_calibrate(TIME, output() + (1 + S) * (reached - commanded), CALIBRATION_MOTION,
+                       noise=noise)
+    found = float(re.search(r'reached (\d+) deg/s', str(refused.value))[1])
+    assert found == pytest.approx(limit, abs=0.5 + 0.025 * 45)
+
+
+def test_a_run_of_which_a_part_is_short_is_refused_by_a_turn_that_explains_it():
+    short = np.where(TIME > 11.0, -0.06, 0.0) * CALIBRATION_MOTION.rate_at(TIME)
+    with pytest.raises(DataRefused, match='otherwise than the profile') as refused:
+        self_calibrate(TIME, output() + short, CALIBRATION_MOTION)
+    assert float(re.search(r'turned ([\d.]+) deg', str(refused.value))[1]) > 5.0
+
+
+def test_a_run_without_known_noise_is_judged_by_the_noise_of_its_samples():
+    """White noise of a gyro is no fault; a robot that swings about its profile is one."""
+    limits = RunLimits(max_scale_deviation=1.0, max_heading_error=math.tau)
+    assert self_calibrate(TIME, output(level=15.0), CALIBRATION_MOTION, limits=limits)
+    wander = 4.0 * DEGREE * np.sin(2.0 * math.pi * TIME / 3.1)
+    with pytest.raises(DataRefused, match='times as noisy as its samples show'):
+        self_calibrate(TIME, output() + wander, CALIBRATION_MOTION, limits=limits)
+
+
+def test_a_scale_factor_error_that_gyros_hardly_have_is_remarked_with_a_remedy():
+    wheels = output() - 0.27 * CALIBRATION_MOTION.rate_at(TIME)
+    off, good = (self_calibrate(TIME, rate, CALIBRATION_MOTION) for rate in (wheels, output()))
+    assert describe_implausible_scale(good, 0.01, 'profile') == ''
+    assert ' 22 standard deviations' in describe_implausible_scale(off, 0.01, 'profile')
+    assert 'radius and track of the wheels' in describe_implausible_scale(off, 0.01, 'profile')
 
 
 def test_a_slip_in_a_long_run_is_found_by_work_that_grows_no_faster_than_its_length():
