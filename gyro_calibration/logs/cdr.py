@@ -232,6 +232,12 @@ def parse(data: bytes, layout: MessageLayout) -> tuple[int, tuple[float, ...]]:
     return int(numbers[0]) * NSEC_PER_SEC + int(numbers[1]), numbers[2:]
 
 
+def parse_frame(data: bytes) -> str:
+    """Return the frame of the header with which a valid message begins."""
+    length = _UNPACK_LENGTH['<' if data[1] else '>'](data, 12)[0]
+    return data[16:16 + length].rstrip(b'\0').decode(errors='replace')
+
+
 def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:
     """Return a message with a header (stamp in ns since 1970) and numbers, as `parse` reads it."""
     text = frame.encode() + b'\0'

@@ -91,10 +91,16 @@ def _is_same_topic(topic: str, other: str | None) -> bool:
 
 
 class _TopicBuffer:
-    """Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities."""
+    """
+    Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities.
+
+    `frames` are the first two frames in the headers.
+
+    """
 
     def __init__(self, topic: str, kind: str, definition: str, axis: str):
         self.topic, self.kind, self.damaged_count = topic, kind, 0
+        self.frames = set[str]()
         self._layout = cdr.parse_layout(definition, axis)
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
 
@@ -109,6 +115,8 @@ class _TopicBuffer:
         except (MessageError, OverflowError):
             self.damaged_count += 1
             return
+        if len(self.frames) < 2:
+            self.frames.add(cdr.parse_frame(message.data))
         self._stamps.append(stamp)
         self._numbers.extend([numbers[place] for place in self._layout.quantities.values()])
 
@@ -217,6 +225,10 @@ class _LogBuilder:
         if not gyro.is_reported('rate'):
             raise LogError(f'{self._path}: {gyro.topic} declares that it reports no angular '
                            'velocity; name another by --topic')
+        if len(frames := self._series[gyro.topic].frames) > 1:
+            raise LogError(f'{self._path}: samples of the frames {_join_names(sorted(frames))} '
+                           f'are on {gyro.topic}, as of several gyros: record each on a topic of '
+                           'its own, or split the recording where the frame changes')
         reference, temperature = self._find_reference(), self._find_temperature(gyro.topic)
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:

@@ -196,6 +196,7 @@ class Pipeline:
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last_time, self._usual_interval = -math.inf, math.inf
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
+        self._first_frame: str | None = None
         self._frame: str | None = None
         self.publisher_conflict, self._interleaved_count = '', 0
         self._last_arrival, self._backlog = clock.steady(), 0.0  # delay of the last samples, ns
@@ -314,7 +315,9 @@ class Pipeline:
             self._note_jump(now, 'the stamps on imu/data_raw jump back repeatedly')
         if frame != self._frame:
             before, self._frame = self._frame, frame
-            if before is not None:
+            if before is None:
+                self._first_frame = frame
+            else:
                 self._note_jump(
                     now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
         if self.publisher_conflict:
@@ -361,6 +364,15 @@ class Pipeline:
                                          run is not None and run.kind == REST)
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
+
+    @property
+    def frame_fault(self) -> str:
+        """Return that the samples are not in the frame of the first one; ''."""
+        if self._frame == self._first_frame:
+            return ''
+        return (f'the samples on imu/data_raw have the frame {self._frame}, and had '
+                f'{self._first_frame}: the calibration may be that of another gyro; restart this '
+                'node, and calibrate another gyro')
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
@@ -501,7 +513,7 @@ class Pipeline:
         if self.ros_time.paused_duration > DRIVE_SAMPLE_TIMEOUT:
             return ROS_TIME_PAUSED
         if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
-                or self.clock_fault):
+                or self.clock_fault or self.frame_fault):
             return fault
         if not self._recent_rates or now - self.journal.last_received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
@@ -542,7 +554,7 @@ class Pipeline:
         before = self._suspected_clock_fault
         self._suspected_clock_fault = self._stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
-        if self.clock_fault:
+        if self.clock_fault or self.frame_fault:
             self._add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):

@@ -398,6 +398,10 @@ REFUSED = {
                 'no message of sensor_msgs/msg/Imu in it; there are /t'),
     'no rate': (lambda make, time: {'imu': gyro(make, time, time, reports_rate=False)}, Topics(),
                 'reports no angular velocity'),
+    'two gyros on one topic': (
+        lambda make, time: {'imu': [(at, make.imu(at, at, frame='right' if place % 2 else 'left'))
+                                    for place, at in enumerate(time)]}, Topics(),
+        'samples of the frames left and right are on imu, as of several gyros'),
     'a clock that was set back': (
         lambda make, time: {'imu': [(at, make.imu(at - 3600.0 * (at >= 1.5), at))
                                     for at in time]}, Topics(),

@@ -356,6 +356,22 @@ def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     assert not rig.pipeline.conflict
 
 
+def test_after_a_change_of_the_frame_the_heading_claims_nothing(tmp_path, reported):
+    """The calibration may be that of another gyro, or of another mount."""
+    rig = Rig(tmp_path)
+    for frame, fault, is_known in (('gyro', '', True), ('gyro', '', True),
+                                   ('other', 'have the frame other, and had gyro', False),
+                                   ('gyro', '', False)):
+        for _ in range(250):
+            rig.clock.now += INTERVAL
+            rig.fed += 10 ** 7
+            rig.outputs.append(rig.pipeline.add_sample(rig.fed, 0.01, frame=frame))
+            rig.guards()
+        assert fault in rig.pipeline.frame_fault and bool(fault) == bool(rig.pipeline.frame_fault)
+        assert fault in reported(rig)[1] and fault in rig.pipeline.find_obstacle()
+        assert (rig.outputs[-1].heading_variance < math.pi ** 2) == is_known
+
+
 def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_path):
     rig = rested(tmp_path, stationary_method='none', robot=Robot(scale_factor_error=0.0, bias=0.0))
     begin = len(rig.outputs) - 1
