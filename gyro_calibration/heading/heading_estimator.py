@@ -59,7 +59,7 @@ _LOST_TEMPERATURE_RATE = 1.0 / 60.0
 #: Age of a temperature, s, from which on it is held with a growing uncertainty.
 TEMPERATURE_TIMEOUT = 10.0
 #: Largest plausible specific force, m/s².
-_MAX_SPECIFIC_FORCE = 1e5
+MAX_SPECIFIC_FORCE = 1e5
 
 
 @dataclass(frozen=True)
@@ -424,7 +424,7 @@ class HeadingEstimator:
         """Tell whether a sample is plausible for the gyro; `add` refuses others, and any nan."""
         limit = self.current_model.rate_limit
         return (-limit <= output <= limit and -MAX_TIME <= time <= MAX_TIME
-                and (force is None or -_MAX_SPECIFIC_FORCE <= force <= _MAX_SPECIFIC_FORCE))
+                and (force is None or -MAX_SPECIFIC_FORCE <= force <= MAX_SPECIFIC_FORCE))
 
     def _is_outdated(self, time: float) -> bool:
         """Tell whether sensitivities, which are held for a block, are to be computed at a time."""

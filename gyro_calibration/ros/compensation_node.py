@@ -176,8 +176,7 @@ class CompensationNode(Node):
 
     def _on_imu(self, message: Imu) -> None:
         force: float | None = message.linear_acceleration.z
-        if (message.linear_acceleration_covariance[0] == NOT_REPORTED
-                or not math.isfinite(message.linear_acceleration.z)):
+        if message.linear_acceleration_covariance[0] == NOT_REPORTED:
             force = None
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:

@@ -36,6 +36,7 @@ from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
     Assumptions,
     HeadingEstimator,
+    MAX_SPECIFIC_FORCE,
     TEMPERATURE_TIMEOUT,
 )
 from gyro_calibration.heading.integration import Threshold
@@ -301,7 +302,8 @@ class Pipeline:
         Return a sample corrected, or None where it cannot be used.
 
         The stamp is in ns, the output in rad/s, and the specific force along the input axis in
-        m/s²; `receivers` is the number of other nodes that receive cmd_vel.
+        m/s², which counts as missing where it is not plausible; `receivers` is the number of other
+        nodes that receive cmd_vel.
 
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
@@ -351,6 +353,8 @@ class Pipeline:
                 and not 0.0 < interval < _POWER_OFF_SILENCE):
             self.estimator.begin_run(self._clock.date())
         self._last_time = time
+        if specific_force is not None and not abs(specific_force) <= MAX_SPECIFIC_FORCE:
+            specific_force = None
         journal.channels = set() if specific_force is None else {'specific_force'}
         if not self._integrate(time, (interval, silence), output, specific_force, now):
             return None

@@ -112,6 +112,14 @@ def test_an_impossible_rate_is_refused_and_leaves_a_gap(tmp_path, value):
 # Variances
 
 
+@pytest.mark.parametrize('force', [math.nan, math.inf, 1e6])
+def test_an_impossible_specific_force_does_not_cost_the_rate(tmp_path, force):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(100, 0.5), force=force)
+    assert not rig.journal.counts['refused_samples'] and not rig.journal.channels
+    assert rig.outputs[-1].heading == pytest.approx(99 * 0.5 * INTERVAL)
+
+
 def test_variances_grow_as_noise_and_assumptions_say(tmp_path):
     model = 'effects: {bias: {bias: 0.01}}\nnoise: {angle_random_walk: 7.0e-4}'
     found = Rig(tmp_path, model=model, stationary_method='none').feed(np.full(203, 0.5))
