@@ -259,7 +259,7 @@ class RestScatter:
         The ratio is that of the variance of the bias, over 1 s, to that of the white noise.
 
         """
-        passes = SCATTER_RATIOS <= max(bias_ratio, _MAX_SCATTER_RATIO)
+        passes = max(bias_ratio, _MAX_SCATTER_RATIO) >= SCATTER_RATIOS
         self.counts = self._learned + self._retention * _PRIOR_COUNTS * passes
 
     def probabilities(self, likelihood: Array) -> Array:
