@@ -228,17 +228,25 @@ def number_sweeps(rate: Array) -> Numbers:
 
 
 def _number_passes(value: Array) -> Numbers:
-    """Assign numbers to passes through values; a pass begins where the direction reverses."""
+    """
+    Assign numbers to passes through values; a pass begins where the direction reverses.
+
+    Values that are repeated where passes turn belong to both in equal parts.
+
+    """
     change = np.diff(value)
     # Mean rates of opposite sign differ slightly in absolute value.
     steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
     numbers = np.zeros(len(value), dtype=int)
-    direction = 0.0
+    direction, last_step = 0.0, 0
     for place, step in enumerate(steps, 1):
         is_reversed = step * direction < 0.0
         numbers[place] = numbers[place - 1] + is_reversed
+        if is_reversed and step * next((each for each in steps[place:] if each), 0.0) > 0.0:
+            numbers[place - (place - last_step) // 2: place] += 1
         # The jump back to the start of the next pass does not show its direction.
         direction = 0.0 if is_reversed else direction or step
+        last_step = place if step else last_step
     return numbers
 
 

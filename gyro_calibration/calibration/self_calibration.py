@@ -47,7 +47,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.special import chdtrc, ndtr, ndtri
+from scipy.special import chdtr, chdtrc, ndtr, ndtri
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,27 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
     _refuse_fit(fit, run, motion, limits,
                 white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time)))))
+    _refuse_shared_noise(fit, time, rate, noise)
     return fit
+
+
+def _refuse_shared_noise(fit: ScaleBiasFit, time: Array, rate: Array,
+                         noise: Noise | None) -> None:
+    """
+    Refuse a reference that follows the noise of the gyro: it is computed from this gyro.
+
+    The noise is the lesser of that of the model and that of the differences of the samples.
+
+    """
+    if noise is None or not noise.angle_random_walk or not fit.dof:
+        return
+    own = min(noise.angle_random_walk ** 2,
+              white_noise_deviation(rate) ** 2 * float(np.median(np.diff(time))))
+    if own and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-MIN_SLIP_SIGMAS):
+        raise DataRefused(
+            'the reference is computed from this gyro, since they differ by '
+            f'{math.sqrt(fit.residual_squares / (own * fit.dof)):.2f} times the noise of the '
+            'gyro: give a reference without it, such as odometry of the wheels')
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,

@@ -38,7 +38,7 @@ from gyro_calibration.heading.bias_table import (
 from gyro_calibration.heading.integration import TIME_TOLERANCE
 from gyro_calibration.heading.stationary import BLOCK_DURATION
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, Number
+from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MAX_TIME, Number
 from gyro_calibration.model.compensation import (
     compensate,
     CompensatedSamples,
@@ -58,8 +58,8 @@ _RESTART_DISTANCE = 5.0
 _LOST_TEMPERATURE_RATE = 1.0 / 60.0
 #: Age of a temperature, s, from which on it is held with a growing uncertainty.
 TEMPERATURE_TIMEOUT = 10.0
-#: Largest plausible stamp, s, and specific force, m/s².
-_MAX_TIME, _MAX_SPECIFIC_FORCE = 1e12, 1e5
+#: Largest plausible specific force, m/s².
+MAX_SPECIFIC_FORCE = 1e5
 
 
 @dataclass(frozen=True)
@@ -345,7 +345,7 @@ class HeadingEstimator:
     def add_temperature(self, time: float, temperature: float) -> None:
         """Take a temperature, degC, with its stamp, s; an implausible one is refused."""
         coldest, hottest = self.model.temperature_limits
-        if coldest <= temperature <= hottest and abs(time) <= _MAX_TIME:
+        if coldest <= temperature <= hottest and abs(time) <= MAX_TIME:
             self.temperature, self._temperature_time = temperature, time
         else:
             self.refused_temperature_count += 1
@@ -423,8 +423,8 @@ class HeadingEstimator:
     def is_plausible(self, time: float, output: float, force: float | None = None) -> bool:
         """Tell whether a sample is plausible for the gyro; `add` refuses others, and any nan."""
         limit = self.current_model.rate_limit
-        return (-limit <= output <= limit and -_MAX_TIME <= time <= _MAX_TIME
-                and (force is None or -_MAX_SPECIFIC_FORCE <= force <= _MAX_SPECIFIC_FORCE))
+        return (-limit <= output <= limit and -MAX_TIME <= time <= MAX_TIME
+                and (force is None or -MAX_SPECIFIC_FORCE <= force <= MAX_SPECIFIC_FORCE))
 
     def _is_outdated(self, time: float) -> bool:
         """Tell whether sensitivities, which are held for a block, are to be computed at a time."""
@@ -533,7 +533,7 @@ class HeadingEstimator:
         end = int(np.searchsorted(time[place:], begin + REST_DURATION - TIME_TOLERANCE)) + place
         end = min(end + (self._stretch is not None), len(time), place + CACHE_BLOCK_SAMPLES)
         rows, limit = slice(place, end), self.current_model.rate_limit
-        known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= _MAX_TIME)
+        known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= MAX_TIME)
         if temperature is not None:
             coldest, hottest = self.model.temperature_limits
             known &= (coldest <= temperature[rows]) & (temperature[rows] <= hottest)

@@ -48,15 +48,19 @@ _MIN_WINDOW_SAMPLES = 8
 _MAX_WINDOWS, _MIN_WINDOWS, _MAX_NOISE_FACTOR = 120, 20, 3.0
 #: Variances of means over 1 s in a detected rest, in addition to that of white noise and relative
 #: to it, correlations of neighbours, and the variances of blocks about these means: first those of
-#: a rest, then those of straight drives. With larger variances, most means over 1 s are beyond the
-#: limit of `mean_threshold_sigmas`, and most windows beyond that of the energy.
+#: a rest, then those of straight drives. With variances beyond `_MAX_SCATTER_RATIO` and beyond
+#: that of the bias, most means over 1 s are beyond the limit of `mean_threshold_sigmas`, and most
+#: windows beyond that of the energy. The largest is that of 0.5 deg/s and a fibre optic gyro.
 SCATTER_RATIOS, SCATTER_CORRELATIONS, BLOCK_RATIOS = np.array(
-    [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(4)
+    [(0.0, 0.0, 0.0), *((ratio, shared, fast) for ratio in 4.0 ** np.arange(11)
                         for shared in (0.0, 0.25, 0.5) for fast in (0.0, 1.0, 4.0))]).T
+_MAX_SCATTER_RATIO = 64.0
 #: The same of sums of many means, relative to that of white noise, for a process of first order.
 _SUM_RATIOS = SCATTER_RATIOS * (1.0 + SCATTER_CORRELATIONS) / (1.0 - SCATTER_CORRELATIONS)
-#: Prior numbers of rests, 3, and of straight drives that pass for rests, 1; largest total.
-_PRIOR_COUNTS = np.append(3.0, np.full(len(SCATTER_RATIOS) - 1, 1.0 / (len(SCATTER_RATIOS) - 1)))
+#: Prior numbers of rests, 3, and of straight drives that pass for rests with a known bias, 1;
+#: largest total.
+_PRIOR_COUNTS = np.append(3.0, np.full(
+    len(SCATTER_RATIOS) - 1, 1.0 / (np.count_nonzero(SCATTER_RATIOS <= _MAX_SCATTER_RATIO) - 1)))
 _MAX_STRETCHES = 20.0
 
 
@@ -232,18 +236,31 @@ class Snapshot:
     log_likelihood: Array = field(default_factory=lambda: np.zeros(len(SCATTER_RATIOS)))
 
 
-@dataclass
 class RestScatter:
     """
     Distribution of the scatter of the rates in detected rests.
 
     Attributes
     ----------
-    counts : number of rests with each of `SCATTER_RATIOS`, shape (k,)
+    counts : number of rests with each of `SCATTER_RATIOS` that pass in this rest, shape (k,)
 
     """
 
-    counts: Array = field(default_factory=_PRIOR_COUNTS.copy)
+    def __init__(self) -> None:
+        """Begin with the prior numbers."""
+        self._learned: Array = np.zeros(len(SCATTER_RATIOS))
+        self._retention = 1.0
+        self.begin_rest(0.0)
+
+    def begin_rest(self, bias_ratio: float) -> None:
+        """
+        Begin a rest.
+
+        The ratio is that of the variance of the bias, over 1 s, to that of the white noise.
+
+        """
+        passes = max(bias_ratio, _MAX_SCATTER_RATIO) >= SCATTER_RATIOS
+        self.counts = self._learned + self._retention * _PRIOR_COUNTS * passes
 
     def probabilities(self, likelihood: Array) -> Array:
         """Return the probability of each scatter, shape (k,)."""
@@ -258,8 +275,9 @@ class RestScatter:
 
     def learn(self, last: Snapshot) -> None:
         """Add a detected rest that has ended."""
-        retention = _MAX_STRETCHES / max(_MAX_STRETCHES, float(self.counts.sum()))
-        self.counts = retention * self.counts + self.probabilities(last.log_likelihood)
+        kept = _MAX_STRETCHES / max(_MAX_STRETCHES, float(self.counts.sum()))
+        self._learned = kept * self._learned + self.probabilities(last.log_likelihood)
+        self._retention *= kept
 
 
 @dataclass

@@ -698,6 +698,8 @@ class HeadingTracker:
         self.is_resting, self._rest_integral = True, self._zero_integral
         self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
+        self._rest_scatter.begin_rest(
+            (self.bias[1] / self._state.noise.angle_random_walk) ** 2)
         _, median = self._rest_scatter.mean_and_median(np.zeros(1))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
@@ -741,8 +743,11 @@ class HeadingTracker:
             duration += block.duration
         if len(blocks) < 3 or turn.duration - duration > BLOCK_DURATION:
             return snapshot, turn
-        squares = np.square(
-            [self._normalized_innovation(snapshot.state, block) for block in blocks])
+        state, innovations = snapshot.state, list[float]()
+        for block in blocks:
+            innovations.append(self._normalized_innovation(state, block))
+            state = state.advance_at_rest(block)  # an error of the bias is in the first alone
+        squares = np.square(innovations)
         at_rest = np.cumsum(squares)[:-1]
         moving = np.maximum((squares.sum() - at_rest) / np.arange(len(blocks) - 1, 0, -1), 1.0)
         last = int(np.argmin(at_rest + np.arange(len(blocks) - 1, 0, -1) * (1.0 + np.log(moving))))

@@ -233,9 +233,9 @@ def parse(data: bytes, layout: MessageLayout) -> tuple[int, tuple[float, ...]]:
 
 
 def parse_frame(data: bytes) -> str:
-    """Return the frame_id of a message that `parse` reads."""
+    """Return the frame of the header with which a valid message begins."""
     length = _UNPACK_LENGTH['<' if data[1] else '>'](data, 12)[0]
-    return data[16:15 + length].decode(errors='replace')
+    return data[16:16 + length].rstrip(b'\0').decode(errors='replace')
 
 
 def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:

@@ -77,6 +77,8 @@ _MAX_LINE_LENGTH, _MAX_BLOCK_LENGTH = 1 << 16, 1 << 24
 #: Largest number of values of a log in memory, 4 GB; a text counts as ten.
 _MAX_LOG_VALUES = 1 << 29
 
+#: Largest time of a sample, s; the stamps of this era in ms, us or ns are beyond it.
+MAX_TIME = 1e12
 _ROS_1_MAGIC = b'#ROSBAG V2.0'
 #: Largest magnitudes in the unit of the quantity, where they are not `MAX_MAGNITUDE`.
 _MAX_MAGNITUDES = {'temperature': 1e5}
@@ -389,9 +391,14 @@ def excerpt(text: str) -> str:
 
 def _refuse_unordered_time(path: str | Path, line_numbers: Sequence[int], time: Array | None,
                            previous_time: float) -> float:
-    """Refuse time that does not increase, also from block to block; return the last time."""
+    """Refuse time that does not increase or is too large; return the last time."""
     if time is None:
         return previous_time
+    if (far := np.abs(time) > MAX_TIME).any():
+        row = int(np.argmax(far))
+        raise LogError(f'{path}: line {line_numbers[row]}, column time_s: {time[row]:g} s is '
+                       f'beyond the limit of {MAX_TIME:g} s; give its unit, as by --columns '
+                       'time=time_s:ns')
     late = ~(np.diff(time, prepend=previous_time) >= MIN_SAMPLE_INTERVAL)
     if late.any():
         row = int(np.argmax(late))

@@ -82,13 +82,18 @@ def _is_same_topic(topic: str, other: str | None) -> bool:
 
 
 class _TopicBuffer:
-    """Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities."""
+    """
+    Messages of one topic: stamps and times of receipt, ns, and the numbers of quantities.
+
+    `frames` are the first two frames in the headers.
+
+    """
 
     def __init__(self, topic: str, kind: str, definition: str, axis: str):
         self.topic, self.kind, self.damaged_count = topic, kind, 0
+        self.frames = set[str]()
         self._layout = cdr.parse_layout(definition, axis)
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
-        self.frames = dict[str, int]()  # number of messages of each
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -101,8 +106,8 @@ class _TopicBuffer:
         except (MessageError, OverflowError):
             self.damaged_count += 1
             return
-        frame = cdr.parse_frame(message.data)
-        self.frames[frame] = self.frames.get(frame, 0) + 1
+        if len(self.frames) < 2:
+            self.frames.add(cdr.parse_frame(message.data))
         self._stamps.append(stamp)
         self._numbers.extend([numbers[place] for place in self._layout.quantities.values()])
 
@@ -303,10 +308,10 @@ class _LogBuilder:
             self._notes.append(f'{series.damaged_count} messages of {topic} could not be read and '
                                'were left out')
         if len(series.frames) > 1:
-            frames = [f'{count} of {name or "none"}' for name, count in series.frames.items()]
-            raise LogError(f'{self._path}: the messages of {topic} have several frames, '
-                           f'{_join_names(frames[:4])}, as of several sensors; record each on a '
-                           'topic of its own')
+            raise LogError(f'{self._path}: messages of the frames '
+                           f'{_join_names(sorted(series.frames))} are on {topic}, as of several '
+                           'sensors: record each on a topic of its own, or split the recording '
+                           'where the frame changes')
         return series.sort_by_arrival()
 
     def _order_samples(self, gyro: _TopicSeries, rate: float | None) -> _TopicSeries:

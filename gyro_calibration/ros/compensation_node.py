@@ -176,8 +176,7 @@ class CompensationNode(Node):
 
     def _on_imu(self, message: Imu) -> None:
         force: float | None = message.linear_acceleration.z
-        if (message.linear_acceleration_covariance[0] == NOT_REPORTED
-                or not math.isfinite(message.linear_acceleration.z)):
+        if message.linear_acceleration_covariance[0] == NOT_REPORTED:
             force = None
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:
@@ -424,8 +423,8 @@ class CompensationReport:
         for channel in estimator.missing_channels(pipeline.journal.channels):
             yield (f'the model needs the {channel.replace("_", " ")}, which no message contains; '
                    'that effect is left out')
-        yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.odometry_fault,
-                    pipeline.frame_fault, store.calibration_hint, store.shared_hint,
+        yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
+                    pipeline.odometry_fault, store.calibration_hint, store.shared_hint,
                     monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,
                     store.table_hint)
 

@@ -36,6 +36,7 @@ from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
     Assumptions,
     HeadingEstimator,
+    MAX_SPECIFIC_FORCE,
     TEMPERATURE_TIMEOUT,
 )
 from gyro_calibration.heading.integration import MAX_GAP, Threshold
@@ -160,9 +161,8 @@ class Pipeline:
     Computes corrected rates and the heading from raw samples.
 
     `conflict` says why samples cannot be used, `publisher_conflict` that the graph lists several
-    publishers, `repeat_fault` that the gyro repeats one value, `frame_fault` that the samples come
-    in another frame than the first, and `clock_fault` that stamps and clock advance differently,
-    each in a sentence or ''.
+    publishers, `repeat_fault` that the gyro repeats one value, and `clock_fault` that stamps and
+    clock advance differently, each in a sentence or ''.
 
     """
 
@@ -197,8 +197,8 @@ class Pipeline:
         self._stamp_offset = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last_time, self._usual_interval = -math.inf, math.inf
         self._last_stamp, self._jump_times = 0, deque[float](maxlen=2)
+        self._first_frame: str | None = None
         self._frame: str | None = None
-        self._first_frame = self.frame_fault = ''
         self.publisher_conflict, self._interleaved_count = '', 0
         self._last_arrival, self._backlog = clock.steady(), 0.0  # delay of the last samples, ns
         self._trusted_heading = 0.0, 0.0
@@ -302,7 +302,8 @@ class Pipeline:
         Return a sample corrected, or None where it cannot be used.
 
         The stamp is in ns, the output in rad/s, and the specific force along the input axis in
-        m/s²; `receivers` is the number of other nodes that receive cmd_vel.
+        m/s², which counts as missing where it is not plausible; `receivers` is the number of other
+        nodes that receive cmd_vel.
 
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
@@ -319,7 +320,8 @@ class Pipeline:
             if before is None:
                 self._first_frame = frame
             else:
-                self._note_frame(now, before, frame)
+                self._note_jump(
+                    now, f'samples of the frames {before} and {frame} alternate on imu/data_raw')
         if self.publisher_conflict:
             self._detect_interleaving(stamp)
         silence, self._last_stamp, self._last_arrival = now - self._last_arrival, stamp, now
@@ -351,6 +353,8 @@ class Pipeline:
                 and not 0.0 < interval < _POWER_OFF_SILENCE):
             self.estimator.begin_run(self._clock.date())
         self._last_time = time
+        if specific_force is not None and not abs(specific_force) <= MAX_SPECIFIC_FORCE:
+            specific_force = None
         journal.channels = set() if specific_force is None else {'specific_force'}
         if not self._integrate(time, (interval, silence), output, specific_force, now):
             return None
@@ -365,17 +369,14 @@ class Pipeline:
         self.session.add(time, output, receivers)
         return self._corrected_sample(stamp, time)
 
-    def _note_frame(self, now: float, before: str, frame: str) -> None:
-        """Note that the samples come in another frame, and end a run."""
-        self.frame_fault = '' if frame == self._first_frame else (
-            f'samples on imu/data_raw come in the frame {frame}, and came in {self._first_frame}: '
-            'if this is another gyro or mounting, give its model and start the node again')
-        if self.frame_fault:
-            self.journal.event = self.frame_fault
-            if self.session.run:
-                self.session.end(self.frame_fault)
-        self._note_jump(now,
-                        f'samples of the frames {before} and {frame} alternate on imu/data_raw')
+    @property
+    def frame_fault(self) -> str:
+        """Return that the samples are not in the frame of the first one; ''."""
+        if self._frame == self._first_frame:
+            return ''
+        return (f'the samples on imu/data_raw have the frame {self._frame}, and had '
+                f'{self._first_frame}: the calibration may be that of another gyro; restart this '
+                'node, and calibrate another gyro')
 
     def _note_jump(self, now: float, what: str) -> None:
         """Count a jump of stamps or frames; two within 1 s show several gyros."""
@@ -517,7 +518,7 @@ class Pipeline:
         if self.ros_time.paused_duration > DRIVE_SAMPLE_TIMEOUT:
             return ROS_TIME_PAUSED
         if (fault := self.conflict or self.publisher_conflict or self.repeat_fault
-                or self.clock_fault):
+                or self.clock_fault or self.frame_fault):
             return fault
         if not self._recent_rates or now - self.journal.last_received > 1.0:
             return 'no sample comes on imu/data_raw: check the gyro and its driver'
@@ -558,7 +559,7 @@ class Pipeline:
         before = self._suspected_clock_fault
         self._suspected_clock_fault = self._stamp_delay.find_fault()
         self.clock_fault = before and self._suspected_clock_fault
-        if self.clock_fault:
+        if self.clock_fault or self.frame_fault:
             self._add_unknown_turn(math.tau)
         date = self._clock.date()
         if event := self.estimator.update_table(date, is_final):

@@ -86,6 +86,12 @@ def test_sweeps_are_found_by_the_order_of_the_rates(sweep):
     assert list(found.sweep[turning]) == list(np.repeat([0, 1, 2], len(sweep))[turning])
 
 
+def test_a_rate_that_is_repeated_where_sweeps_turn_belongs_to_both():
+    up = [-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]
+    found = dwells_from_table(table([*up, *up[::-1], *up, *up[::-1]]))
+    assert list(found.sweep) == list(np.repeat([0, 1, 2, 3], 7))
+
+
 @pytest.mark.parametrize('rates, more, sweeps', [
     ([1, 2, 3, 4], {'sweep': ('cold', 'warm', 'cold', 'warm')}, [0, 1, 0, 1]),
     ([-100, -50, 0, 50, 100, 50, 0, -50, -100], {}, [0] * 5 + [1] * 4),

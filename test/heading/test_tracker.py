@@ -169,6 +169,22 @@ def test_a_first_rest_is_kept_whatever_the_bias_of_a_quiet_gyro(sigmas):
     assert abs(tracker.heading) < 4.0 * math.sqrt(tracker.variance)
 
 
+@pytest.mark.parametrize('slow', [0.2, -0.4, 0.7])
+def test_a_slow_turn_before_the_first_rest_does_not_fix_the_bias(slow):
+    """The robot has begun to drive with a bias that is hardly known, and rests for 2 s later."""
+    wide = np.diag([SCALE ** 2, (0.5 * DEGREE) ** 2])
+    parts = [(3, 20), (1.2, slow), *[(3, -20), (5, 10), (2, 0), (3, 20)] * 10]
+    motion = constant_rate_motion(parts)
+    for seed in range(3):
+        noise = Noise(0.005 * DEGREE)
+        time, _, heading, rate = gyro(motion, np.random.default_rng([9, seed]), noise, bias=0.0)
+        found = track(time, rate, sensitivity_of(rate), noise, wide, Settings(),
+                      still=np.array([0.0, -1.0]))
+        error = (found.heading - heading)[::20]
+        assert np.all(error ** 2 < 16.0 * found.variance[::20] + (0.05 * DEGREE) ** 2)
+        assert abs(error[-1]) < 1.0 * DEGREE
+
+
 def test_a_rest_that_was_too_short_to_learn_from_still_ends_in_time():
     motion = constant_rate_motion([(3, 0), (2, 30), (0.9, 0), (2, -30), (0.4, 0), (2, 30), (3, 0)])
     time, _, heading, rate = gyro(motion, np.random.default_rng(3))

@@ -72,6 +72,8 @@ REFUSED = {
                               'line 3 has 0 values where the header has 2'),
     'stands': ('time_s,gyro_dps\n0,1\n1,1\n1,1\n',
                'line 4, column time_s: 1 s is not later than 1 s'),
+    'time in ns': ('time_s,gyro_dps\n1.7e18,1\n1.8e18,1\n',
+                   'line 2, column time_s: 1.7e+18 s is beyond the limit of 1e+12 s; give'),
     'lost time': ('time_s,gyro_dps\n0,1\nnan,1\n2,1\n',
                   'line 3, column time_s: nan is not a finite number'),
     'infinite': ('time_s,gyro_dps\n0,1\n1,-inf\n',

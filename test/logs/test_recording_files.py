@@ -391,14 +391,6 @@ REFUSED = {
                 'no message of sensor_msgs/msg/Imu in it; there are /t'),
     'no rate': (lambda make, time: {'imu': gyro(make, time, time, reports_rate=False)}, Topics(),
                 'reports no angular velocity'),
-    'a clock that was set back': (
-        lambda make, time: {'imu': [(at, make.imu(at - 3600.0 * (at >= 1.5), at))
-                                    for at in time]}, Topics(),
-        r'step back by 3599\.9\d* s at sample 151'),
-    'two gyros on one topic': (
-        lambda make, time: {'imu': [(at, make.imu(at, at, frame='ab'[place % 2]))
-                                    for place, at in enumerate(time)]}, Topics(),
-        'imu have several frames, 150 of a and 150 of b, as of several sensors'),
     'a reference of another time': (
         lambda make, time: {'imu': gyro(make, time, time),
                             'pose': [(at, make.pose(at + 3600.0, 0.0)) for at in time]},

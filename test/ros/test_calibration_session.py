@@ -486,6 +486,25 @@ def test_odometry_is_a_reference(tmp_path):
     assert kept.standard_deviations[0] > 0.0099 * (1 + SCALE), 'no run is better than its odometry'
 
 
+def test_odometry_that_is_computed_from_the_gyro_is_no_reference(tmp_path):
+    rig = rested(tmp_path, robot=Robot(bias=0.0), calibration_reference=ODOMETRY)
+    estimator, turned = rig.pipeline.estimator, 0.0
+
+    def fused(stamp, reading):
+        nonlocal turned
+        turned += estimator.corrected_rate * INTERVAL
+        rig.pipeline.add_odometry(stamp, math.remainder(turned, math.tau),
+                                  Velocity(angular=(0.0, 0.0, estimator.corrected_rate)))
+
+    rig.odometry = fused
+    rig.begin(ODOMETRY)
+    for rate, seconds in ((0.6, 4.0), (0.0, 3.0), (-0.6, 4.0), (0.0, 13.5)):
+        rig.robot.command(rate)
+        rig.go(seconds)
+    success, message = rig.session.conclude()
+    assert not success and 'the reference is computed from this gyro' in message, message
+
+
 def test_odometry_may_be_finished_early(tmp_path):
     rig = rested(tmp_path, calibration_reference=ODOMETRY, calibration_duration=600.0)
     rig.begin(ODOMETRY)

@@ -112,6 +112,14 @@ def test_an_impossible_rate_is_refused_and_leaves_a_gap(tmp_path, value):
 # Variances
 
 
+@pytest.mark.parametrize('force', [math.nan, math.inf, 1e6])
+def test_an_impossible_specific_force_does_not_cost_the_rate(tmp_path, force):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(100, 0.5), force=force)
+    assert not rig.journal.counts['refused_samples'] and not rig.journal.channels
+    assert rig.outputs[-1].heading == pytest.approx(99 * 0.5 * INTERVAL)
+
+
 def test_variances_grow_as_noise_and_assumptions_say(tmp_path):
     model = 'effects: {bias: {bias: 0.01}}\nnoise: {angle_random_walk: 7.0e-4}'
     found = Rig(tmp_path, model=model, stationary_method='none').feed(np.full(203, 0.5))
@@ -359,15 +367,20 @@ def test_samples_of_two_frames_through_one_publisher_are_an_error(tmp_path):
     assert not rig.pipeline.conflict
 
 
-def test_samples_in_another_frame_are_a_warning_until_the_first_returns(tmp_path):
-    rig = Rig(tmp_path, model=KNOWN)
-    rig.feed(noisy(2.0), SLOW)
-    rig.pipeline.add_sample(rig.fed + 5 * 10 ** 6, 0.0, frame='other')
-    assert ('in the frame other' in rig.pipeline.frame_fault == rig.journal.event
-            and not rig.pipeline.conflict)
-    rig.clock.now += 5.0
-    rig.feed(noisy(1.0), SLOW)
-    assert not rig.pipeline.frame_fault
+def test_after_a_change_of_the_frame_the_heading_claims_nothing(tmp_path, reported):
+    """The calibration may be that of another gyro, or of another mount."""
+    rig = Rig(tmp_path)
+    for frame, fault, is_known in (('gyro', '', True), ('gyro', '', True),
+                                   ('other', 'have the frame other, and had gyro', False),
+                                   ('gyro', '', False)):
+        for _ in range(250):
+            rig.clock.now += INTERVAL
+            rig.fed += 10 ** 7
+            rig.outputs.append(rig.pipeline.add_sample(rig.fed, 0.01, frame=frame))
+            rig.guards()
+        assert fault in rig.pipeline.frame_fault and bool(fault) == bool(rig.pipeline.frame_fault)
+        assert fault in reported(rig)[1] and fault in rig.pipeline.find_obstacle()
+        assert (rig.outputs[-1].heading_variance < math.pi ** 2) == is_known
 
 
 def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_path):
