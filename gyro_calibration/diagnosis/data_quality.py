@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.calibration.reference_noise import update_interval
@@ -183,7 +184,7 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
     it, which is not so for a coarse code at a constant rate.
 
     """
-    chances = {}
+    chances, (low, high) = {}, codes.values[[0, -1]].tolist()
     deviation, noise = comparison.deviation, comparison.noise_deviation
     fine = codes.step < MIN_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
@@ -199,8 +200,8 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
             continue
         at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
         # a limit on either side counts the runs of both
-        both = (Limit(*codes.values[[0, -1]], chance).is_reached(comparison.output)
-                if abs(codes.values[0] + codes.values[-1]) < 1.5 * step else at_extreme)
+        both = (Limit(low, high, chance).is_reached(comparison.output)
+                if abs(low + high) < 1.5 * step else at_extreme)
         expected = (np.array([]) if comparison.expected is None
                     else sign * comparison.expected[at_extreme])
         beyond = (float(np.nanmedian(expected)) - extreme if np.isfinite(expected).any()
@@ -306,10 +307,11 @@ def _robust_quantile(off: Array) -> float:
 def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
                   level: float) -> SampleFault | None:
     """Find outliers among valid samples, or return None; `min_scatter` is half a code."""
-    output = measured = bridge_gaps(np.where(valid, comparison.output, np.nan))
+    measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
     limit = max(_MIN_OUTLIER_SIGMAS, float(stats.norm.isf(0.25 * level / len(output))))
     # how much the output is expected to change about each sample, and how far it jumps
-    expected_change = jumps = expected = np.zeros(len(output))
+    expected: Array = np.zeros(len(output))
+    expected_change = jumps = expected
     if comparison.expected is not None and np.isfinite(comparison.expected).any():
         expected = bridge_gaps(comparison.expected)
         output = output - expected
@@ -339,14 +341,14 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
             else None)
 
 
-def _windows(values: Array | Mask) -> tuple[Array, NDArray[np.intp]]:
+def _windows(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp]]:
     """Return the seven samples about each one, the outer ones at the ends, and its place there."""
     size, index = 2 * NEIGHBOURS_PER_SIDE + 1, np.arange(len(values))
     first = np.clip(index - NEIGHBOURS_PER_SIDE, 0, len(values) - size)
     return sliding_window_view(values, size)[first], index - first
 
 
-def _neighbour_samples(values: Array | Mask) -> Array:
+def _neighbour_samples(values: NDArray[Any]) -> NDArray[Any]:
     """Return the samples before and after each one, the next six at the ends, shape (n, 6)."""
     window, place = _windows(values)
     size = window.shape[1]

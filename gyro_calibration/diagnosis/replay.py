@@ -140,7 +140,7 @@ _GAP_MARGIN_SAMPLES = 4
 _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Replay:
     """One log prepared for the search: n samples, of which some are used."""
 

@@ -28,6 +28,7 @@ from typing import Any
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
     candidate_transforms,
+    depends_on_rate,
     effect_candidate,
     fitted_shape_indices,
     gaussian_pulse,
@@ -137,16 +138,27 @@ class Search:
         key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
                     for each in fit.causes if is_rate_distortion(each.cause))
         if key not in self.columns_cache:
-            for other in self.columns_cache.keys() - {()}:  # one is hundreds of megabytes
-                del self.columns_cache[other]
-            parts = [candidate_transforms(each, fit.distorted) for each in self.candidates]
-            ends = np.cumsum([len(part) for part in parts]).tolist()
-            columns = np.concatenate([np.empty((0, len(self.problem.deviation))), *parts])
-            self.columns_cache[key] = (columns / self.problem.deviation, [
-                range(end - len(part), end) for end, part in zip(ends, parts)])
+            known = self.columns_cache.popitem()[1] if self.columns_cache else None
+            self.columns_cache[key] = self._candidate_columns(fit, known)
         columns, groups = self.columns_cache[key]
         penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in groups])
         return column_evidence(fit, columns, groups) - penalty
+
+    def _candidate_columns(self, fit: RegressionFit, known: tuple[Array, list[range]] | None,
+                           ) -> tuple[Array, list[range]]:
+        """Return whitened columns and those of each candidate; known ones for another rate."""
+        deviation = self.problem.deviation
+        if known is None:
+            parts = [candidate_transforms(each, fit.distorted) / deviation
+                     for each in self.candidates]
+            ends = np.cumsum([len(part) for part in parts]).tolist()
+            return np.concatenate([np.empty((0, len(deviation))), *parts]), [
+                range(end - len(part), end) for end, part in zip(ends, parts)]
+        columns, groups = known
+        for each, own in zip(self.candidates, groups):
+            if depends_on_rate(each):
+                columns[own.start:own.stop] = candidate_transforms(each, fit.distorted) / deviation
+        return columns, groups
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
