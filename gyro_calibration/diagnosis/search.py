@@ -34,6 +34,7 @@ from gyro_calibration.diagnosis.candidates import (
     gaussian_pulse,
     generic_terms,
     indices_by_cause,
+    is_discontinuous,
     is_named,
     propose_candidates,
     unnamed_variable,
@@ -249,17 +250,19 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
 
 def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
     """Return a cause with its best shape near the given one, and the likelihood with it."""
-    if fitted_shape_indices(candidate) and candidate.cause != 'reference_slip':
-        place = fitted_shape_indices(candidate)[0]
+    places = fitted_shape_indices(candidate) if candidate.cause != 'reference_slip' else []
+    # those of smooth columns follow by Gauss-Newton steps
+    for place in places if is_discontinuous(candidate) else places[:1]:
         if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
             ratio = free_amplitude(fit, candidate)
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
             candidate = with_shape(candidate, place,
                                    candidate.shapes[place] * math.copysign(size, ratio))
-        first, half = candidate.shapes[place], candidate.half_width
+        start, half = candidate, candidate.half_width
 
-        def moved(by: float) -> Candidate:
-            return with_shape(candidate, place, first + by if half else first * math.exp(by))
+        def moved(by: float, start: Candidate = start, place: int = place) -> Candidate:
+            first = start.shapes[place]
+            return with_shape(start, place, first + by if half else first * math.exp(by))
 
         half_range = half or _SHAPE_RANGE
         best = minimize_scalar(
