@@ -137,8 +137,9 @@ def is_discontinuous(candidate: Candidate) -> bool:
 def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidate:
     """Return a candidate without values with another shape, within the bounds of its effect."""
     if candidate.cause == PART_OF_LOG:
-        ends = (*candidate.shapes[:shape_index], value, *candidate.shapes[shape_index + 1:])
-        return replace(_part_of_log(*ends, candidate.log_index, candidate.half_width),
+        ends = list(candidate.shapes)
+        ends[shape_index] = value
+        return replace(_part_of_log(ends[0], ends[1], candidate.log_index, candidate.half_width),
                        penalty=candidate.penalty)
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))

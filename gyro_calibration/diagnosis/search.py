@@ -251,6 +251,8 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
 def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
     """Return a cause with its best shape near the given one, and the likelihood with it."""
     places = fitted_shape_indices(candidate) if candidate.cause != 'reference_slip' else []
+    half = candidate.half_width
+    half_range = half or _SHAPE_RANGE
     # those of smooth columns follow by Gauss-Newton steps
     for place in places if is_discontinuous(candidate) else places[:1]:
         if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
@@ -258,13 +260,12 @@ def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
             candidate = with_shape(candidate, place,
                                    candidate.shapes[place] * math.copysign(size, ratio))
-        start, half = candidate, candidate.half_width
+        start = candidate
 
         def moved(by: float, start: Candidate = start, place: int = place) -> Candidate:
             first = start.shapes[place]
             return with_shape(start, place, first + by if half else first * math.exp(by))
 
-        half_range = half or _SHAPE_RANGE
         best = minimize_scalar(
             lambda by: -fit_causes(fit.problem, [*fit.causes, moved(by)]).log_likelihood,
             bounds=(-half_range, half_range), method='bounded',
