@@ -40,6 +40,11 @@ MIN_CHANNEL_RANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
 #: Shortest thermal lag, s; a shorter one equals a sensitivity to the temperature rate.
 MIN_THERMAL_LAG = 12.0
 
+#: Prefix of the name of structure without a name, which its variable follows; and the name of an
+#: error that is proportional to the rate in a part of a log.
+UNNAMED_PREFIX = '~'
+PART_OF_LOG = f'{UNNAMED_PREFIX}rate and time'
+
 #: Columns of one log: (replay) -> arrays of shape (n,).
 ColumnFunction = Callable[[Replay], Sequence[Array]]
 
@@ -106,11 +111,13 @@ _REFERENCE_EFFECTS: Mapping[str, Callable[..., Sequence[Array]]] = {
     'reference_slip': lambda each, width, *moments: tuple(
         -gaussian_pulse(each.channels.time, moment, width) for moment in moments)}
 #: Causes whose columns do not depend smoothly on their shapes.
-_DISCONTINUOUS = ('bias_step', 'dead_zone')
+_DISCONTINUOUS = ('bias_step', 'dead_zone', PART_OF_LOG)
 
 
 def fitted_shape_indices(candidate: Candidate) -> list[int]:
     """Return the indices of the shapes that are fitted, not set by convention."""
+    if candidate.cause == PART_OF_LOG:
+        return [0, 1]
     if candidate.cause not in CATALOGUE:
         return [0] if candidate.shapes and is_named(candidate) else []
     parameters = CATALOGUE[candidate.cause].parameters[:len(candidate.shapes)]
@@ -119,17 +126,35 @@ def fitted_shape_indices(candidate: Candidate) -> list[int]:
 
 def smooth_shapes(candidate: Candidate) -> list[int]:
     """Return the indices of fitted shapes on which the columns depend smoothly."""
-    return [] if candidate.cause in _DISCONTINUOUS else fitted_shape_indices(candidate)
+    return [] if is_discontinuous(candidate) else fitted_shape_indices(candidate)
+
+
+def is_discontinuous(candidate: Candidate) -> bool:
+    """Tell whether the columns of a candidate do not depend smoothly on its shapes."""
+    return candidate.cause in _DISCONTINUOUS
 
 
 def with_shape(candidate: Candidate, shape_index: int, value: float) -> Candidate:
     """Return a candidate without values with another shape, within the bounds of its effect."""
+    if candidate.cause == PART_OF_LOG:
+        ends = list(candidate.shapes)
+        ends[shape_index] = value
+        return replace(_part_of_log(ends[0], ends[1], candidate.log_index, candidate.half_width),
+                       penalty=candidate.penalty)
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[shape_index].bounds))
     moved = effect_candidate(candidate.cause, *candidate.shapes[:shape_index], value,
                              *candidate.shapes[shape_index + 1:], log_index=candidate.log_index,
                              half_width=candidate.half_width)
     return replace(moved, penalty=candidate.penalty)
+
+
+def depends_on_rate(candidate: Candidate) -> bool:
+    """Tell whether the columns of a candidate depend on the rate that the gyro senses."""
+    if not is_named(candidate):
+        return 'rate' in unnamed_variable(candidate).split(' and ')
+    effect = CATALOGUE.get(candidate.cause)
+    return effect is None or effect.distortion is not None or 'rate' in effect.inputs
 
 
 def common_channels(replays: Sequence[Replay]) -> frozenset[str]:
@@ -235,8 +260,6 @@ def indices_by_cause(candidates: Sequence[Candidate]) -> Mapping[str, list[int]]
     return places
 
 
-#: Prefix of the name of structure without a name; its variable follows.
-UNNAMED_PREFIX = '~'
 #: Numbers of waves over a turn or the range of rate or temperature, and of knots of splines.
 WAVE_COUNTS, SPLINE_KNOTS = range(1, 13), 8
 #: Widths of a bump in time as shares of the duration.
@@ -276,8 +299,14 @@ def generic_terms(replays: Sequence[Replay]) -> Iterator[Candidate]:
     for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # scale_factor_temperature
             yield _unnamed_term(f'{first} and {second}', _product_columns(one, other))
+    # a scale factor that differs in a part of a log; so many ends have `MAX_STEP_TIMES` pairs
+    ends = math.isqrt(2 * MAX_STEP_TIMES // len(replays)) + 1
     for run, each in enumerate(replays):
         begin = float(each.channels.time[each.valid][0])
+        if 'rate' in variables:
+            for part in combinations(begin + each.duration * np.linspace(0.0, 1.0, ends), 2):
+                if part[1] - part[0] < 0.99 * each.duration:
+                    yield _part_of_log(*part, run, each.duration / (ends - 1))
         for width in BUMP_WIDTHS:
             count = min(MAX_STEP_TIMES, round(1.0 / width)) // len(replays) + 3
             for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
@@ -326,6 +355,14 @@ def _spline_columns(variable: Variable) -> ColumnFunction:
     knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, SPLINE_KNOTS - 2), [1.0] * 3])
     # their sum is constant, as the bias is
     return lambda each: tuple(BSpline.design_matrix(variable(each), knots, 3).toarray().T[1:])
+
+
+def _part_of_log(first: float, last: float, log_index: int | None,
+                 half_width: float | None) -> Candidate:
+    """Return a scale factor error from a first to a last time."""
+    return Candidate(PART_OF_LOG, (first, last), lambda each: (each.channels.rate * (
+        (each.channels.time >= first) & (each.channels.time < last)),), log_index,
+        half_width=half_width)
 
 
 def _bump_columns(middle: float, width: float) -> ColumnFunction:

@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 from gyro_calibration.calibration.dwells import require_output
 from gyro_calibration.calibration.reference_noise import update_interval
@@ -37,11 +38,13 @@ from gyro_calibration.diagnosis.gates import (
     fit_line,
     identify_unit_factor,
     is_implausible_factor,
+    LineFit,
     model_scale_factor,
     OutputComparison,
     reference_rate,
     resample_reference,
     select_reference,
+    spline_rate,
     UNIT_FACTORS,
 )
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, NORMAL_QUANTILE_975
@@ -181,7 +184,7 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
     it, which is not so for a coarse code at a constant rate.
 
     """
-    chances = {}
+    chances, (low, high) = {}, codes.values[[0, -1]].tolist()
     deviation, noise = comparison.deviation, comparison.noise_deviation
     fine = codes.step < MIN_STEP_NOISE_RATIO * noise
     for sign in (1.0, -1.0):
@@ -196,13 +199,16 @@ def find_limit(codes: QuantizationCodes, comparison: OutputComparison,
         if chance >= level or extreme <= _rest_rate_limit(comparison.output):
             continue
         at_extreme = sign * comparison.output >= extreme - 1e-9 * abs(extreme)
+        # a limit on either side counts the runs of both
+        both = (Limit(low, high, chance).is_reached(comparison.output)
+                if abs(low + high) < 1.5 * step else at_extreme)
         expected = (np.array([]) if comparison.expected is None
                     else sign * comparison.expected[at_extreme])
         beyond = (float(np.nanmedian(expected)) - extreme if np.isfinite(expected).any()
                   else -math.inf)
         # The expected output errs by bias wander and nonlinearity, which these samples share.
         if (beyond > (-3.0 * deviation if fine else 0.5 * codes.step + 2.0 * deviation)
-                or fine and len(find_runs(at_extreme)) >= _MIN_LIMIT_RUNS):
+                or fine and len(find_runs(both)) >= _MIN_LIMIT_RUNS):
             chances[sign] = (sign * extreme, chance)
     if not chances:
         return None
@@ -301,10 +307,11 @@ def _robust_quantile(off: Array) -> float:
 def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
                   level: float) -> SampleFault | None:
     """Find outliers among valid samples, or return None; `min_scatter` is half a code."""
-    output = bridge_gaps(np.where(valid, comparison.output, np.nan))
+    measured = output = bridge_gaps(np.where(valid, comparison.output, np.nan))
     limit = max(_MIN_OUTLIER_SIGMAS, float(stats.norm.isf(0.25 * level / len(output))))
     # how much the output is expected to change about each sample, and how far it jumps
-    expected_change = jumps = np.zeros(len(output))
+    expected: Array = np.zeros(len(output))
+    expected_change = jumps = expected
     if comparison.expected is not None and np.isfinite(comparison.expected).any():
         expected = bridge_gaps(comparison.expected)
         output = output - expected
@@ -313,8 +320,12 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
         jumps = maximum_filter1d(_distance_to_cubic(expected), 2 * _JOLT_SAMPLES + 1)
     off = _distance_to_median(output)
     sigmas = _outlier_sigmas(output, off, expected_change, valid, min_scatter)
+    # an outlier is one among samples of the same rate too, and in the output itself
+    sigmas *= np.minimum(_distance_to_median(output, np.argsort(expected, kind='stable'))
+                         / np.maximum(off, 1e-300), 1.0)
+    sigmas[_distance_to_parabola(measured) < 0.5 * off] = 0.0
     # near a jump of the reference of half the size: a jolt, or the reference is outlying
-    sigmas[jumps > 0.5 * _distance_to_cubic(output)] = 0.0
+    sigmas[jumps > 0.5 * off] = 0.0
     missing = np.count_nonzero(_neighbour_samples(~valid), axis=1)
     tested = valid & (missing < NEIGHBOURS_PER_SIDE)
     outlying = (sigmas > limit) & tested
@@ -330,17 +341,38 @@ def find_outliers(comparison: OutputComparison, valid: Mask, min_scatter: float,
             else None)
 
 
-def _neighbour_samples(values: Array | Mask) -> Array:
+def _windows(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp]]:
+    """Return the seven samples about each one, the outer ones at the ends, and its place there."""
+    size, index = 2 * NEIGHBOURS_PER_SIDE + 1, np.arange(len(values))
+    first = np.clip(index - NEIGHBOURS_PER_SIDE, 0, len(values) - size)
+    return sliding_window_view(values, size)[first], index - first
+
+
+def _neighbour_samples(values: NDArray[Any]) -> NDArray[Any]:
     """Return the samples before and after each one, the next six at the ends, shape (n, 6)."""
-    size, place = 2 * NEIGHBOURS_PER_SIDE + 1, np.arange(len(values))
-    first = np.clip(place - NEIGHBOURS_PER_SIDE, 0, len(values) - size)
-    window = sliding_window_view(values, size)[first]
-    return window[np.arange(size) != (place - first)[:, None]].reshape(-1, size - 1)
+    window, place = _windows(values)
+    size = window.shape[1]
+    return window[np.arange(size) != place[:, None]].reshape(-1, size - 1)
 
 
-def _distance_to_median(values: Array) -> Array:
-    """Return how far each sample is from the median of its neighbours."""
-    return np.abs(values - np.median(_neighbour_samples(values), axis=1))
+def _distance_to_median(values: Array, order: NDArray[np.intp] | None = None) -> Array:
+    """Return how far each sample is from the median of its neighbours, in time or in an order."""
+    if order is None:
+        return np.abs(values - np.median(_neighbour_samples(values), axis=1))
+    distance = np.empty(len(values))
+    distance[order] = _distance_to_median(values[order])
+    return distance
+
+
+def _distance_to_parabola(values: Array) -> Array:
+    """Return how far each sample is from the parabola through its neighbours."""
+    window, place = _windows(values)
+    powers = np.vander(np.arange(window.shape[1]), 3)
+    weights = np.eye(len(powers))
+    for each, row in enumerate(weights):
+        others = np.arange(len(powers)) != each
+        row[others] = -powers[each] @ np.linalg.pinv(powers[others])
+    return np.abs((window * weights[place]).sum(axis=1))
 
 
 def _distance_to_cubic(values: Array) -> Array:
@@ -405,6 +437,9 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     output, rate = require_output(log), reference_rate(resample_reference(log))
     has_output = np.isfinite(output)
     line = None if rate is None else fit_line(log.time, rate, output)
+    if (rate is not None and line is not None and log.time is not None
+            and log.reference_rate is None):
+        rate = _follow_corners(log, rate, line)
     factor, units = 1.0, []
     if rate is not None and line is not None:
         # a factor in addition to the scale factor of the model
@@ -431,6 +466,22 @@ def inspect_record(log: Log, model: GyroModel | None = None) -> DataQuality:
     found = DataQuality((*units, *lost), (*notes, *remarks), has_output, factor,
                         heading_step=heading_step, update_interval=update)
     return _check_samples(found, compare_output(output * factor, expected), model, log)
+
+
+def _follow_corners(log: Log, rate: Array, line: LineFit) -> Array:
+    """
+    Return the rate of a heading by splines where it is closer to the output than a smooth one.
+
+    The smooth one errs at the ends of a log and at corners of the motion, and that by splines by
+    the noise of the heading.
+
+    """
+    assert log.time is not None
+    heading = resample_reference(log).reference_heading
+    assert heading is not None
+    sharp = np.where(np.isfinite(heading), spline_rate(log.time, heading), np.nan)
+    return min((sharp, rate), key=lambda each: float(np.nanmean(
+        (require_output(log) - line.factor * each - line.offset) ** 2)))
 
 
 def resolve_unit(quality: DataQuality) -> DataQuality:

@@ -65,6 +65,7 @@ from gyro_calibration.logs.quality import (
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
+from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
 #: Common confusions: degrees and radians, the sense of rotation, two ranges of a gyro.
@@ -188,6 +189,12 @@ def reference_rate(log: Log) -> Array | None:
         return None
     smooth = savgol_filter(bridge_gaps(log.reference_heading), length, 2)
     return np.where(known, np.gradient(smooth, log.time), np.nan)
+
+
+def spline_rate(time: Array, heading: Array) -> Array:
+    """Return the rate of a heading by a cubic spline, gaps interpolated, rad/s, shape (n,)."""
+    known = np.isfinite(heading)
+    return np.asarray(CubicSpline(time, np.interp(time, time[known], heading[known]))(time, 1))
 
 
 def fit_line(time: Array | None, rate: Array, output: Array) -> LineFit | None:

@@ -25,6 +25,7 @@ from gyro_calibration.diagnosis.candidates import (
     constant_channels,
     is_named,
     observed_range,
+    PART_OF_LOG,
     unnamed_variable,
 )
 from gyro_calibration.diagnosis.causes import (
@@ -395,6 +396,10 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: Regressi
                for each in selection.unnamed if is_named(each)}
     reasons |= {each.cause: 'it does not predict held-out stretches, or its size may be 0'
                 for each in selection.refuted}
+    for known in selection.unnamed:
+        if known.cause == PART_OF_LOG:
+            yield (f'From {known.shapes[0]:.4g} s to {known.shapes[1]:.4g} s the scale factor '
+                   'differs from that of the rest of the log: an effect of a part of the log.')
     for name, why in reasons.items():
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     scale = fit.scale_factor_error

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
@@ -61,7 +61,7 @@ MIN_INDEPENDENT_SHARE = 1e-7
 _MAX_AVERAGING_TIME, _MAX_FILTERED_RATIO, SMOOTHED_RATIO = 0.25, 0.7, 0.05
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RegressionProblem:
     """The logs and the noises that are tried."""
 
@@ -297,7 +297,7 @@ class RegressionFit:
         new = replay
         for known in self.causes:
             if is_rate_distortion(known.cause):
-                before, new = new, with_distorted_rate(new, [known])
+                before, new = new, with_distorted_rate(new, ((known.cause, known.shapes),))
                 found[known.cause] = new.channels.rate - before.channels.rate
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
         for place, known in enumerate(self.causes):
@@ -358,33 +358,51 @@ def is_rate_distortion(name: str) -> bool:
     return name in CATALOGUE and CATALOGUE[name].stage == 'rate'
 
 
-def with_distorted_rate(replay: Replay, causes: Sequence[Candidate]) -> Replay:
-    """Return a log with the rate that the gyro senses, distorted by causes."""
-    rate, time = replay.channels.rate, replay.channels.time
-    for known in causes:
-        if is_rate_distortion(known.cause):
-            distortion = CATALOGUE[known.cause].distortion
-            assert distortion is not None
-            rate = distortion(rate, time, *known.shapes)
-    return replay.with_rate(rate)
+@lru_cache(maxsize=16)
+def with_distorted_rate(replay: Replay,
+                        distortions: tuple[tuple[str, tuple[float, ...]], ...]) -> Replay:
+    """Return a log with the rate that the gyro senses, distorted by causes with their shapes."""
+    if not distortions:
+        return replay
+    before, (name, shapes) = with_distorted_rate(replay, distortions[:-1]), distortions[-1]
+    distortion = CATALOGUE[name].distortion
+    assert distortion is not None
+    return before.with_rate(distortion(before.channels.rate, before.channels.time, *shapes))
+
+
+#: Transforms of the same columns are needed in many fits, as in a search for a shape.
+_transforms = lru_cache(maxsize=32)(candidate_transforms)
+
+
+@lru_cache(maxsize=16)
+def _transforms_without_causes(replays: tuple[Replay, ...],
+                               distorted: tuple[Replay, ...]) -> tuple[Array, Array]:
+    """Return the transforms of the residual and of the rate over all logs, each shape (m,)."""
+    return (np.concatenate([
+        each.transform_residual(
+            each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
+        for each, new in zip(replays, distorted)]),
+        np.concatenate([each.transform_samples(each.channels.rate) for each in distorted]))
 
 
 # fits
 
 def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> RegressionFit:
     """Fit causes to logs, and the shapes of those that have values to first order."""
-    distorted = tuple(with_distorted_rate(each, causes) for each in problem.replays)
-    widths = []
-    residual = np.concatenate([
-        each.transform_residual(
-            each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
-        for each, new in zip(problem.replays, distorted)])
-    columns, owners = [np.concatenate([each.transform_samples(each.channels.rate)
-                                       for each in distorted])[None]], [(-1, 0)]
+    return _fit_causes(problem, tuple(causes))
+
+
+@lru_cache(maxsize=16)
+def _fit_causes(problem: RegressionProblem, causes: tuple[Candidate, ...]) -> RegressionFit:
+    distortions = tuple((each.cause, each.shapes)
+                        for each in causes if is_rate_distortion(each.cause))
+    distorted = tuple(with_distorted_rate(each, distortions) for each in problem.replays)
+    residual, rate = _transforms_without_causes(problem.replays, distorted)
+    columns, owners, widths = [rate[None]], [(-1, 0)], []
     for place, known in enumerate(causes):
         distorts = is_rate_distortion(known.cause)
         replays = problem.replays if distorts else distorted
-        own = candidate_transforms(known, replays)
+        own = _transforms(known, replays) if known.values or not distorts else rate[:0]
         widths.append(len(own) if known.amplitude is None else 0)
         if known.amplitude is None:
             columns.append(own)
@@ -405,12 +423,12 @@ def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> Regre
         'gq,gq->g', np.linalg.solve(information, pull[:, :, None])[:, :, 0], pull)
     determinants = problem.log_determinants + np.linalg.slogdet(information)[1]
     likelihood = -0.5 * ((len(residual) - len(of)) * np.log(squares) + determinants)
-    return RegressionFit(problem, distorted, tuple(causes), residual, of,
+    return RegressionFit(problem, distorted, causes, residual, of,
                          tuple(owners[place] for place in kept), tuple(widths), information,
                          scores, squares, likelihood)
 
 
-def _shape_derivative(cause: Candidate, shape_index: int, replays: Sequence[Replay],
+def _shape_derivative(cause: Candidate, shape_index: int, replays: tuple[Replay, ...],
                       columns: Array) -> Array:
     """Return the derivative of a cause's contribution with respect to a shape, shape (m,)."""
     shape = cause.shapes[shape_index]
@@ -419,7 +437,7 @@ def _shape_derivative(cause: Candidate, shape_index: int, replays: Sequence[Repl
     moved = with_shape(cause, shape_index, shape + step)
     if moved.shapes[shape_index] == shape:  # at its upper bound
         moved = with_shape(cause, shape_index, shape - step)
-    change = np.tensordot(cause.values, candidate_transforms(moved, replays) - columns, 1)
+    change = np.tensordot(cause.values, _transforms(moved, replays) - columns, 1)
     return np.asarray(change / (moved.shapes[shape_index] - shape))
 
 

@@ -30,6 +30,7 @@ from gyro_calibration.diagnosis.gates import (
     MIN_VALID_SHARE,
     resample_reference,
     select_reference,
+    spline_rate,
 )
 from gyro_calibration.heading.integration import integrate as integrate_trapezoidal
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
@@ -41,7 +42,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 
 
@@ -140,7 +140,7 @@ _GAP_MARGIN_SAMPLES = 4
 _CORNER_NOISE_SHARE, _MAX_CORNER_SHARE = 0.1, 0.2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Replay:
     """One log prepared for the search: n samples, of which some are used."""
 
@@ -381,7 +381,7 @@ def _interpolate_updates(time: Array, values: Array, step: float) -> Array:
 def _heading_rates(time: Array, heading: Array, heading_step: float) -> tuple[Array, Array]:
     """Return the rate of a heading by splines, nan where lost; and a smooth one without steps."""
     lost = ~np.isfinite(heading)
-    rate = CubicSpline(time, _interpolate_gaps(time, heading))(time, 1)
+    rate = spline_rate(time, heading)
     long = binary_opening(lost, np.ones(_GAP_MARGIN_SAMPLES))
     near = maximum_filter1d(lost, 3) | maximum_filter1d(long, 2 * _GAP_MARGIN_SAMPLES + 1)
     raw = np.where(near, np.nan, rate)

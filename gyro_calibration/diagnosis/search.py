@@ -28,11 +28,13 @@ from typing import Any
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
     candidate_transforms,
+    depends_on_rate,
     effect_candidate,
     fitted_shape_indices,
     gaussian_pulse,
     generic_terms,
     indices_by_cause,
+    is_discontinuous,
     is_named,
     propose_candidates,
     unnamed_variable,
@@ -137,16 +139,27 @@ class Search:
         key = tuple((each.cause, *(float(f'{shape:.2g}') for shape in each.shapes))
                     for each in fit.causes if is_rate_distortion(each.cause))
         if key not in self.columns_cache:
-            for other in self.columns_cache.keys() - {()}:  # one is hundreds of megabytes
-                del self.columns_cache[other]
-            parts = [candidate_transforms(each, fit.distorted) for each in self.candidates]
-            ends = np.cumsum([len(part) for part in parts]).tolist()
-            columns = np.concatenate([np.empty((0, len(self.problem.deviation))), *parts])
-            self.columns_cache[key] = (columns / self.problem.deviation, [
-                range(end - len(part), end) for end, part in zip(ends, parts)])
+            known = self.columns_cache.popitem()[1] if self.columns_cache else None
+            self.columns_cache[key] = self._candidate_columns(fit, known)
         columns, groups = self.columns_cache[key]
         penalty = VALUE_PENALTY * np.array([len(group) - 1.0 for group in groups])
         return column_evidence(fit, columns, groups) - penalty
+
+    def _candidate_columns(self, fit: RegressionFit, known: tuple[Array, list[range]] | None,
+                           ) -> tuple[Array, list[range]]:
+        """Return whitened columns and those of each candidate; known ones for another rate."""
+        deviation = self.problem.deviation
+        if known is None:
+            parts = [candidate_transforms(each, fit.distorted) / deviation
+                     for each in self.candidates]
+            ends = np.cumsum([len(part) for part in parts]).tolist()
+            return np.concatenate([np.empty((0, len(deviation))), *parts]), [
+                range(end - len(part), end) for end, part in zip(ends, parts)]
+        columns, groups = known
+        for each, own in zip(self.candidates, groups):
+            if depends_on_rate(each):
+                columns[own.start:own.stop] = candidate_transforms(each, fit.distorted) / deviation
+        return columns, groups
 
 
 def start_search(replays: Sequence[Replay], rate: float = 0.006,
@@ -237,19 +250,22 @@ def _screen_causes(search: Search, fit: RegressionFit) -> list[Scored]:
 
 def refine_shape(fit: RegressionFit, candidate: Candidate) -> Scored:
     """Return a cause with its best shape near the given one, and the likelihood with it."""
-    if fitted_shape_indices(candidate) and candidate.cause != 'reference_slip':
-        place = fitted_shape_indices(candidate)[0]
+    places = fitted_shape_indices(candidate) if candidate.cause != 'reference_slip' else []
+    half = candidate.half_width
+    half_range = half or _SHAPE_RANGE
+    # those of smooth columns follow by Gauss-Newton steps
+    for place in places if is_discontinuous(candidate) else places[:1]:
         if candidate.cause in _GROWING_EFFECTS:  # begin with the shape of the free amplitude
             ratio = free_amplitude(fit, candidate)
             size = math.sqrt(abs(ratio)) if candidate.cause == 'sine_response' else abs(ratio)
             candidate = with_shape(candidate, place,
                                    candidate.shapes[place] * math.copysign(size, ratio))
-        first, half = candidate.shapes[place], candidate.half_width
+        start = candidate
 
-        def moved(by: float) -> Candidate:
-            return with_shape(candidate, place, first + by if half else first * math.exp(by))
+        def moved(by: float, start: Candidate = start, place: int = place) -> Candidate:
+            first = start.shapes[place]
+            return with_shape(start, place, first + by if half else first * math.exp(by))
 
-        half_range = half or _SHAPE_RANGE
         best = minimize_scalar(
             lambda by: -fit_causes(fit.problem, [*fit.causes, moved(by)]).log_likelihood,
             bounds=(-half_range, half_range), method='bounded',

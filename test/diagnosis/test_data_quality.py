@@ -36,6 +36,7 @@ from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration_bench.hidden.log import hide
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 
 INTERVAL = 0.01
 WHITE = Noise(1e-4)
@@ -176,6 +177,50 @@ def test_an_outlier_at_an_end_of_the_log_is_found(place, generator):
     assert not inspect_record(log).usable[place] and 'outliers' in found(log)
 
 
+def with_motion(log, rate, reference):
+    """Return the log of another motion, with a rate or a heading as its reference."""
+    output = log.output + 1.01 * (rate - log.reference_rate)
+    heading = (cumulative_trapezoid(rate, log.time, initial=0.0) if reference == 'heading'
+               else None)
+    return replace(log, output=output, reference_heading=heading,
+                   reference_rate=None if heading is not None else rate)
+
+
+def ending_in_motion(log, generator):
+    """Return a log that ends in motion, where the rate of a heading is less well known."""
+    return with_motion(log, np.sin(6.0 * (log.time - log.time[-1])), 'heading')
+
+
+def with_corners(log, generator):
+    """Return a log with corners and a step of its rate, which a heading does not resolve."""
+    corners = np.cumsum(generator.uniform(2.0, 4.0, 15))
+    rate = np.interp(log.time, corners, np.arange(15) % 2 * 3.0)
+    return with_motion(log, rate + 4.0 * np.maximum(log.time % 30.0 - 29.5, 0.0), 'heading')
+
+
+def held_at_the_end(log, generator):
+    """Return a log whose reference ends before the output does, in motion."""
+    held = with_motion(log, log.reference_rate + np.exp(50.0 * (log.time - 60.0)), 'rate')
+    held.reference_rate[-2:] = held.reference_rate[-3]
+    return held
+
+
+def with_a_dead_zone(log, generator):
+    """Return a log with an output of zero in slow motion, and in single samples of reversals."""
+    corners = np.add.outer([20.0, 30.0, 40.0, 50.0], [0.0, 0.4]) + generator.uniform(0.0, 9.0)
+    rate = np.interp(log.time, corners.ravel(), [0.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
+    moved = with_motion(log, np.where(log.time < 20.0, 0.03 * np.sin(log.time), rate), 'rate')
+    within = np.abs(moved.reference_rate) < 20.0 * SIGMA
+    return replace(moved, output=moved.output - within * moved.reference_rate)
+
+
+@pytest.mark.parametrize('moved', [ending_in_motion, with_corners, held_at_the_end,
+                                   with_a_dead_zone])
+def test_what_motion_and_its_reference_do_is_no_outlier(moved, any_generator):
+    logs = [moved(swing(any_generator), any_generator) for _ in range(8)]
+    assert sum('outliers' in found(log) for log in logs) <= most(8, STATED)
+
+
 def test_an_outlier_of_the_reference_is_not_blamed_on_the_gyro(generator):
     log = swing(generator)
     log.reference_rate[generator.choice(np.arange(20, 5980), 8, replace=False)] += 30.0 * SIGMA
@@ -243,6 +288,14 @@ def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
     beyond = (log.output > high) | (log.output < low)
     assert (not quality.usable[beyond].any()
             and quality.usable[np.abs(log.reference_rate) < 0.6].all())
+
+
+def test_few_runs_at_a_limit_on_either_side_are_no_repeats_without_a_reference(generator):
+    time = np.arange(6000) * INTERVAL
+    rate = np.interp(time, [0, 5, 7, 10, 12, 20, 22, 25, 27, 40, 42, 45, 47, 60],
+                     [0.1, 0.1, 1, 1, 0, 0, -1, -1, 0, 0, 1, 1, 0.1, 0.1])
+    log = Log(output=np.clip(rate + SIGMA * generator.standard_normal(6000), -0.9, 0.9), time=time)
+    assert list(found(log)) == ['saturation']
 
 
 def test_a_constant_rate_of_coarse_steps_is_no_limit(generator):

@@ -165,6 +165,19 @@ def test_outliers_in_fast_motion_leave_no_slip():
     assert [each.effect for each in found.findings] == ['outliers']
 
 
+def test_a_scale_factor_of_a_part_of_a_log_is_not_blamed_on_the_temperature():
+    generator, time = np.random.default_rng(4), np.arange(6000) * 0.05
+    rate = np.sin(0.9 * time) * np.sin(0.11 * time)
+    part = (time > 105.0) & (time < 195.0)
+    log = Log(output=(1.0 + 0.004 * part) * rate + 1e-3 * generator.standard_normal(6000),
+              time=time, reference_rate=rate,
+              temperature=30.0 + 12.0 * np.sin(2.0 * math.pi * time / 180.0 + 3.0))
+    found = diagnose([log], generator)
+    assert not [each for each in found.findings if each.status == 'established']
+    assert 'rate and time' in [each.along for each in found.unexplained]
+    assert any('an effect of a part of the log' in remark for remark in found.remarks)
+
+
 # where is looked
 
 LATE = (TIME >= 200.0) & (TIME < 300.0)
