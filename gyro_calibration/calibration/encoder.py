@@ -36,6 +36,7 @@ from gyro_calibration.calibration.dwells import (
     interpolate_reference,
 )
 from gyro_calibration.calibration.heading_regression import (
+    COURSE_TREATMENT,
     fit_course,
     is_noisy,
     MAX_ENCODER_OFFSET,
@@ -65,7 +66,14 @@ from gyro_calibration.calibration.self_calibration import (
     RunLimits,
 )
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.logs.log import (
+    Array,
+    DataRefused,
+    DEGREE,
+    Log,
+    NORMAL_QUANTILE_975,
+    refuse_wrapped,
+)
 from gyro_calibration.logs.quality import (
     encoder_step,
     find_holes,
@@ -412,7 +420,12 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidu
 
 
 def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[str]:
-    s = fit.scale_factor_error
+    s, largest = fit.scale_factor_error, (COURSE_TREATMENT.largest_delay if method == 'course'
+                                          else MAX_ENCODER_OFFSET)
+    if abs(fit.time_offset) + NORMAL_QUANTILE_975 * fit.time_offset_deviation >= largest:
+        yield (f'the delay of {fit.time_offset:.3f} s is at the limit of those that are possible '
+               f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
+               'their stamps not of one clock: check them before the model is used')
     if method == 'course':
         if fit.reference_drift is not None:
             rate, half = (each / DEGREE for each in fit.reference_drift)
