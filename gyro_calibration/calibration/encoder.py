@@ -33,6 +33,7 @@ import math
 from gyro_calibration.calibration.dwells import (
     Dwells,
     few_values_remedy,
+    format_list,
     interpolate_reference,
 )
 from gyro_calibration.calibration.heading_regression import (
@@ -56,7 +57,11 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     TridiagonalMatrix,
 )
-from gyro_calibration.calibration.reference_noise import is_course, MAX_ROUNDING_STEP
+from gyro_calibration.calibration.reference_noise import (
+    drop_held_values,
+    is_course,
+    MAX_ROUNDING_STEP,
+)
 from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION,
@@ -75,6 +80,7 @@ from gyro_calibration.logs.log import (
     refuse_wrapped,
 )
 from gyro_calibration.logs.quality import (
+    bridge_gaps,
     encoder_step,
     find_holes,
     quantization_step,
@@ -88,11 +94,15 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 #: The gyro's white noise that is possible, rad/√s, and cosines for the wander of its bias.
 _WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
+#: Share of the largest differences that show their tail, and the probability that noise alone
+#: exceeds the limit of a jump in a log.
+_TAIL_SHARE, _JUMP_PROBABILITY = 0.005, 0.01
 #: Fewer dwells leave nothing over for two values, bias and scale factor error.
 MIN_DWELLS = 3
 
@@ -172,6 +182,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     DataRefused : with the reason and the remedy
 
     """
+    log, jumps = _remove_jumps(log)
     time, output, motion = _extract_motion(log)
     if method is None:
         method = 'likelihood'
@@ -200,7 +211,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         _heading_residual(on_reference, (output - fit.bias) / (1.0 + fit.scale_factor_error),
                           motion),
         0 if lost is None else int(lost.sum()),
-        tuple(_list_remarks(fit, method, technology)))
+        (*jumps, *_list_remarks(fit, method, technology)))
 
 
 def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
@@ -244,13 +255,54 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
+def _remove_jumps(log: Log) -> tuple[Log, list[str]]:
+    """
+    Return a log whose reference heading continues over its jumps as the gyro does, and a remark.
+
+    A jump is a change from one value to the next beyond all rates of the gyro around it, and
+    beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
+    1975). Two in a row are an outlier, or a motion that the gyro does not measure.
+
+    """
+    if (log.time is None or log.output is None or log.reference_heading is None
+            or not np.isfinite(log.output).any()):
+        return log, []
+    refuse_wrapped(log)
+    time, output = log.time, bridge_gaps(log.output)
+    heading = np.asarray(drop_held_values(log).reference_heading)
+    known = np.flatnonzero(np.isfinite(heading))
+    if len(known) < 2:
+        return log, []
+    apart, turned = np.diff(time[known]), np.diff(heading[known])
+    difference = turned - np.diff(integrate(time, output)[known])
+    around = 2 * math.ceil(COURSE_TREATMENT.largest_delay / float(np.median(np.diff(time)))) + 1
+    slowest, fastest = (find(output, around)[known[1:]] * apart
+                        for find in (minimum_filter1d, maximum_filter1d))
+    beyond = np.maximum(turned - fastest, slowest - turned) - quantization_step(heading[known])
+    usual = apart < 1.5 * np.median(apart)
+    low, high = np.quantile(np.abs(difference[usual]), 1.0 - _TAIL_SHARE * np.array([2.0, 1.0]))
+    noise = high + (high - low) * math.log2(
+        max(_TAIL_SHARE * len(known) / _JUMP_PROBABILITY, 1.0))
+    above = usual & (beyond > noise)
+    alone = np.convolve(above, np.ones(3), 'same') == 1.0
+    jumps = known[1:][above & alone]
+    if not len(jumps):
+        return log, []
+    sizes = np.zeros(len(time))
+    sizes[jumps] = difference[above & alone]
+    places = format_list([f'{time[row]:.2f} s' for row in jumps])
+    return replace(log, reference_heading=log.reference_heading - np.cumsum(sizes)), [
+        f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value to '
+        f'the next, at {places}, where the gyro does not turn so fast, as after a lost reference '
+        'or where rows are missing; the heading is compared before and after, not over, each jump']
+
+
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
     """Return time and output of the gyro, and the reference motion, without lost samples."""
     heading, rate = log.reference_heading, log.reference_rate
     if log.time is None or log.output is None or (heading is None and rate is None):
         raise DataRefused('the log holds no reference over time: it needs the columns time_s, '
                           'gyro_dps and reference_heading_deg or reference_rate_dps')
-    refuse_wrapped(log)
     if heading is None:
         assert rate is not None
         known, heading = np.isfinite(rate), np.full(len(log), np.nan)
