@@ -26,12 +26,11 @@ its wander between pieces.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import (
-    Dwells,
     few_values_remedy,
     format_list,
     interpolate_reference,
@@ -103,8 +102,6 @@ _HOLE_EDGE = 15
 #: Share of the largest differences that show their tail, and the probability that noise alone
 #: exceeds the limit of a jump in a log.
 _TAIL_SHARE, _JUMP_PROBABILITY = 0.005, 0.01
-#: Fewer dwells leave nothing over for two values, bias and scale factor error.
-MIN_DWELLS = 3
 
 
 @dataclass(frozen=True)
@@ -158,11 +155,6 @@ class EncoderCalibration:
     remarks: tuple[str, ...]
 
 
-def is_continuous_motion(logs: Sequence[Log], table: Dwells) -> bool:
-    """Tell whether logs are one log in time that has not enough dwells for a fit."""
-    return len(logs) == 1 and logs[0].time is not None and len(table) < MIN_DWELLS
-
-
 def calibrate_encoder(log: Log, method: str | None = None,
                       technology: str = 'mems') -> EncoderCalibration:
     """
@@ -182,14 +174,17 @@ def calibrate_encoder(log: Log, method: str | None = None,
     DataRefused : with the reason and the remedy
 
     """
-    log, jumps = _remove_jumps(log)
-    time, output, motion = _extract_motion(log)
+    refuse_wrapped(log)
     if method is None:
         method = 'likelihood'
         if log.reference_heading is not None and log.time is not None:
             sampled = replace(log, reference_heading=interpolate_reference(
                 log.time, log.reference_heading))
             method = 'course' if is_course(sampled) or is_noisy(sampled) else 'likelihood'
+    jumps: list[str] = []
+    if method != 'course':  # which errs in bursts of some seconds
+        log, jumps = _bridge_jumps(log)
+    time, output, motion = _extract_motion(log)
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
@@ -255,7 +250,7 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
-def _remove_jumps(log: Log) -> tuple[Log, list[str]]:
+def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     """
     Return a log whose reference heading continues over its jumps as the gyro does, and a remark.
 
@@ -267,7 +262,6 @@ def _remove_jumps(log: Log) -> tuple[Log, list[str]]:
     if (log.time is None or log.output is None or log.reference_heading is None
             or not np.isfinite(log.output).any()):
         return log, []
-    refuse_wrapped(log)
     time, output = log.time, bridge_gaps(log.output)
     heading = np.asarray(drop_held_values(log).reference_heading)
     known = np.flatnonzero(np.isfinite(heading))
