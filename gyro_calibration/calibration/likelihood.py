@@ -548,20 +548,11 @@ def _min_rate_variance(data: _Increments) -> float:
 
 
 def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
-    """
-    Estimate again, with the reference heading smoothed by the gyro as the instrument.
-
-    Also for delay and lag: the rate and the acceleration by the gyro hold its noise, which shows
-    as a lag, and with that as a scale factor error where a swing has one frequency.
-
-    """
+    """Estimate again, with the reference heading smoothed by the gyro as the instrument."""
     for _ in range(3):
-        instrument, scale = data.columns.copy(), _nonzero_scale(estimate.values[0])
-        instrument[:, 0] += (estimate.noise.expected_reference_error(estimate.residual) / scale)
-        turned = scale * np.append(0.0, np.cumsum(instrument[:, 0]))
-        rate = np.gradient(turned, data.time)
-        instrument[:, 2] = np.diff(rate)
-        instrument[:, 3] = np.diff(np.gradient(rate, data.time))
+        instrument = data.columns.copy()
+        instrument[:, 0] += (estimate.noise.expected_reference_error(estimate.residual)
+                             / _nonzero_scale(estimate.values[0]))
         estimate = _solve_weighted(data, estimate.noise, instrument, estimate.prior_deviation)
     return estimate
 

@@ -142,19 +142,6 @@ def test_scale_bias_and_delay_are_found(log, late, lost, count):
     assert found.fit.time_offset == pytest.approx(late, abs=1e-4)
 
 
-def test_noise_of_the_gyro_is_not_taken_for_a_lag_and_so_for_scale():
-    """A swing of one frequency does not separate lag and scale factor error."""
-    time, errors = np.arange(9000) / 100.0, []
-    rate = 60.0 * DEGREE * np.sin(1.6 * np.pi * time) * np.sin(0.1 * time)
-    heading = np.append(0.0, np.cumsum(rate[1:] + rate[:-1])) / 200.0
-    for seed in range(6):
-        noise = 0.1 * DEGREE * np.random.default_rng([seed, 64]).standard_normal(len(time))
-        fit = calibrate_encoder(Log(time=time, output=(1.0 + S) * rate + B + noise,
-                                    reference_heading=heading)).fit
-        errors.append((fit.scale_factor_error - S) / np.sqrt(fit.covariance[0, 0]))
-    assert np.sqrt(np.mean(np.square(errors))) < rms_bounds(6)[1]
-
-
 def test_rows_that_are_missing_without_a_gap_in_the_stamps_are_found_by_the_jumps_they_leave():
     generator = np.random.default_rng(63)
     log = log_of(SWING, 100.0, Noise(angle_random_walk=1e-4), generator, step=1e-6)

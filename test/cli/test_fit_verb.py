@@ -109,7 +109,7 @@ def test_three_steady_speeds_in_a_log_in_time_give_scale_and_bias(run, tmp_path)
 @pytest.mark.parametrize('rests', [0, 2])
 def test_a_reference_rate_that_is_never_steady_is_integrated(run, tmp_path, rests):
     time = np.arange(9000) / 100.0
-    rate = 60.0 * np.sin(2.0 * np.pi * 0.1 * time) * np.sin(0.03 * time)
+    rate = 60.0 * np.sin(0.6 * time) * np.sin(0.2 * time) + 30.0 * np.sin(2.3 * time)
     if rests:
         rate[(time < 5.0) | (time > 85.0)] = 0.0
     answer = fit_rates(run, tmp_path / 'log.csv', rate)
