@@ -279,6 +279,10 @@ def interpolate_reference(time: Array, values: Array) -> Array:
                     np.interp(time, time[known], values[known], np.nan, np.nan))
 
 
+class NothingSteady(DataRefused):
+    """The reference of a log in time is hardly ever steady, so that it shows no dwells."""
+
+
 class _Samples(NamedTuple):
     """
     Samples with output and reference, arrays of shape (n,).
@@ -357,7 +361,8 @@ def find_dwells(log: Log) -> Dwells:
 
     Raises
     ------
-    DataRefused : output or reference are missing, or the reference is never steady for long enough
+    DataRefused : output or reference are missing
+    NothingSteady : the reference is never steady for long enough
 
     """
     samples, remarks = _select_samples(log)
@@ -390,7 +395,7 @@ def find_dwells(log: Log) -> Dwells:
     remarks += _describe_left_out(log, samples, is_outlier & within, is_repeated & within, within)
     share = sum(map(samples.duration, dwells)) / float(np.ptp(time))
     if share < _MIN_DWELL_SHARE:
-        raise DataRefused(
+        raise NothingSteady(
             'the reference turns at a constant rate (its heading is a straight line to '
             f'{_MAX_DEVIATION / DEGREE:g} deg), for {_MIN_DURATION:g} s at a time without the '
             f'settling, in {100.0 * share:.0f} % of the log; hold each rate for longer, or use '

@@ -26,16 +26,17 @@ its wander between pieces.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells import (
-    Dwells,
     few_values_remedy,
+    format_list,
     interpolate_reference,
 )
 from gyro_calibration.calibration.heading_regression import (
+    COURSE_TREATMENT,
     fit_course,
     is_noisy,
     MAX_ENCODER_OFFSET,
@@ -55,7 +56,11 @@ from gyro_calibration.calibration.noise_grid import (
     HierarchicalPrior,
     TridiagonalMatrix,
 )
-from gyro_calibration.calibration.reference_noise import is_course, MAX_ROUNDING_STEP
+from gyro_calibration.calibration.reference_noise import (
+    drop_held_values,
+    is_course,
+    MAX_ROUNDING_STEP,
+)
 from gyro_calibration.calibration.run_faults import refuse_unit_error
 from gyro_calibration.calibration.self_calibration import (
     DRIVE_DURATION,
@@ -65,8 +70,16 @@ from gyro_calibration.calibration.self_calibration import (
     RunLimits,
 )
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.logs.log import (
+    Array,
+    DataRefused,
+    DEGREE,
+    Log,
+    NORMAL_QUANTILE_975,
+    refuse_wrapped,
+)
 from gyro_calibration.logs.quality import (
+    bridge_gaps,
     encoder_step,
     find_holes,
     quantization_step,
@@ -80,13 +93,15 @@ from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 #: The gyro's white noise that is possible, rad/√s, and cosines for the wander of its bias.
 _WHITE_NOISE_RANGE, _COSINE_COUNT = (1e-5, 1e-2), 8
 #: References on each side of a hole that the residual is continued by.
 _HOLE_EDGE = 15
-#: Fewer dwells leave nothing over for two values, bias and scale factor error.
-MIN_DWELLS = 3
+#: Share of the largest differences that show their tail, and the probability that noise alone
+#: exceeds the limit of a jump in a log.
+_TAIL_SHARE, _JUMP_PROBABILITY = 0.005, 0.01
 
 
 @dataclass(frozen=True)
@@ -140,11 +155,6 @@ class EncoderCalibration:
     remarks: tuple[str, ...]
 
 
-def is_continuous_motion(logs: Sequence[Log], table: Dwells) -> bool:
-    """Tell whether logs are one log in time that has not enough dwells for a fit."""
-    return len(logs) == 1 and logs[0].time is not None and len(table) < MIN_DWELLS
-
-
 def calibrate_encoder(log: Log, method: str | None = None,
                       technology: str = 'mems') -> EncoderCalibration:
     """
@@ -164,13 +174,17 @@ def calibrate_encoder(log: Log, method: str | None = None,
     DataRefused : with the reason and the remedy
 
     """
-    time, output, motion = _extract_motion(log)
+    refuse_wrapped(log)
     if method is None:
         method = 'likelihood'
         if log.reference_heading is not None and log.time is not None:
             sampled = replace(log, reference_heading=interpolate_reference(
                 log.time, log.reference_heading))
             method = 'course' if is_course(sampled) or is_noisy(sampled) else 'likelihood'
+    jumps: list[str] = []
+    if method != 'course':  # which errs in bursts of some seconds
+        log, jumps = _bridge_jumps(log)
+    time, output, motion = _extract_motion(log)
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
@@ -192,7 +206,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
         _heading_residual(on_reference, (output - fit.bias) / (1.0 + fit.scale_factor_error),
                           motion),
         0 if lost is None else int(lost.sum()),
-        tuple(_list_remarks(fit, method, technology)))
+        (*jumps, *_list_remarks(fit, method, technology)))
 
 
 def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
@@ -236,13 +250,53 @@ def _fit_encoder(time: Array, output: Array, motion: Motion, method: str,
     return fit, {'angle_random_walk': (float(low), float(high))}
 
 
+def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
+    """
+    Return a log whose reference heading continues over its jumps as the gyro does, and a remark.
+
+    A jump is a change from one value to the next beyond all rates of the gyro around it, and
+    beyond what noise gives in all of the log, by the exponential tail of the differences (Pickands
+    1975). Two in a row are an outlier, or a motion that the gyro does not measure.
+
+    """
+    if (log.time is None or log.output is None or log.reference_heading is None
+            or not np.isfinite(log.output).any()):
+        return log, []
+    time, output = log.time, bridge_gaps(log.output)
+    heading = np.asarray(drop_held_values(log).reference_heading)
+    known = np.flatnonzero(np.isfinite(heading))
+    if len(known) < 2:
+        return log, []
+    apart, turned = np.diff(time[known]), np.diff(heading[known])
+    difference = turned - np.diff(integrate(time, output)[known])
+    around = 2 * math.ceil(COURSE_TREATMENT.largest_delay / float(np.median(np.diff(time)))) + 1
+    slowest, fastest = (find(output, around)[known[1:]] * apart
+                        for find in (minimum_filter1d, maximum_filter1d))
+    beyond = np.maximum(turned - fastest, slowest - turned) - quantization_step(heading[known])
+    usual = apart < 1.5 * np.median(apart)
+    low, high = np.quantile(np.abs(difference[usual]), 1.0 - _TAIL_SHARE * np.array([2.0, 1.0]))
+    noise = high + (high - low) * math.log2(
+        max(_TAIL_SHARE * len(known) / _JUMP_PROBABILITY, 1.0))
+    above = usual & (beyond > noise)
+    alone = np.convolve(above, np.ones(3), 'same') == 1.0
+    jumps = known[1:][above & alone]
+    if not len(jumps):
+        return log, []
+    sizes = np.zeros(len(time))
+    sizes[jumps] = difference[above & alone]
+    places = format_list([f'{time[row]:.2f} s' for row in jumps])
+    return replace(log, reference_heading=log.reference_heading - np.cumsum(sizes)), [
+        f'the reference jumps by up to {np.abs(sizes).max() / DEGREE:.1f} deg from one value to '
+        f'the next, at {places}, where the gyro does not turn so fast, as after a lost reference '
+        'or where rows are missing; the heading is compared before and after, not over, each jump']
+
+
 def _extract_motion(log: Log) -> tuple[Array, Array, Motion]:
     """Return time and output of the gyro, and the reference motion, without lost samples."""
     heading, rate = log.reference_heading, log.reference_rate
     if log.time is None or log.output is None or (heading is None and rate is None):
         raise DataRefused('the log holds no reference over time: it needs the columns time_s, '
                           'gyro_dps and reference_heading_deg or reference_rate_dps')
-    refuse_wrapped(log)
     if heading is None:
         assert rate is not None
         known, heading = np.isfinite(rate), np.full(len(log), np.nan)
@@ -412,7 +466,12 @@ def _heading_residual(time: Array, rate: Array, motion: Motion) -> HeadingResidu
 
 
 def _list_remarks(fit: ScaleBiasFit, method: str, technology: str) -> Iterator[str]:
-    s = fit.scale_factor_error
+    s, largest = fit.scale_factor_error, (COURSE_TREATMENT.largest_delay if method == 'course'
+                                          else MAX_ENCODER_OFFSET)
+    if abs(fit.time_offset) + NORMAL_QUANTILE_975 * fit.time_offset_deviation >= largest:
+        yield (f'the delay of {fit.time_offset:.3f} s is at the limit of those that are possible '
+               f'({largest:g} s either way), so gyro and reference may not be of one motion, or '
+               'their stamps not of one clock: check them before the model is used')
     if method == 'course':
         if fit.reference_drift is not None:
             rate, half = (each / DEGREE for each in fit.reference_drift)

@@ -135,6 +135,11 @@ class ReferenceTreatment:
     is_fine: bool
     errs_as_heading: bool  # whether it has errors of a heading, not of an integrated rate
 
+    @property
+    def largest_delay(self) -> float:
+        """Return the largest trial delay, s."""
+        return _DELAY_SIGMAS * self.prior[2]
+
 
 COURSE_TREATMENT = ReferenceTreatment(2.0, 400, (*TECHNOLOGY_PRIORS['mems'], 1.0), (0.1, 1.0),
                                       15.0, False, True)
@@ -513,16 +518,12 @@ def find_delay(spans: Spans) -> float:
     count, prior = len(spans.time) - 1, np.array(spans.treatment.prior)
 
     def disagreement(delay: float) -> float:
-        """Return the robust difference of gyro and reference at a delay, rad."""
+        """Return the robust difference of gyro and reference over a span at a delay, rad."""
         moved = replace(spans, delay=delay)
-        if not spans.treatment.is_fine:
-            line = np.column_stack([np.ones(count + 1), spans.time])
-            error = np.append(0.0, np.cumsum(moved.observed[:count]))
-            return float(np.mean(np.abs(robust_residual(line, error, 3))))
         left = _robust_least_squares(moved.base_columns()[:, :2], moved.observed, prior[:2])[1]
         return float(np.mean(np.minimum(np.abs(left[:count]), 10.0 * DEGREE)))
 
-    most = int(_DELAY_SIGMAS * prior[2] / _DELAY_STEP + 1e-6)
+    most = int(spans.treatment.largest_delay / _DELAY_STEP + 1e-6)
     return min((_DELAY_STEP * np.arange(-most, most + 1)).tolist(), key=disagreement)
 
 

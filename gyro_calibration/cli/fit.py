@@ -24,13 +24,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwells import extract_dwells, format_list, join_dwells
-from gyro_calibration.calibration.encoder import (
-    calibrate_encoder,
-    EncoderCalibration,
-    is_continuous_motion,
-    MIN_DWELLS,
+from gyro_calibration.calibration.dwells import (
+    extract_dwells,
+    format_list,
+    join_dwells,
+    NothingSteady,
 )
+from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
 from gyro_calibration.calibration.rate_table import Bin, bin_errors, Calibration, fit_effects
 from gyro_calibration.calibration.scatter import MIN_SWEEPS
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGY_EFFECTS
@@ -123,6 +123,10 @@ _HEADING_ALONE = ('a reference heading determines bias and scale_factor_error on
                   'effects, --matrix and --surface use --method dwells')
 
 
+#: Fewer dwells leave nothing over for two values, bias and scale factor error.
+_MIN_DWELLS = 3
+
+
 def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: str | None = None,
               technology: str | None = None) -> Selection | EncoderCalibration:
     """Calibrate as `api.fit` by named logs: by dwells, or by the heading of a single log."""
@@ -133,11 +137,17 @@ def calibrate(logs: Mapping[str, Log], effects: Sequence[Effect] = (), method: s
         log.time is not None and log.reference_rate is None and log.reference_heading is not None
         for log in logs.values()))
     if by_dwells:
-        table = join_dwells([extract_dwells(log, name=Path(path).name if len(logs) > 1 else '')
-                             for path, log in logs.items()])
-        if effects or method or not is_continuous_motion(list(logs.values()), table):
-            return (Selection(fit_effects(table, effects), (), ()) if effects
-                    else select_effects(table, technology))
+        is_settled = effects or method or len(logs) > 1
+        try:
+            table = join_dwells([extract_dwells(log, name=Path(path).name if len(logs) > 1 else '')
+                                 for path, log in logs.items()])
+            if is_settled or len(table) >= _MIN_DWELLS or any(
+                    log.time is None for log in logs.values()):
+                return (Selection(fit_effects(table, effects), (), ()) if effects
+                        else select_effects(table, technology))
+        except NothingSteady:
+            if is_settled:
+                raise
     if len(logs) > 1:
         raise UsageError(f'--method {method or "likelihood"} takes one log; '
                          'give one log, or use --method dwells')
@@ -176,7 +186,7 @@ def _answer_heading(given: argparse.Namespace, logs: Mapping[str, Log], model: G
         draw_headings(given.picture, found)
     if log.reference_heading is None:
         remarks.insert(
-            0, f'the log has a reference rate, and fewer than {MIN_DWELLS} stretches of '
+            0, f'the log has a reference rate, and fewer than {_MIN_DWELLS} stretches of '
             'constant rate; so the rate is integrated, and headings are compared. For other '
             'effects than bias and scale factor error, hold each rate for some seconds')
     return ([f'{len(log)} samples of {path}, {found.lost_samples} lost.',

@@ -142,6 +142,28 @@ def test_scale_bias_and_delay_are_found(log, late, lost, count):
     assert found.fit.time_offset == pytest.approx(late, abs=1e-4)
 
 
+def test_rows_that_are_missing_without_a_gap_in_the_stamps_are_found_by_the_jumps_they_leave():
+    generator = np.random.default_rng(63)
+    log = log_of(SWING, 100.0, Noise(angle_random_walk=1e-4), generator, step=1e-6)
+    heading = log.reference_heading + 0.03 * DEGREE * generator.standard_normal(len(log))
+    heading[2000] += 5.0 * DEGREE
+    kept = np.ones(len(log), dtype=bool)
+    for begin in (1750, 3000, 4600, 6150, 9000):  # five times 0.3 s, 18 deg each
+        kept[begin:begin + 30] = False
+    assert np.all(np.abs(SWING.rate_at(log.time[~kept])) > 59.0 * DEGREE)
+    whole = calibrate_encoder(replace(log, reference_heading=heading))
+    found = calibrate_encoder(Log(time=log.time[:kept.sum()], output=log.output[kept],
+                                  reference_heading=heading[kept]))
+    for fit in (whole.fit, found.fit):
+        off = np.array([fit.scale_factor_error - S, fit.bias - B])
+        deviations = np.sqrt(np.diag(fit.covariance))
+        assert np.all(np.abs(off) < 4.0 * deviations)
+        assert np.all(deviations < [2e-4, 0.01 * DEGREE])
+    assert found.remarks[0].startswith('the reference jumps by up to 18.')
+    assert '17.50 s, 29.70 s, 45.40 s, 60.60 s, 88.80 s' in found.remarks[0]
+    assert not any('jumps' in remark for remark in whole.remarks)
+
+
 def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
     """
     A firmware that takes 351 for 360 deg makes a perfect gyro look 2.56 % too large.

@@ -88,17 +88,34 @@ def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
     assert low < -2.5654 * 0.07 * DEGREE < high
 
 
-def test_three_steady_speeds_in_a_log_in_time_give_scale_and_bias(run, tmp_path):
-    generator, time = np.random.default_rng(2), np.arange(0.0, 90.0, 0.01)
-    rate = np.array([0.0, 200.0, 270.0])[(time // 30.0).astype(int)]
-    output = 0.5 + 1.02 * rate + 0.1 * generator.standard_normal(len(time))
-    rows = [f'{t:.2f},{y:.4f},{w:.1f}' for t, y, w in zip(time, output, rate)]
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,reference_rate_dps\n' + '\n'.join(rows)
-                                      + '\n')
-    code, text, _ = run('fit', tmp_path / 'log.csv', '--json')
+def fit_rates(run, path, rate):
+    """Return the answer to a log at 100 Hz with a reference rate, deg/s; the gyro has 2 %."""
+    generator, time = np.random.default_rng(2), np.arange(len(rate)) / 100.0
+    output = 0.5 + 1.02 * rate + 0.1 * generator.standard_normal(len(rate))
+    np.savetxt(path, np.column_stack([time, output, rate]), '%.4f', ',', comments='',
+               header='time_s,gyro_dps,reference_rate_dps')
+    code, text, _ = run('fit', path, '--json')
     answer = strict(text)
     low, high = answer['effects']['scale_factor_error']['scale_factor_error']['ci95']
-    assert code == 0 and answer['dwells'] == 3 and low < 0.02 < high and high - low < 0.01
+    assert code == 0 and low < 0.02 < high and high - low < 0.01
+    return answer
+
+
+def test_three_steady_speeds_in_a_log_in_time_give_scale_and_bias(run, tmp_path):
+    answer = fit_rates(run, tmp_path / 'log.csv', np.repeat([0.0, 200.0, 270.0], 3000))
+    assert answer['method'] == 'dwells' and answer['dwells'] == 3
+
+
+@pytest.mark.parametrize('rests', [0, 2])
+def test_a_reference_rate_that_is_never_steady_is_integrated(run, tmp_path, rests):
+    time = np.arange(9000) / 100.0
+    rate = 60.0 * np.sin(0.6 * time) * np.sin(0.2 * time) + 30.0 * np.sin(2.3 * time)
+    if rests:
+        rate[(time < 5.0) | (time > 85.0)] = 0.0
+    answer = fit_rates(run, tmp_path / 'log.csv', rate)
+    assert answer['method'] == 'likelihood' and 'the rate is integrated' in answer['remarks'][0]
+    low, high = answer['effects']['bias']['bias']['ci95']
+    assert low < 0.5 * DEGREE < high < 0.6 * DEGREE
 
 
 def test_tables_in_several_files_are_one_calibration(run, tmp_path):
