@@ -166,6 +166,9 @@ class CauseTerm(NamedTuple):
         return self.cause in ('bias_step', 'reference_slip')
 
 
+_CLOCK_TERM = CauseTerm('clock_rate')
+
+
 @dataclass(frozen=True)
 class Spans:
     """One log as n spans between n + 1 points, and r rests."""
@@ -190,12 +193,13 @@ class Spans:
     # span that meets one, nothing is compared, and its observation is 0
     holes: Array
     delay: float = 0.0  # of the stamps of the gyro relative to the reference, s
+    clock_rate: float = 0.0  # by which the clock of the gyro is slow, so that the delay decreases
 
     @property
     def is_measured(self) -> Mask:
         """Tell which spans and rests the output covers, shape (n + r,)."""
         assert self.log.time is not None
-        at, margin = self.time + self.delay, 0.5 * float(np.median(np.diff(self.time)))
+        at, margin = self.gyro_stamps(self.time), 0.5 * float(np.median(np.diff(self.time)))
         first, last = np.concatenate([np.column_stack([at[:-1] - margin, at[1:] + margin]),
                                       self.log.time[self.rests]]).T
         begin, end = self.holes[:, :, None].transpose(1, 0, 2)
@@ -228,6 +232,20 @@ class Spans:
         own = [CauseTerm('reference_drift')] * bool(self.stands.any())
         return [*dict.fromkeys([*own, *causes])]
 
+    def value_slice(self, causes: Sequence[CauseTerm], cause: CauseTerm) -> slice:
+        """Return the places of the values of one of the causes."""
+        before = causes[:causes.index(cause)]
+        start = len(BASE_VALUES) + sum(self.cause_columns(each).shape[1] for each in before)
+        return slice(start, start + self.cause_columns(cause).shape[1])
+
+    def correction(self, causes: Sequence[CauseTerm], count: int) -> Array:
+        """Return the values for which the stamps are corrected, and 0 for the others."""
+        values: Array = np.zeros(count)
+        values[2] = self.delay
+        if _CLOCK_TERM in causes:
+            values[self.value_slice(causes, _CLOCK_TERM)] = self.clock_rate
+        return values
+
     @property
     def is_in_motion(self) -> Mask:
         """Tell which samples are not in a rest."""
@@ -245,10 +263,14 @@ class Spans:
         assert self.log.time is not None
         return np.diff(self.log.time[self.rests])[:, 0]
 
+    def gyro_stamps(self, time: Array) -> Array:
+        """Return the stamps of the gyro at times of the reference, s."""
+        return (time + self.delay) / (1.0 + self.clock_rate)
+
     def point_means(self, values: Array) -> Array:
         """Return the means of a signal at the points, corrected for the delay, shape (n + 1,)."""
         assert self.log.time is not None
-        delayed_values = np.interp(self.value_times + self.delay, self.log.time, values)
+        delayed_values = np.interp(self.gyro_stamps(self.value_times), self.log.time, values)
         return np.bincount(self.point_index, delayed_values) / np.bincount(self.point_index)
 
     def span_integrals(self, rate: Array) -> Array:
@@ -270,7 +292,8 @@ class Spans:
         """Return the change of the reference less that of the integral of the output, (n + r,)."""
         assert self.log.output is not None
         turned = np.append(np.diff(self.heading), np.zeros(len(self.rests)))
-        return self.is_measured * turned - self.span_integrals(self.log.output)
+        return self.is_measured * turned - (1.0 + self.clock_rate) * self.span_integrals(
+            self.log.output)
 
     def base_columns(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
@@ -299,17 +322,33 @@ class Spans:
         if cause.cause == 'bandwidth':
             # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
             return -self.span_changes(np.gradient(output, time))[:, None]
+        if cause.cause == 'clock_rate':
+            rate = np.asarray(self.channels.rate)
+            return (self.span_integrals(rate) - self.span_changes(time * rate))[:, None]
         columns = CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)
         return np.column_stack([-self.span_integrals(np.asarray(each)) for each in columns])
 
-    def with_corrected_rate(self, values: Array) -> Spans:
-        """Return the spans with the rate corrected for scale factor error, bias and delay."""
+    def with_corrected_rate(self, values: Array, causes: Sequence[CauseTerm] = ()) -> Spans:
+        """
+        Return the spans with the rate corrected for scale factor error, bias, delay and causes.
+
+        The delay and the clock rate are added to those of the spans.
+
+        """
         assert self.log.output is not None and self.log.time is not None
-        rate: Array = self.is_in_motion * (self.log.output - values[1]) / (1.0 + values[0])
-        moved = replace(self, delay=self.delay + float(values[2]))
+        errors, clock_rate = values[1], self.clock_rate
+        for cause in causes:
+            own = values[self.value_slice(causes, cause)]
+            if cause == _CLOCK_TERM:
+                clock_rate += float(own[0])
+            elif cause.cause in CATALOGUE.keys() - {'bandwidth'}:
+                errors = errors + sum(size * column for size, column in zip(
+                    own, CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)))
+        rate: Array = self.is_in_motion * (self.log.output - errors) / (1.0 + values[0])
+        moved = replace(self, delay=self.delay + float(values[2]), clock_rate=clock_rate)
         turned = integrate_with_curvature(self.log.time, rate)
         # the heading of the reference, between its points that of the gyro
-        at = self.log.time - moved.delay
+        at = (1.0 + moved.clock_rate) * self.log.time - moved.delay
         heading_change: Array = self.heading - moved.point_means(turned)
         if self.treatment.is_fine:
             heading_change = self._difference_of_gyro(heading_change)
@@ -470,10 +509,7 @@ class SpanFit:
 
     def value_slice(self, cause: CauseTerm) -> slice:
         """Return the places of the values of a cause."""
-        widths = [self.spans.cause_columns(each).shape[1] for each in self.causes]
-        place = self.causes.index(cause)
-        start = len(BASE_VALUES) + sum(widths[:place])
-        return slice(start, start + widths[place])
+        return self.spans.value_slice(self.causes, cause)
 
     def noise_size(self, name: str) -> float:
         """Return the likeliest size of a part of the noise."""
@@ -503,11 +539,13 @@ def fit_spans(spans: Spans, causes: Sequence[CauseTerm] = ()) -> SpanFit:
         else:
             values, error = _fit_headings(delayed, design, point_variances, free)
             point_variances = _burst_variance(delayed.time, error)
-        delayed = delayed.with_corrected_rate(values)
+        corrected = delayed.with_corrected_rate(values, causes)
         if spans.treatment.is_fine:
-            values[2] = 0.0
-            left = delayed.observed - design_matrix(delayed, causes) @ values
+            values += (delayed.correction(causes, len(values))
+                       - corrected.correction(causes, len(values)))
+            left = corrected.observed - design_matrix(corrected, causes) @ values
             point_variances = _point_variances(left[:count])
+        delayed = corrected
     if not (given or spans.stands.all()):
         delayed = _drop_contradicted_rests(delayed, causes, point_variances)
     return _fit_with_noise(delayed, causes, point_variances)
@@ -639,8 +677,7 @@ def _fit_with_noise(spans: Spans, causes: Sequence[CauseTerm],
         fit = fit_with(likeliest, wandering_value=1, hierarchical_priors=[
             HierarchicalPrior(name, place, (1e-2 * size, size))
             for place, (name, size) in enumerate(zip(BASE_VALUES, prior[:2]))])
-    values = fit.values.copy()
-    values[2] += spans.delay
+    values = fit.values + spans.correction(causes, len(fit.values))
     done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)),
                    np.ones(len(values)))
     covariance, effective, freedom = _cluster_robust_covariance(
@@ -669,10 +706,10 @@ def _cluster_robust_covariance(data: WhitenedRegression,
     number = float(stretch.max()) + 1.0
     variances = np.maximum(np.diag(fit.covariance),
                            np.sum(scores ** 2, axis=1) * number / max(number - 1.0, 0.5))
-    effective = _effective_clusters(stretch[inside], data.design[inside, :count])
+    effective = effective_clusters(stretch[inside], data.design[inside, :count])
     freedom = np.maximum(effective - 1.0, 1.0)
     for cluster in sectors:
-        rests_on = _effective_clusters(cluster[inside], influence[inside])
+        rests_on = effective_clusters(cluster[inside], influence[inside])
         scatter = _jackknife(data, cluster, inside)[:count]
         freedom = np.where(scatter > variances, np.maximum(rests_on - 1.0, 1.0), freedom)
         variances = np.maximum(variances, scatter)
@@ -694,7 +731,7 @@ def _jackknife(data: WhitenedRegression, cluster: NDArray[np.intp], inside: Mask
     return np.asarray((parts - 1) * np.var(without, axis=0) * (scale[-1] / scale[:-1]) ** 2)
 
 
-def _effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
+def effective_clusters(cluster: NDArray[np.intp], columns: Array) -> Array:
     """Return the effective number of clusters that determine each column."""
     shares = np.array([np.bincount(cluster, part ** 2) for part in columns.T])
     return np.asarray(shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300))

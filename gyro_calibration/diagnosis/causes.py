@@ -18,7 +18,7 @@ the experiment that distinguishes it from similar causes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Any
@@ -111,6 +111,27 @@ def add_causes(effects: Iterable[Effect]) -> None:
     """Add user-defined effects of the catalogue to the causes that a diagnosis searches for."""
     for effect in effects:
         CAUSES[effect.name] = _cause_of_effect(effect)
+
+
+def untestable_causes(testable: Collection[str], missing: Collection[str],
+                      reason: Callable[[Cause], str]) -> dict[str, str]:
+    """
+    Return the reasons why causes cannot be seen.
+
+    Parameters
+    ----------
+    testable : names of the causes that are tested in any case
+    missing : the channels that the logs do not have
+    reason : of a cause that lacks no channel; '' for one that is tested
+
+    """
+    found = {}
+    for name, cause in CAUSES.items():
+        lacks = ' and no '.join(sorted(cause.required_channels & {*missing}))
+        if name not in testable and (why := f'the logs have no {lacks}'.replace('_', ' ')
+                                     if lacks else reason(cause)):
+            found[name] = why
+    return found
 
 
 def make_finding(name: str, parameters: Mapping[str, Estimate], p_value: float,

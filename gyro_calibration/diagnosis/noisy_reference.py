@@ -22,7 +22,7 @@ better than no cause; otherwise it is suspected.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -31,6 +31,7 @@ from gyro_calibration.calibration.heading_regression import (
     BASE_VALUES,
     CauseTerm,
     design_matrix,
+    effective_clusters,
     fit_spans,
     HEADING_TREATMENT,
     lay_out_spans,
@@ -43,10 +44,12 @@ from gyro_calibration.calibration.heading_regression import (
 from gyro_calibration.diagnosis.candidates import lasting_shapes, MIN_CHANNEL_RANGE
 from gyro_calibration.diagnosis.causes import (
     add_remedies,
+    Cause,
     CAUSES,
     make_finding,
     mark_suspected,
     SINGLE_EVENT_REMEDY,
+    untestable_causes,
 )
 from gyro_calibration.diagnosis.data_quality import inspect_record
 from gyro_calibration.diagnosis.extended_model import (
@@ -79,7 +82,7 @@ from gyro_calibration.diagnosis.findings import (
 from gyro_calibration.diagnosis.search import MAX_CAUSES, MIN_PREDICTION_SIGMAS, prediction_sigmas
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, NORMAL_QUANTILE_975
-from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
+from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -93,6 +96,7 @@ _SAME_CLOCK = ('rate_command', 'encoder')
 DETECTION_SIGMAS = 4.8
 #: Longest lag of a gyro, s.
 _MAX_GYRO_LAG = 0.1
+_CLOCK_REMEDY = ('synchronize the clocks of gyro and reference; the model does not contain it')
 _REFERENCE_PHRASES = {
     'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
@@ -115,6 +119,8 @@ FOLD_COUNT = 5
 #: deviations of the prior of a scale factor error. Larger ones result from several similar columns
 #: that nearly cancel each other.
 _MAX_RELATIVE_EFFECT = 2.0 * HEADING_TREATMENT.prior[0]
+#: Most steps of the search for the k of a sine response, each of which multiplies its error.
+_SHAPE_STEPS = 20
 #: Variables whose causes are similar to errors of an encoder that repeat with its position.
 _MOTION_VARIABLES = frozenset({'rate', 'heading'})
 
@@ -163,18 +169,22 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
                   if not each.parameters[each.effect].contains_zero)]
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     of_record = {each.effect for each in record.findings}
+    # between two clocks neither a delay nor a clock rate is a property of the gyro
+    of_clocks = set() if reference.kind in _SAME_CLOCK else {'time_offset', 'clock_rate'}
+    findings = [replace(each, remedy=_CLOCK_REMEDY)
+                if each.effect in of_clocks and each.status == 'established' else each
+                for each in findings]
     changed = any(each.status == 'established' and CAUSES[each.effect].origin == 'gyro'
-                  and each.effect not in {'time_offset', 'bias_step', *of_record}
+                  and each.effect not in {'time_offset', 'bias_step', *of_record, *of_clocks}
                   for each in findings)
-    # between two clocks a delay is no property of the gyro
     clock_delay = next((each for each in findings if each.effect == 'time_offset'
-                        and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
+                        and each.status == 'established' and not of_clocks), None)
     rejected = gain is not None and gain.is_worse
     before = (model if model is not None else GyroModel() if rejected
               else _model_with_fit(GyroModel(), plain, log))
     after = (before if rejected or not (changed or clock_delay or model is None
                                         or prior is not None)
-             else _extend_model(model, model_fit, log, clock_delay))
+             else _extend_model(model, model_fit, log, clock_delay, of_clocks))
     curve, trace = _rate_curve_and_trace(extended, parts)
     return Diagnosis(tuple(add_remedies(findings, of_heading, after)), (), _gyro_noise(extended),
                      Noise() if model is None else model.noise,
@@ -217,13 +227,10 @@ def _value_findings(fit: SpanFit, model: GyroModel | None, false_alarm_rate: flo
         known, confounders = {}, ['reference_scale'] if name == 'scale_factor_error' else []
         if name == 'time_offset':
             of_gyro = 0.0 < value < _MAX_GYRO_LAG
-            if of_gyro and _is_lag_possible(fit, value):
-                confounders = ['bandwidth']
-            if own_clock:
-                known = {'remedy': 'synchronize the clocks of gyro and reference; the model does '
-                         'not contain it'}
-                if not of_gyro:
-                    known['cause'] = 'The gyro has a time offset from its reference.'
+            confounders = [other for other, might in (('bandwidth', of_gyro), ('clock_rate', True))
+                           if might and _is_possible_instead(fit, other)]
+            if own_clock and not of_gyro:
+                known['cause'] = 'The gyro has a time offset from its reference.'
         yield make_finding(name, {name: Estimate.from_half_width(value, half, CAUSES[name].unit)},
                            max(chance, MIN_PROBABILITY), confounders,
                            minimum_detectable=DETECTION_SIGMAS * deviation,
@@ -246,15 +253,19 @@ def _drift_findings(fit: SpanFit, false_alarm_rate: float) -> Iterator[Finding]:
             evidence=f'against {fit.spans.stands.sum()} rests, which determine the bias')
 
 
-def _is_lag_possible(fit: SpanFit, delay: float) -> bool:
-    """Tell whether a lag explains the log as well as the delay does, to three sigma."""
-    if not fit.spans.treatment.is_fine:
+def _is_possible_instead(fit: SpanFit, cause: str) -> bool:
+    """Tell whether a lag, or a clock rate, explains a log as well as the delay, to three sigma."""
+    if CauseTerm(cause) in fit.causes:
+        return False
+    if cause == 'bandwidth' and not fit.spans.treatment.is_fine:
         return True
-    data = whiten_regression(fit, (*fit.causes, CauseTerm('bandwidth')))
-    place = len(fit.values)
+    data = whiten_regression(fit, (*fit.causes, CauseTerm(cause)))
     inverse = np.linalg.pinv(data.design.T @ data.design)
-    square = float((inverse @ data.design.T @ data.observed)[place])
-    return abs(square - 0.5 * delay ** 2) < 3.0 * math.sqrt(inverse[place, place])
+    values, delay = inverse @ data.design.T @ data.observed, float(fit.values[2])
+    # the square of a lag; and the delay that a clock rate leaves
+    place, left = ((len(fit.values), 0.5 * delay ** 2) if cause == 'bandwidth'
+                   else (2, -fit.spans.delay))
+    return bool(abs(values[place] - left) < 3.0 * math.sqrt(inverse[place, place]))
 
 
 def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
@@ -269,6 +280,10 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
             else CAUSES[term.cause].unit)
     size, within = float(values[0]), float(half[0])
+    if term.cause == SINE_RESPONSE.name:
+        size, slope = _shape_of_sine(term, size)
+        within, unit = slope * within, CAUSES[term.cause].unit
+        term = CauseTerm(term.cause)
     if len(values) > 1:
         size = float(np.hypot(*values))
         within = float(np.hypot(*(values * half))) / size
@@ -293,10 +308,21 @@ def _cause_finding(found_cause: FoundCause, extended: SpanFit) -> Finding:
     return shown if found_cause.is_established else mark_suspected(shown)
 
 
+def _shape_of_sine(term: CauseTerm, amplitude: float) -> tuple[float, float]:
+    """
+    Return the k of a sine response of amplitude 1, and its derivative by the fitted amplitude.
+
+    The effect, ``sin(k w) / k - w``, is proportional to k² to first order.
+
+    """
+    root = math.sqrt(max(amplitude, 0.0))
+    return term.shapes[0] * root, 0.5 * term.shapes[0] / max(root, 1e-3)
+
+
 def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
-                  delay_finding: Finding | None) -> GyroModel:
-    """Return the extended model of a fit, with a delay of the gyro."""
-    after = _model_with_fit(model or GyroModel(), fit, log)
+                  delay_finding: Finding | None, left_out: Collection[str]) -> GyroModel:
+    """Return the extended model of a fit, with a delay of the gyro, without some causes."""
+    after = _model_with_fit(model or GyroModel(), fit, log, left_out)
     if model is not None and model.prior_deviations is not None:
         # the values of this unit replace those of its type
         after = replace(after, tolerance=Tolerance(), origin=previous_origins(model))
@@ -307,20 +333,29 @@ def _extend_model(model: GyroModel | None, fit: SpanFit, log: Log,
                      np.array([[size.deviation ** 2]]), [np.array(after.rate_range)], [])
 
 
-def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log) -> GyroModel:
+def _model_with_fit(base_model: GyroModel, fit: SpanFit, log: Log,
+                    left_out: Collection[str] = ()) -> GyroModel:
     """Return a model with scale factor error, bias, and the causes of the gyro that are fitted."""
     own = 1.0 + sum(
         term.values[0] for term in base_model.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in fit.values[:2])
     terms, rows = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))], [1, 0]
+    slopes = [1.0, 1.0]
     for cause in fit.causes:
-        if cause.cause in CATALOGUE:
+        if cause.cause in CATALOGUE.keys() - {*left_out}:
             places = fit.value_slice(cause)
-            terms.append(Term(CATALOGUE[cause.cause],
-                              (*cause.shapes, *fit.values[places].tolist())))
+            shapes, values = cause.shapes, fit.values[places].tolist()
             # shapes, as the last row, have no variance
-            rows += [*(-1 for _ in cause.shapes), *range(places.start, places.stop)]
-    covariance = np.pad(fit.covariance, (0, 1))[np.ix_(rows, rows)]
+            of_term = [*(-1 for _ in shapes), *range(places.start, places.stop)]
+            if cause.cause == SINE_RESPONSE.name:
+                # the shape instead of the amplitude
+                shape, slope = _shape_of_sine(cause, values[0])
+                shapes, values, of_term = (shape,), [1.0], [places.start, -1]
+                slopes += [slope, 0.0]
+            terms.append(Term(CATALOGUE[cause.cause], (*shapes, *values)))
+            rows += of_term
+            slopes += [1.0] * (len(rows) - len(slopes))
+    covariance = np.pad(fit.covariance, (0, 1))[np.ix_(rows, rows)] * np.outer(slopes, slopes)
     assert log.output is not None
     new = add_terms(base_model, terms, covariance, [log.output[np.isfinite(log.output)]],
                     [] if log.temperature is None else [log.temperature])
@@ -340,14 +375,14 @@ def _gyro_noise(fit: SpanFit) -> Noise:
 
 def _heading_contributions(fit: SpanFit) -> dict[str, Array]:
     """Return contributions of causes to the change of heading over spans, and residual, rad."""
-    values = fit.values.copy()
-    values[2] -= fit.spans.delay
+    values = fit.values - fit.spans.correction(fit.causes, len(fit.values))
     columns = design_matrix(fit.spans, fit.causes) * values
     found = {name: columns[:, place]
              for place, name in enumerate(BASE_VALUES) if name != 'time_offset'}
     for cause in fit.causes:
-        found[cause.cause] = found.get(cause.cause, 0.0) + columns[:, fit.value_slice(cause)].sum(
-            axis=1)
+        if cause.cause != 'clock_rate':
+            found[cause.cause] = found.get(cause.cause, 0.0) + columns[
+                :, fit.value_slice(cause)].sum(axis=1)
     found['left'] = fit.spans.observed - columns.sum(axis=1)
     return {name: part[:len(fit.spans.time) - 1] for name, part in found.items()}
 
@@ -392,26 +427,18 @@ def _cross_validated_gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
 
 def _untestable_causes(plain: SpanFit) -> dict[str, str]:
     """Return the reason for each cause that was not searched for."""
-    seen = {each.cause for each in (*propose_terms(plain), *plain.causes)} | _ALWAYS_TESTED
-    missing = {channel for channel in ('temperature', 'specific_force', 'supply')
-               if getattr(plain.spans.log, channel) is None}
-    shown = {}
-    for name, cause in CAUSES.items():
-        if name in seen:
-            continue
-        if lacks := sorted(missing & cause.required_channels):
-            reason = f'the logs have no {" and no ".join(lacks)}'.replace('_', ' ')
-        elif plain.lacks_turns and _follows_the_rate(name):
-            reason = ('fewer than three stretches turn, which do not distinguish it from a scale '
-                      'factor error')
-        elif name == 'reference_drift':
-            reason = 'the reference is known in no rest'
-        elif name == 'reference_once_per_rev':
-            reason = 'a course over ground has no shaft'
-        else:
-            reason = 'the errors of the reference hide it over short spans'
-        shown[name] = reason
-    return shown
+    def reason(cause: Cause) -> str:
+        if plain.lacks_turns and _follows_the_rate(cause.name):
+            return ('fewer than three stretches turn, which do not distinguish it from a scale '
+                    'factor error')
+        return {'reference_drift': 'the reference is known in no rest',
+                'reference_once_per_rev': 'a course over ground has no shaft'}.get(
+                    cause.name, 'the errors of the reference hide it over short spans')
+
+    seen = {each.cause for each in (*propose_terms(plain), *plain.causes)}
+    return untestable_causes(seen | _ALWAYS_TESTED, [
+        channel for channel in MIN_CHANNEL_RANGE if getattr(plain.spans.log, channel) is None],
+        reason)
 
 
 def _remarks(reference: Reference, done: SpanFit, is_fleet_model: bool) -> Iterator[str]:
@@ -449,11 +476,13 @@ def _rate_curve_and_trace(fit: SpanFit, parts: dict[str, Array]) -> tuple[Curve,
 # the search
 
 class Evidence(NamedTuple):
-    """Evidence for a term: p-value of it alone, gain in log-likelihood, effective stretches."""
+    """Evidence for a term."""
 
-    chance: float
-    gain: float
-    stretches: float
+    chance: float  # p-value of it alone
+    gain: float  # in log-likelihood
+    stretches: float  # effective number of stretches
+    # variance by the scatter of the stretches relative to that by the noise, at least 1
+    variance_ratio: float
 
 
 @dataclass(frozen=True)
@@ -485,6 +514,9 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
         terms += [CauseTerm(name, (moment,))
                   for moment in np.linspace(time[0], time[-1], 22)[1:-1].tolist()
                   for name in ('bias_step', 'reference_slip')]
+    fastest = float(np.abs(fit.spans.channels.rate).max())
+    terms += [CauseTerm('clock_rate'),
+              *[CauseTerm(SINE_RESPONSE.name, (0.5 / fastest,))] * (fine and fastest > 0.0)]
     return [each for each in terms if (fine or each.cause != 'reference_once_per_rev')
             and not (fit.lacks_turns and _follows_the_rate(each.cause))]
 
@@ -492,7 +524,8 @@ def propose_terms(fit: SpanFit) -> list[CauseTerm]:
 def _follows_the_rate(cause: str) -> bool:
     """Tell whether a cause adds nothing to the heading where the gyro does not turn."""
     effect = CATALOGUE.get(cause)
-    return (cause == 'reference_once_per_rev' if effect is None else 'rate' in effect.inputs)
+    return (cause in ('reference_once_per_rev', 'clock_rate') or effect is not None
+            and 'rate' in effect.inputs)
 
 
 def search_causes(fit: SpanFit, false_alarm_rate: float,
@@ -502,23 +535,33 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
     steps = _find_steps(fit, (), false_alarm_rate) if fine else []
     found, candidates = list(steps), propose_terms(fit)
     # noise given one column of each cause, so that it does not absorb their contributions
-    columns = {each.cause: each for each in candidates if not each.is_single_event}
+    columns = {each.cause: each for each in candidates
+               if not each.is_single_event and each.cause != SINE_RESPONSE.name}
     rich_fit = fit_spans(fit.spans, [*columns.values(), *(each.cause_term for each in steps)])
     while len(found) < MAX_CAUSES:
         found_terms = [each.cause_term for each in found]
         names = {each.cause for each in found_terms}
         on_progress(None, f'search for causes, {len(found)} found')
-        data = whiten_regression(fit, found_terms, rich_fit, use_max_random_walk=True)
-        best = _find_best_cause(fit.spans, data,
-                                [each for each in candidates if each.cause not in names],
-                                false_alarm_rate)
+        at = fit
+        for _ in range(2):
+            data = whiten_regression(at, found_terms, rich_fit, use_max_random_walk=True)
+            remaining = [fitted for each in candidates if each.cause not in names
+                         for fitted in _fit_shape(at.spans, data, each)]
+            best = _find_best_cause(at.spans, data, remaining, false_alarm_rate)
+            if best is None or 'rate' not in getattr(CATALOGUE.get(best.cause_term.cause),
+                                                     'inputs', ()):
+                break
+            # once more, at the rate without this cause: similar ones differ in higher order
+            at = fit_spans(fit.spans, [*found_terms, best.cause_term])
         if best is None:
             break
         found.append(best)
     found = [each for each in found if each.prediction_gain > 0.0]
-    if fine and found and not steps:
-        found += _find_steps(fit, [each.cause_term for each in found if each.is_established],
-                             false_alarm_rate)
+    causes = [each for each in found if each not in steps]
+    if fine and causes:
+        # a step may have been part of another cause, or have been hidden by it
+        found = causes + _find_steps(fit, [each.cause_term for each in causes
+                                           if each.is_established], false_alarm_rate)
     while established := [each.cause_term for each in found if each.is_established]:
         extended = fit_spans(fit.spans, established)
         worst = max(established, key=lambda each: _implausibility(extended, each))
@@ -529,14 +572,33 @@ def search_causes(fit: SpanFit, false_alarm_rate: float,
     return fit, found
 
 
+def _fit_shape(spans: Spans, data: WhitenedRegression, term: CauseTerm) -> list[CauseTerm]:
+    """Return a term, that of a sine response with the k for the amplitude 1; none without one."""
+    if term.cause != SINE_RESPONSE.name:
+        return [term]
+    # beyond a quarter of a wave the output would fall while the rate increases
+    largest = 0.5 * math.pi / float(np.abs(spans.channels.rate).max())
+    for _ in range(_SHAPE_STEPS):
+        column, left = _given_design(data, data.whiten_columns(spans.cause_columns(term)))
+        square = float(np.sum(column ** 2))
+        amplitude = float(left @ column[:, 0]) / square if square > 0.0 else 0.0
+        shape = _shape_of_sine(term, amplitude)[0]
+        if not SINE_RESPONSE.parameters[0].bounds[0] < shape < largest:
+            break
+        term = CauseTerm(term.cause, (shape,))
+        if abs(amplitude - 1.0) < 1e-3:
+            return [term]
+    return []
+
+
 def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
                 false_alarm_rate: float) -> list[FoundCause]:
     """
     Return the steps of the bias given some causes, at most three.
 
-    A step is tried at each point. The noise is fitted again with the steps, so that a random walk
-    that they had caused does not hide them, and one that the log has is not a step. Of three
-    steps those that are not significant are removed, the weakest first.
+    A step is tried at each point, and around the best of them. The noise is fitted again with the
+    steps, so that a random walk that they had caused does not hide them, and one that the log has
+    is not a step. Of three steps those that are not significant are removed, the weakest first.
 
     """
     times = fit.spans.time[2:-2]
@@ -546,7 +608,9 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
         with_steps = fit_spans(fit.spans, [*causes, *steps]) if causes or steps else fit
         data = whiten_regression(with_steps, with_steps.causes)
         place = every * int(np.argmax(_step_gains(fit, data, times[::every])))
-        near = times[max(place - every, 0):place + every + 1]
+        # in a gap between two points, such as a rest of an encoder, the time matters too
+        begin, end = max(place - every, 0), min(place + every, len(times) - 1)
+        near = np.linspace(times[begin], times[end], 20 * (end - begin) + 1)
         gains = _step_gains(fit, data, near)
         if gains.max() < math.log(2.0 * len(times) / false_alarm_rate):
             break
@@ -556,7 +620,12 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
         places = [with_steps.value_slice(each).start for each in steps]
         deviations = np.sqrt(np.diag(with_steps.covariance)[places])
         sigmas = np.abs(with_steps.values[places]) / deviations
-        chances = 2.0 * len(times) * student.sf(sigmas, with_steps.freedom[places])
+        # given the other steps, a step between them rests on the stretches there
+        data = whiten_regression(with_steps, with_steps.causes)
+        influence = data.design @ np.linalg.pinv(data.design.T @ data.design)[:, places]
+        stretches = effective_clusters(data.clusters[0], influence)
+        chances = np.where(stretches < MIN_STRETCHES, 1.0, 2.0 * len(times) * student.sf(
+            sigmas, np.maximum(stretches - 1.0, 1.0)))
         weakest = int(chances.argmax())
         if chances[weakest] < false_alarm_rate:
             return [FoundCause(each, max(chance, MIN_PROBABILITY), 0.5 * size ** 2, 1.0, True, {})
@@ -605,17 +674,20 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     level = false_alarm_rate * (1.0 if terms[strongest].is_single_event else SUSPECTED_RATE_FACTOR)
     if p_values[strongest] > level:
         return None
+    # with one variance for all, as similar causes scatter alike
+    likelihoods = [each.gain * each.variance_ratio / evidences[strongest].variance_ratio
+                   for each in evidences]
     best_of = {terms[place].cause: place
-               for place in sorted(range(len(terms)), key=lambda place: evidences[place].gain)}
-    gain = evidences[strongest].gain
+               for place in sorted(range(len(terms)), key=likelihoods.__getitem__)}
+    gain = likelihoods[strongest]
     equivalent = {name: place for name, place in best_of.items() if place == strongest
-                  or gain - evidences[place].gain < RULED_OUT_DEFICIT}
+                  or gain - likelihoods[place] < RULED_OUT_DEFICIT}
 
     def complexity(place: int) -> tuple[int, float]:
         """Return the number of values and fitted shapes, and the p-value."""
-        shapes = getattr(CATALOGUE.get(terms[place].cause), 'nonlinear_parameters', ())
-        return (widths[place].shape[1] + sum(each.default is None for each in shapes),
-                p_values[place])
+        effect = CATALOGUE.get(terms[place].cause)
+        return (widths[place].shape[1] if effect is None
+                else sum(each.default is None for each in effect.parameters), p_values[place])
 
     simplest = min(equivalent.values(), key=complexity)
     # every fifth stretch, where slow causes are also predicted by the bias wander of neighbouring
@@ -627,7 +699,7 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     # errors of a course are correlated over time, so that distant stretches must be predicted too
     sigmas, predicted, selected = max(folds) if spans.treatment.is_fine else min(folds)
     probability = {name: chance for name, chance in probabilities(
-        {name: gain - evidences[place].gain for name, place in best_of.items()}).items()
+        {name: gain - likelihoods[place] for name, place in best_of.items()}).items()
         if name in equivalent}
     established = (p_values[simplest] < false_alarm_rate and sigmas > MIN_PREDICTION_SIGMAS
                    and selected == 1.0 and not terms[simplest].is_single_event
@@ -663,7 +735,7 @@ def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArr
     information = x.T @ x
     size = np.sqrt(np.diag(information))
     if not (size > min_sizes).all():
-        return Evidence(1.0, 0.0, 0.0)
+        return Evidence(1.0, 0.0, 0.0, 1.0)
     # by the residual with the candidate: scores that contain the effect would overestimate scatter
     off = residual - x @ np.linalg.lstsq(x, residual, rcond=None)[0]
     count, found = x.shape[1], []
@@ -674,10 +746,10 @@ def _cluster_robust_evidence(x: Array, residual: Array, clusters: Sequence[NDArr
         shares = np.bincount(cluster, np.sum((x / size) ** 2, axis=1))
         effective = float(shares.sum() ** 2 / (shares ** 2).sum())
         scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
-        max_variance_ratio = float(np.linalg.eigvalsh(root @ scatter @ root.T).max())
-        statistic, freedom = square / max(max_variance_ratio, 1.0), max(effective - count, 1.0)
+        ratio = max(float(np.linalg.eigvalsh(root @ scatter @ root.T).max()), 1.0)
+        statistic, freedom = square / ratio, max(effective - count, 1.0)
         found.append(Evidence(float(fisher.sf(statistic / count, count, freedom)),
-                              0.5 * statistic, effective))
+                              0.5 * statistic, effective, ratio))
     return max(found)
 
 

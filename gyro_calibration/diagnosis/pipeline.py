@@ -17,7 +17,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.calibration.dwells import Dwells, find_dwells, require_output
+from gyro_calibration.calibration.dwells import (
+    Dwells,
+    find_dwells,
+    LIKELIHOOD_HINT,
+    require_output,
+)
 from gyro_calibration.calibration.heading_regression import MIN_STRETCHES
 from gyro_calibration.diagnosis.candidates import (
     Candidate,
@@ -30,12 +35,14 @@ from gyro_calibration.diagnosis.candidates import (
 )
 from gyro_calibration.diagnosis.causes import (
     add_remedies,
+    Cause,
     CAUSES,
     make_finding,
     mark_suspected,
     next_experiment,
     REFERENCES,
     SINGLE_EVENT_REMEDY,
+    untestable_causes,
 )
 from gyro_calibration.diagnosis.data_quality import DataQuality, inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
@@ -291,8 +298,9 @@ def _settled_dwells(log: Log, fit: RegressionFit,
     excess = white[~inside] ** 2 - np.median(steady)
     found = Unexplained('rate_change', float(max(excess.sum(), 0.0) / (white @ white)), chance)
     return replace(dwells, remarks=(
-        *dwells.remarks, 'between the dwells, gyro and reference differ by more than the causes '
-        'explain, as where a robot follows its command with a lag and overshoot; the log is '
+        *(each.removesuffix(LIKELIHOOD_HINT) for each in dwells.remarks),
+        'between the dwells, gyro and reference differ by more than the causes explain, '
+        'as where a robot follows its command with a lag and overshoot; the log is '
         f'diagnosed by its {len(dwells)} dwells alone: use a measured rate or heading as the '
         'reference to see more')), found
 
@@ -370,18 +378,18 @@ def _untestable_causes(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     if any(getattr(log, name) is not None for log in logs for name in REFERENCES):
         has |= of_motion
     moves = any(np.any(each.reference[each.valid] != 0.0) for each in replays)
-    reasons = {}
-    for name, cause in CAUSES.items():
-        if missing := sorted(cause.required_channels - has):
-            reasons[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
-        elif not moves and cause.required_channels & of_motion:
-            reasons[name] = 'the reference shows no motion'
-        elif constant := sorted(cause.required_channels & constant_channels(replays)):
-            reasons[name] = _CONSTANT_REASONS[constant[0]]
-        elif name in search.unidentifiable:
-            reasons[name] = ('in these logs it cannot be distinguished from a bias or a scale '
-                             'factor error')
-    return reasons
+    constant = constant_channels(replays)
+
+    def reason(cause: Cause) -> str:
+        if not moves and cause.required_channels & of_motion:
+            return 'the reference shows no motion'
+        if unchanging := sorted(cause.required_channels & constant):
+            return _CONSTANT_REASONS[unchanging[0]]
+        return ('in these logs it cannot be distinguished from a bias or a scale factor error'
+                if cause.name in search.unidentifiable else '')
+
+    needed = {channel for cause in CAUSES.values() for channel in cause.required_channels}
+    return untestable_causes((), needed - has, reason)
 
 
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], fit: RegressionFit,

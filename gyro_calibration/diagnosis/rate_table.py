@@ -53,7 +53,14 @@ from gyro_calibration.calibration.selection import (
     try_fit,
     try_replace,
 )
-from gyro_calibration.diagnosis.causes import add_remedies, CAUSES, make_finding, REFERENCES
+from gyro_calibration.diagnosis.causes import (
+    add_remedies,
+    Cause,
+    CAUSES,
+    make_finding,
+    REFERENCES,
+    untestable_causes,
+)
 from gyro_calibration.diagnosis.data_quality import inspect_record, resolve_unit
 from gyro_calibration.diagnosis.extended_model import (
     gain_from_squares,
@@ -512,13 +519,12 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
 
 def _untestable_causes(dwells: Dwells) -> dict[str, str]:
     """Return the causes that the table cannot show, with the reasons."""
-    found = {}
-    for name, cause in CAUSES.items():
-        if name in {*STATIC_EFFECTS, 'outliers', 'unit_error'}:
-            continue
+    def reason(cause: Cause) -> str:
         more = cause.required_channels - {'time', 'temperature', *REFERENCES, 'reference'}
         columns = ' and '.join(['time', *sorted(more)]).replace('_', ' ')
-        found[name] = f'means at constant rates do not show it; record samples with {columns}'
+        return f'means at constant rates do not show it; record samples with {columns}'
+
+    found = untestable_causes({*STATIC_EFFECTS, 'outliers', 'unit_error'}, (), reason)
     found['reference_scale'] = ('only a second reference separates the scale of the first from '
                                 'that of the gyro')
     if not _shows_temperature(dwells):

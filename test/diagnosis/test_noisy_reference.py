@@ -158,6 +158,44 @@ def test_a_bias_in_part_of_a_log_is_a_step_at_its_begin_and_one_at_its_end(step)
 
 
 @pytest.mark.parametrize('step', [0.5, 0.0])
+@pytest.mark.parametrize('name, size', [('clock_rate', 3e-4), ('time_offset', 0.03)])
+def test_a_delay_that_grows_is_a_clock_rate_and_a_constant_one_is_none(step, name, size):
+    log = turning_log(2, lambda time, _: 0.003, step)
+    late = log.time * (1.0 + size) if name == 'clock_rate' else log.time - size
+    # the sum of the rates is half a sample early
+    log = replace(log, output=np.interp(late + 0.5 / RATE, log.time, log.output))
+    found = diagnosed(select_rows(log, log.time < 239.0),
+                      kind='encoder' if step else 'motion_capture')
+    (only,) = [each for each in found.findings if each.status == 'established']
+    # where no motion reverses quickly, a lag looks like a constant delay
+    assert only.effect == name and {*only.ambiguous_with} <= {'bandwidth'}
+    assert only.parameters[name].estimate == pytest.approx(size, rel=0.05)
+    # between two clocks it is no property of the gyro
+    assert (name in {term.effect.name for term in found.model.terms}) == bool(step)
+
+
+@pytest.mark.parametrize('step', [0.1, 0.0])
+@pytest.mark.parametrize('name, size', [('sine_response', 0.4), ('cubic_nonlinearity', 0.02)])
+def test_a_sine_response_and_a_cubic_nonlinearity_are_a_set_where_they_look_alike(
+        step, name, size):
+    log = turning_log(4, lambda time, _: 0.003, step)
+    rate = (log.output - 0.003) / (1.0 + SCALE)
+    error = (np.sin(size * rate) / size - rate if name == 'sine_response' else size * rate ** 3)
+    found = diagnosed(replace(log, output=log.output + error))
+    (first,) = [each for each in found.findings
+                if each.status == 'established' and each.effect != 'time_offset']
+    # up to 1 rad/s the sine and its cubic part differ by 0.8 % of it; a positive cubic is no sine
+    assert {first.effect, *first.ambiguous_with} == {
+        'cubic_nonlinearity', *['sine_response'] * (name == 'sine_response')}
+    size_found = first.parameters[first.effect]
+    expected = size if first.effect == name else -size ** 2 / 6.0
+    assert size_found.estimate == pytest.approx(expected, rel=0.03)
+    assert first.effect in {term.effect.name for term in found.model.terms}
+    if name == 'sine_response':
+        assert sum(first.probability.values()) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize('step', [0.5, 0.0])
 def test_a_random_walk_of_the_bias_is_no_step(step):
     found = [diagnosed(turning_log(seed, lambda time, generator: 1e-4 * np.cumsum(
         generator.standard_normal(len(time))) / np.sqrt(RATE), step)) for seed in range(3)]
