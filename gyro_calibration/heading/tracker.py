@@ -751,7 +751,7 @@ class HeadingTracker:
         at_rest = np.cumsum(squares)[:-1]
         moving = np.maximum((squares.sum() - at_rest) / np.arange(len(blocks) - 1, 0, -1), 1.0)
         last = int(np.argmin(at_rest + np.arange(len(blocks) - 1, 0, -1) * (1.0 + np.log(moving))))
-        if not last:
+        if not last or abs(innovations[0]) > _BIAS_MARGIN_SIGMAS:  # as of a sample at rest
             return snapshot, turn
         quiet = sum(blocks[1:last], blocks[0])
         while self._snapshots[-1] is not snapshot:
