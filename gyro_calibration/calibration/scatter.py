@@ -370,9 +370,9 @@ class Uncertainty:
 
     @property
     def sweep_scatter(self) -> Array:
-        """Return deviations of bias and scale of another sweep, of which 1.96 hold 95 %, (2,)."""
-        return self._half_width(0.95, np.zeros_like(self.sweep_deviations),
-                                self.sweep_deviations) / NORMAL_QUANTILE_975
+        """Return the deviations of bias and scale of another sweep, which hold 68.3 %, (2,)."""
+        return self._half_width(0.6827, np.zeros_like(self.sweep_deviations),
+                                self.sweep_deviations)
 
     def covariance(self) -> Array:
         """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""

@@ -528,10 +528,10 @@ def _untestable_causes(dwells: Dwells) -> dict[str, str]:
     found['reference_scale'] = ('only a second reference separates the scale of the first from '
                                 'that of the gyro')
     if not _shows_temperature(dwells):
-        reason = ('the table holds no temperature; record temperature_degc'
-                  if dwells.temperature is None else 'the temperature varies by '
-                  f'{np.ptp(dwells.temperature):.2g} K only; repeat the rates at another one')
-        found |= {name: reason for name, effect in STATIC_EFFECTS.items()
+        constant = ('the table holds no temperature; record temperature_degc'
+                    if dwells.temperature is None else 'the temperature varies by '
+                    f'{np.ptp(dwells.temperature):.2g} K only; repeat the rates at another one')
+        found |= {name: constant for name, effect in STATIC_EFFECTS.items()
                   if 'temperature' in effect.inputs}
     return found
 

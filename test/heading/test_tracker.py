@@ -178,7 +178,7 @@ def test_a_slow_turn_before_the_first_rest_does_not_fix_the_bias(slow):
     for seed in range(3):
         noise = Noise(0.005 * DEGREE)
         time, _, heading, rate = gyro(motion, np.random.default_rng([9, seed]), noise, bias=0.0)
-        found = track(time, rate, sensitivity_of(rate), noise, wide, Settings(),
+        found = track(time, rate, -np.vstack([rate, np.ones(len(rate))]), noise, wide, Settings(),
                       still=np.array([0.0, -1.0]))
         error = (found.heading - heading)[::20]
         assert np.all(error ** 2 < 16.0 * found.variance[::20] + (0.05 * DEGREE) ** 2)
