@@ -85,6 +85,7 @@ from gyro_calibration.diagnosis.regression import (
     average_filtered_noise,
     build_problem,
     fit_causes,
+    forget_fits,
     is_single_event,
     RegressionFit,
     SMOOTHED_RATIO,
@@ -184,8 +185,11 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         found = diagnose_by_noisy_reference(logs[0], references[0], model, false_alarm_rate,
                                             on_progress)
     else:
-        found = _diagnose_by_exact_reference(logs, generator, model, false_alarm_rate, names,
-                                             on_progress)
+        try:
+            found = _diagnose_by_exact_reference(logs, generator, model, false_alarm_rate, names,
+                                                 on_progress)
+        finally:
+            forget_fits()
         found = replace(found, reference=references[0] if len(logs) == 1 else None)
     if given_model is not None and found.model is model:
         # with its self-calibration separate

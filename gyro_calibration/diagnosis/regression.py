@@ -385,6 +385,12 @@ def _transforms_without_causes(replays: tuple[Replay, ...],
         np.concatenate([each.transform_samples(each.channels.rate) for each in distorted]))
 
 
+def forget_fits() -> None:
+    """Release the logs and columns that fits keep for the next ones."""
+    for kept in (with_distorted_rate, _transforms, _transforms_without_causes, _fit_causes):
+        kept.cache_clear()
+
+
 # fits
 
 def fit_causes(problem: RegressionProblem, causes: Sequence[Candidate]) -> RegressionFit:
