@@ -519,12 +519,13 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: NamedCauses,
 
 def _untestable_causes(dwells: Dwells) -> dict[str, str]:
     """Return the causes that the table cannot show, with the reasons."""
-    def reason(cause: Cause) -> str:
+    def needed_columns(cause: Cause) -> str:
         more = cause.required_channels - {'time', 'temperature', *REFERENCES, 'reference'}
         columns = ' and '.join(['time', *sorted(more)]).replace('_', ' ')
         return f'means at constant rates do not show it; record samples with {columns}'
 
-    found = untestable_causes({*STATIC_EFFECTS, 'outliers', 'unit_error'}, (), reason)
+    found = untestable_causes({*STATIC_EFFECTS, 'outliers', 'unit_error'}, (),
+                              needed_columns)
     found['reference_scale'] = ('only a second reference separates the scale of the first from '
                                 'that of the gyro')
     if not _shows_temperature(dwells):
