@@ -163,12 +163,12 @@ class Rig:
             self.step()
         return until()
 
-    def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None):
+    def feed(self, outputs, interval=INTERVAL, temperature=None, moving=None, force=None):
         """
         Play outputs of a gyro, rad/s, without the robot; return what came out for each.
 
         The temperature, degC, may be one or one a sample; `moving` is the rate that odometry
-        shows, rad/s.
+        shows, rad/s, and `force` the specific force, m/s².
 
         """
         found = []
@@ -182,7 +182,7 @@ class Rig:
                 self.pipeline.add_temperature(stamp, float(each))
             if moving is not None:
                 self.pipeline.add_odometry(stamp, 0.0, Velocity(angular=(0.0, 0.0, moving)))
-            found.append(self.pipeline.add_sample(stamp, float(output), receivers=self.receivers))
+            found.append(self.pipeline.add_sample(stamp, float(output), force, self.receivers))
             self.outputs += [found[-1]] if found[-1] else []
             self.guards()
         return found

@@ -269,7 +269,8 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
         return log, []
     apart, turned = np.diff(time[known]), np.diff(heading[known])
     difference = turned - np.diff(integrate(time, output)[known])
-    around = 2 * math.ceil(COURSE_TREATMENT.largest_delay / float(np.median(np.diff(time)))) + 1
+    late = COURSE_TREATMENT.largest_delay / float(np.median(np.diff(time)))
+    around = 2 * math.ceil(min(late, len(time))) + 1
     slowest, fastest = (find(output, around)[known[1:]] * apart
                         for find in (minimum_filter1d, maximum_filter1d))
     beyond = np.maximum(turned - fastest, slowest - turned) - quantization_step(heading[known])

@@ -332,7 +332,8 @@ class Spans:
         """
         Return the spans with the rate corrected for scale factor error, bias, delay and causes.
 
-        The delay and the clock rate are added to those of the spans.
+        The causes are those that depend on the rate. The delay and the clock rate are added to
+        those of the spans.
 
         """
         assert self.log.output is not None and self.log.time is not None
@@ -341,7 +342,8 @@ class Spans:
             own = values[self.value_slice(causes, cause)]
             if cause == _CLOCK_TERM:
                 clock_rate += float(own[0])
-            elif cause.cause in CATALOGUE.keys() - {'bandwidth'}:
+            elif (cause.cause in CATALOGUE.keys() - {'bandwidth'}
+                    and 'rate' in CATALOGUE[cause.cause].inputs):
                 errors = errors + sum(size * column for size, column in zip(
                     own, CATALOGUE[cause.cause].columns(self.channels, *cause.shapes)))
         rate: Array = self.is_in_motion * (self.log.output - errors) / (1.0 + values[0])

@@ -23,6 +23,7 @@ would attenuate it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 import math
 
@@ -143,6 +144,10 @@ class _Increments:
     # from the first point to the first block: its heading, the time, the shared errors in that
     # block, then the turn of the gyro
     start_offsets: Array
+    # the change by a lag with accelerations by gyro and reference over `acceleration_time`, s,
+    # rad/s², shape (n, 2); empty for a profile
+    accelerations: Array = field(default_factory=lambda: np.empty((0, 2)))
+    acceleration_time: float = 0.0
 
 
 #: Longest block, s. Errors within a block (vibration, backlash, an eccentric encoder) are no
@@ -198,10 +203,15 @@ class _RunAlignment:
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk_covariance(time, weight, begins)
+        accelerations, base = np.empty((0, 2)), self._block_duration
+        if self.is_measured:
+            accelerations = np.diff(np.add.reduceat(weight[:, None] * np.column_stack([
+                _second_difference(self._integral_at, gyro_time[is_covered], base),
+                _second_difference(self._reference_at, time, base)]), begins), axis=0)
         start_offsets = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
                                         [means[0, 4] - known[0, 4]]])
         return _Increments(columns, prior, prior_factors, expected, np.diff(means[:, 4]), *walk,
-                           1.0 / precision, means[:, 1], start_offsets)
+                           1.0 / precision, means[:, 1], start_offsets, accelerations, base)
 
     def require_increments(self, offset: float, lag: float) -> _Increments:
         """Return the increments, or refuse a run with hardly any."""
@@ -231,6 +241,9 @@ class _RunAlignment:
         within = (self._integral[index]
                   + 0.5 * (inside - self._time[index]) * (rate + self._rate[index]))
         return within + (at - inside) * rate
+
+    def _reference_at(self, at: Array) -> Array:
+        return np.interp(at, self._points.time, self._points.heading)
 
     def find_coarse_offset(self, largest: float) -> float:
         """
@@ -262,6 +275,11 @@ class _RunAlignment:
             return math.inf
         return float(
             np.mean(np.abs(robust_residual(data.columns[:, :2], data.gyro_increments, 3))))
+
+
+def _second_difference(heading: Callable[[Array], Array], at: Array, base: float) -> Array:
+    """Return the acceleration by headings at times, s, and `base` before and after, rad/s²."""
+    return (heading(at + base) - 2.0 * heading(at) + heading(at - base)) / base ** 2
 
 
 def block_duration(motion: Motion) -> float:
@@ -531,7 +549,8 @@ def _average_over_noise(data: _Increments,
     """
     typical = float(np.median(data.walk_variance) / np.median(data.reference_variance))
     noises = [_IncrementCovariance(data, ratio) for ratio in _NOISE_RATIOS * typical]
-    estimates = [_solve_weighted(data, noise, data.columns, data.prior_deviation * factors)
+    estimates = [_solve_weighted(data, noise, _instrument(data, noise),
+                                 data.prior_deviation * factors)
                  for noise in noises for factors in prior_factors]
     logarithms, values, covariances = (
         np.array([getattr(each, name) for each in estimates])
@@ -547,10 +566,28 @@ def _min_rate_variance(data: _Increments) -> float:
     return 1e-18 * float(np.mean(data.gyro_increments ** 2 / data.walk_variance))
 
 
+def _instrument(data: _Increments, noise: _IncrementCovariance) -> Array:
+    """
+    Return the columns with an acceleration whose noise is not correlated with the observations.
+
+    White noise of the variance N² of the gyro has the covariance -N² / base with an acceleration
+    by the gyro over a base, and reference headings of the variance r the covariance 2 r / base²
+    with one by the reference. In a mean with weights inverse to them both cancel. Otherwise the
+    noise passes for a lag, and with that, in a swing of one frequency, for a scale factor error.
+
+    """
+    columns = data.columns.copy()
+    if len(data.accelerations):
+        base = data.acceleration_time
+        share = base / (base + 2.0 * noise.ratio * float(np.median(data.reference_variance)))
+        columns[:, 3] = data.accelerations @ [1.0 - share, share]
+    return columns
+
+
 def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
     """Estimate again, with the reference heading smoothed by the gyro as the instrument."""
     for _ in range(3):
-        instrument = data.columns.copy()
+        instrument = _instrument(data, estimate.noise)
         instrument[:, 0] += (estimate.noise.expected_reference_error(estimate.residual)
                              / _nonzero_scale(estimate.values[0]))
         estimate = _solve_weighted(data, estimate.noise, instrument, estimate.prior_deviation)
@@ -660,8 +697,9 @@ def _fit_offset(alignment: _RunAlignment, largest_time_offset: float) -> tuple[
                 break
             offset, lag = offset - delay_change, lag + lag_change
             data = alignment.require_increments(offset, lag)
-            estimate = _solve_weighted(data, _IncrementCovariance(data, estimate.noise.ratio),
-                                       data.columns, estimate.prior_deviation)
+            noise = _IncrementCovariance(data, estimate.noise.ratio)
+            estimate = _solve_weighted(data, noise, _instrument(data, noise),
+                                       estimate.prior_deviation)
         if (len(prior_factors) == len(data.prior_factors)
                 and abs(offset - before) < _OFFSET_TOLERANCE):
             break

@@ -173,7 +173,7 @@ def _try_motions(run: RunPieces, motion: Motion,
     interval = float(np.median(np.diff(run.edges)))
     for offset in _trial_offsets(largest_offset)[::2]:
         whole = run.reference_angle(motion, offset)
-        largest = float(np.abs(whole).max())
+        largest = float(np.abs(whole).max(initial=0.0))
         for limit in np.arange(0.3, 0.97, 0.05) * largest if is_profile else ():
             yield (run.fit_scale(np.clip(whole, -limit, limit))[0],
                    f'the robot reached {limit / interval / DEGREE:.0f} deg/s where the profile '

@@ -388,7 +388,7 @@ def describe_implausible_scale(fit: ScaleBiasFit, prior_deviation: float, refere
     if 2.0 * float(ndtr(-sigmas)) > MIN_FIT_PROBABILITY:
         return ''
     return (f'a scale factor error of {size:.1f} % is {sigmas:.0f} standard deviations from what '
-            f'such gyros have (0 +- {100.0 * prior_deviation:g} %): compare the turn of the '
+            f'such gyros have, about {100.0 * prior_deviation:g} %: compare the turn of the '
             f'{reference} with a mark on the floor (calibrate by whole turns), and check radius '
             'and track of the wheels, or the sensitivity of the gyro')
 

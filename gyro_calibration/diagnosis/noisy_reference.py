@@ -650,7 +650,8 @@ def _implausibility(fit: SpanFit, cause: CauseTerm) -> float:
         return float(np.hypot(*values))
     if len(values) == 1 and abs(values[0]) < fit.half_width(places.start):
         return math.inf
-    if CAUSES[cause.cause].along != 'rate' or cause.cause not in CATALOGUE:
+    if (CAUSES[cause.cause].along not in ('rate', 'heading')
+            or cause.cause not in CATALOGUE):
         return 0.0
     columns = CATALOGUE[cause.cause].columns(fit.spans.channels, *cause.shapes)
     added = np.abs(np.tensordot(values, np.array(columns), 1)).max()
@@ -683,11 +684,12 @@ def _find_best_cause(spans: Spans, data: WhitenedRegression, terms: Sequence[Cau
     equivalent = {name: place for name, place in best_of.items() if place == strongest
                   or gain - likelihoods[place] < RULED_OUT_DEFICIT}
 
-    def complexity(place: int) -> tuple[int, float]:
-        """Return the number of values and fitted shapes, and the p-value."""
+    def complexity(place: int) -> tuple[int, float, float]:
+        """Return the number of values and fitted shapes, the p-value, and less the likelihood."""
         effect = CATALOGUE.get(terms[place].cause)
         return (widths[place].shape[1] if effect is None
-                else sum(each.default is None for each in effect.parameters), p_values[place])
+                else sum(each.default is None for each in effect.parameters), p_values[place],
+                -evidences[place].gain)
 
     simplest = min(equivalent.values(), key=complexity)
     # every fifth stretch, where slow causes are also predicted by the bias wander of neighbouring

@@ -163,7 +163,7 @@ def test_compensate_looks_for_no_rests_where_the_noise_is_not_known(run, model, 
 def test_compensate_does_not_take_another_unit_of_time_for_seconds(run, tmp_path, words):
     (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
     (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ''.join(
-        f'{1_700_000_000_000 + 10 * row},1.0\n' for row in range(300)))  # in ms
+        f'{10 * row},1.0\n' for row in range(300)))  # in ms
     code, out, error = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'noisy.yaml',
                            '--out', tmp_path / 'out.csv', *words)
     assert code == bool(words) and '10 s apart' in (error if words else out)
