@@ -307,7 +307,8 @@ def _make_unique(header: list[str]) -> list[str]:
 def _parse_numeric_rows(lines: list[str], first_line: int,
                         table: _FileHeader) -> _ParsedRows | None:
     """Parse rows of numbers by numpy; None where they contain anything else."""
-    if table.other_columns:
+    # old versions of numpy read 1_0 and other digits than ASCII
+    if table.other_columns or any('_' in line or not line.isascii() for line in lines):
         return None
     if table.delimiter != ',':
         lines = [line.replace(',', '.') for line in lines]
