@@ -268,3 +268,17 @@ def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
             errors.append(bias)
             refused += 1
     assert refused >= 10 and np.sqrt(np.mean(np.square(errors))) < 0.1 * DEGREE
+
+
+def test_noise_of_the_gyro_in_a_swing_of_one_frequency_is_no_lag():
+    """Delay, lag and scale factor error have the same shape there, and a prior alone limits it."""
+    time, errors = np.arange(9000) / 100.0, []
+    rate = 60.0 * np.sin(2.0 * np.pi * 0.8 * time)
+    heading = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]))) / 100.0
+    for seed in range(4):
+        generator = np.random.default_rng([8, seed])
+        log = Log(time=time, output=(1.02 * rate + 0.1 * generator.standard_normal(9000)) * DEGREE,
+                  reference_heading=(heading + 0.002 * generator.standard_normal(9000)) * DEGREE)
+        fit = calibrate_encoder(log, 'likelihood').fit
+        errors.append((fit.scale_factor_error - 0.02) / np.sqrt(fit.covariance[0, 0]))
+    assert np.sqrt(np.mean(np.square(errors))) < 3.0
