@@ -201,24 +201,22 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         shrinkage = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
         s, b = (shrinkage.T @ (fit.scale_factor_error, fit.bias)).tolist()
         fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ shrinkage)
-    _refuse_fit(fit, run, motion, limits,
-                white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time)))))
-    _refuse_shared_noise(fit, time, rate, noise)
+    white_noise = white_noise_deviation(rate) * math.sqrt(float(np.median(np.diff(time))))
+    _refuse_fit(fit, run, motion, limits, white_noise)
+    _refuse_shared_noise(fit, white_noise, noise)
     return fit
 
 
-def _refuse_shared_noise(fit: ScaleBiasFit, time: Array, rate: Array,
-                         noise: Noise | None) -> None:
+def _refuse_shared_noise(fit: ScaleBiasFit, white_noise: float, noise: Noise | None) -> None:
     """
     Refuse a reference that follows the noise of the gyro: it is computed from this gyro.
 
-    The noise is the lesser of that of the model and that of the differences of the samples.
+    The noise is the lesser of that of the model and that of the samples, `white_noise`, rad/√s.
 
     """
     if noise is None or not noise.angle_random_walk or not fit.dof:
         return
-    own = min(noise.angle_random_walk ** 2,
-              white_noise_deviation(rate) ** 2 * float(np.median(np.diff(time))))
+    own = min(noise.angle_random_walk, white_noise) ** 2
     if own and chdtr(fit.dof, fit.residual_squares / own) < ndtr(-MIN_SLIP_SIGMAS):
         raise DataRefused(
             'the reference is computed from this gyro, since they differ by '
