@@ -231,10 +231,12 @@ def _free_domain():
 @pytest.fixture
 def by_udp(monkeypatch):
     """
-    Have the nodes of a test, which kills them, hear by UDP.
+    Have the nodes of a test, which kills or stops them, hear by UDP.
 
     Fast DDS 2.14 may go on sending to the shared memory of a process that was killed; then the
-    one that comes in its place hears nothing (issues 5053 and 5469 of Fast DDS).
+    one that comes in its place hears nothing (issues 5053 and 5469 of Fast DDS). A process that
+    is stopped while it holds a lock of its shared memory (5 of 226 were) stops the sender too,
+    and all samples sent to it are lost.
 
     """
     for name, value in _profile('udp.xml', _BY_UDP).items():
