@@ -23,7 +23,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
+import math
 from pathlib import Path
+import reprlib
 from typing import Any
 
 from gyro_calibration.allan import (
@@ -51,6 +53,7 @@ from gyro_calibration.cli.fit import calibrate, draw_headings, dwell_lines, head
 from gyro_calibration.cli.self_calibrate import calibrate_run, CalibratedRun, make_self_calibration
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.gates import REFERENCE_KINDS
+from gyro_calibration.diagnosis.report import render_report
 from gyro_calibration.diagnosis.words import terminal_lines
 from gyro_calibration.files import InputError
 from gyro_calibration.heading.integration import integrate, Threshold
@@ -66,7 +69,6 @@ from gyro_calibration.model.motion import (
     Motion,
     motion_by_name,
     motion_from_log,
-    motion_from_rates,
 )
 from gyro_calibration.model.motion import simulate as simulate_motion
 import numpy as np
@@ -147,6 +149,9 @@ def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: flo
     temperature : degC, of all samples or of each, shape (n,)
 
     """
+    _require_model(model)
+    if not (isinstance(sample_rate, (int, float)) and 0.0 < sample_rate < math.inf):
+        raise InputError(f'sample_rate is {sample_rate!r}; wanted a number of Hz above 0')
     generator = None if seed is None else np.random.default_rng(seed)
     return simulate_motion(model, _to_motion(motion)[0], sample_rate, generator, temperature)
 
@@ -202,6 +207,8 @@ def compensate(log: Log, model: GyroModel) -> Headings:
     `ValueError` says that no row of the log is plausible.
 
     """
+    _require_logs(log)
+    _require_model(model)
     return _make_headings(log, integrate_log([log], model, Threshold(0.0)))
 
 
@@ -216,6 +223,8 @@ def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
     hindsight : smooth the heading by all later samples
 
     """
+    _require_time(log)
+    _require_model(model)
     if not model.noise.angle_random_walk:
         raise InputError('the model has no angle random walk, by which rests are found; '
                          'allan finds it in a log at rest')
@@ -273,7 +282,9 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
     method : likelihood, heading or rate
 
     """
-    model, begin = model or GyroModel(), _require_time(log)[0][0]
+    model = GyroModel() if model is None else model
+    _require_model(model)
+    begin = _require_time(log)[0][0]
     _require_choice('method', method, ('likelihood', 'heading', 'rate'))
     driven, reference_begin = _to_motion(log if motion is None else motion)
     run = (calibrate_run(log, model, driven, reference_begin, method, ReferenceErrors())
@@ -322,6 +333,7 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
     method : dwells, likelihood, course or rate; None takes what the logs hold
 
     """
+    _require_logs(*logs)
     for name in effects or ():
         _require_choice('effects', name, STATIC_EFFECTS)
     _require_choice('technology', technology, TECHNOLOGY_PRIORS)
@@ -382,6 +394,15 @@ class Diagnosed(_PrintedResult):
     def __str__(self) -> str:
         return '\n'.join(terminal_lines(self.found))
 
+    def _repr_html_(self) -> str:
+        """Return the report in a frame, which keeps its style to itself."""
+        return (f'<iframe srcdoc="{escape(render_report(self.found))}" '
+                'style="width: 100%; height: 45em; border: 0"></iframe>')
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the residual along the variables of the causes, before and after."""
+        return plots.draw_diagnosis(path, self.found)
+
     def write(self, folder: str | Path) -> None:
         """Write diagnosis.json, report.html and model.yaml into a folder."""
         write_diagnosis(folder, self.found)
@@ -401,6 +422,9 @@ def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
         None takes what the log shows
 
     """
+    _require_logs(*logs)
+    if model is not None:
+        _require_model(model)
     _require_choice('kind', kind, REFERENCE_KINDS)
     found = diagnose_logs(logs, model, seed, kind)
     return Diagnosed(found.model, found)
@@ -411,10 +435,24 @@ def _require_choice(argument: str, value: str | None, choices: Collection[str]) 
         raise InputError(f'{argument} is {value!r}, but must be of {", ".join(choices)}')
 
 
+def _require_logs(*logs: Log) -> None:
+    for log in logs or (None,):
+        if not isinstance(log, Log):
+            raise InputError(f'{reprlib.repr(log)} is no log; read_log(path) reads one, and '
+                             'Log(time, output) makes one')
+        if log.output is None or not len(log):
+            raise InputError('the log has no output of the gyro; Log(time, output) has one')
+
+
+def _require_model(model: GyroModel) -> None:
+    if not isinstance(model, GyroModel):
+        raise InputError(f'{reprlib.repr(model)} is no model; read_model(path) reads one')
+
+
 def _require_time(log: Log) -> tuple[Array, Array]:
+    _require_logs(log)
     if log.time is None or log.output is None:
-        raise InputError('the log has no time or no output, which this needs; '
-                         'Log(time, output) has both')
+        raise InputError('the log has no time, which this needs; Log(time, output) has one')
     return log.time, log.output
 
 
@@ -422,7 +460,11 @@ def _to_motion(motion: MotionLike) -> tuple[Motion, float]:
     """Return a motion, and the time of its beginning in a log, s."""
     if isinstance(motion, Motion):
         return motion, 0.0
-    if isinstance(motion, tuple):
-        time, rate = (np.asarray(values, float) for values in motion)
-        return motion_from_rates(time, rate), 0.0
-    return motion_from_log(motion) if isinstance(motion, Log) else (motion_by_name(motion), 0.0)
+    if isinstance(motion, (str, Path)):
+        return motion_by_name(motion), 0.0
+    if isinstance(motion, tuple) and len(motion) == 2:
+        return motion_from_log(Log(motion[0], reference_rate=motion[1]))[0], 0.0
+    if not isinstance(motion, Log):
+        raise InputError(f'{reprlib.repr(motion)} is no motion; wanted calibration, robot or '
+                         'rest, a profile file, (time, rate), or a log with a reference')
+    return motion_from_log(motion)

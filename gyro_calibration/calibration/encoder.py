@@ -175,6 +175,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
 
     """
     refuse_wrapped(log)
+    time, output, motion = _extract_motion(log)
     if method is None:
         method = 'likelihood'
         if log.reference_heading is not None and log.time is not None:
@@ -184,7 +185,7 @@ def calibrate_encoder(log: Log, method: str | None = None,
     jumps: list[str] = []
     if method != 'course':  # which errs in bursts of some seconds
         log, jumps = _bridge_jumps(log)
-    time, output, motion = _extract_motion(log)
+        time, output, motion = _extract_motion(log)
     bounds: dict[str, tuple[float, float]] = {}
     if method == 'course':
         refuse_dead(output)
@@ -259,14 +260,11 @@ def _bridge_jumps(log: Log) -> tuple[Log, list[str]]:
     1975). Two in a row are an outlier, or a motion that the gyro does not measure.
 
     """
-    if (log.time is None or log.output is None or log.reference_heading is None
-            or not np.isfinite(log.output).any()):
+    if log.time is None or log.output is None or log.reference_heading is None:
         return log, []
     time, output = log.time, bridge_gaps(log.output)
     heading = np.asarray(drop_held_values(log).reference_heading)
     known = np.flatnonzero(np.isfinite(heading))
-    if len(known) < 2:
-        return log, []
     apart, turned = np.diff(time[known]), np.diff(heading[known])
     difference = turned - np.diff(integrate(time, output)[known])
     late = COURSE_TREATMENT.largest_delay / float(np.median(np.diff(time)))

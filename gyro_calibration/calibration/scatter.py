@@ -142,8 +142,9 @@ class Whitener:
         self.deviation = scatter.deviation(dwells)
         shared = scatter.sweep_columns(dwells)
         rows = (np.flatnonzero(self.parts == part) for part in range(self.parts.max() + 1))
-        self._factors = [(own, np.linalg.cholesky(
-            np.diag(self.deviation[own] ** 2) + shared[own] @ shared[own].T)) for own in rows]
+        # by the factors of the covariance: exact dwells would be lost in it beside their sweep
+        self._factors = [(own, np.asarray(np.linalg.qr(np.vstack(
+            [np.diag(self.deviation[own]), shared[own].T]), mode='r')).T) for own in rows]
 
     def whiten(self, values: Array) -> Array:
         """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
@@ -170,8 +171,11 @@ def estimate_scatter(dwells: Dwells) -> Scatter:
     # The likelihood does not depend on the part that the surface explains; without its removal,
     # small errors would be lost in rounding.
     error = error - surface @ (surface.T @ error)
-    size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
-    relative = size / max(float(np.abs(used.rate).max()), 1e-9)
+    fastest = max(float(np.abs(used.rate).max()), 1e-9)
+    # of exact values above their rounding, or what is rounded would be explained
+    size = (rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1))
+            + 1e-12 * fastest)
+    relative = size / fastest
     units = np.array([size, relative, size, relative])[:_count_scatter_terms(used)]
 
     def scatter(logarithms: Array) -> Scatter:

@@ -20,9 +20,11 @@ value for each sample or dwell, shape (n,).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import itertools
+import math
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from gyro_calibration.allan import AllanChart, NoiseFit
 from gyro_calibration.calibration.dwells import Dwells
@@ -34,6 +36,9 @@ from gyro_calibration.logs.log import Array, DEGREE, Mask
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import Motion
 import numpy as np
+
+if TYPE_CHECKING:
+    from gyro_calibration.diagnosis.findings import Diagnosis
 
 #: Lines that are distinguished without colour.
 _LINE_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
@@ -281,6 +286,21 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: floa
                         'scale factor error; a curve: nonlinearity; growth towards '
                         'slow turns: bias or noise. Hatched: slower than '
                         f'{min_rate / DEGREE:g} deg/s, left out. Scales differ.')
+
+
+def draw_diagnosis(path: str | Path | None, diagnosis: Diagnosis) -> Any:
+    """Draw the charts of a diagnosis, two in a row."""
+    from gyro_calibration.diagnosis.report import draw_axes, main_charts  # only for this one
+    charts = main_charts(diagnosis)
+    rows = math.ceil(len(charts) / 2) or 1
+    figure, panels = _panels(rows, 2, (10, 3.6 * rows))
+    for axes, chart in itertools.zip_longest(panels.flat, charts):
+        if chart is None:
+            axes.remove()
+        else:
+            draw_axes(axes, chart)
+    return _save_figure(figure, path, 'Measured less simulated output; bands are of noise alone, '
+                        '95 %. Where a curve leaves its band, the model lacks something.')
 
 
 def _panels(rows: int, columns: int, inches: tuple[float, float],

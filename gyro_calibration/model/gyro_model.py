@@ -144,7 +144,7 @@ class Tolerance:
     per_rate: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GyroModel:
     """The model of one gyro."""
 
@@ -164,6 +164,11 @@ class GyroModel:
     tolerance: Tolerance = Tolerance()  # errors of the rate beyond the covariance
     # by name of a noise figure, the bounds that hold it with 95 % confidence
     noise_bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        values = (f'{parameter.name} {value:.4g} {parameter.unit}'.removesuffix(' 1')
+                  for _, parameter, value, _ in self.estimates())
+        return f'<GyroModel: {", ".join(values) or "no errors"}>'
 
     def estimates(self) -> Iterator[tuple[str, Parameter, float, float]]:
         """Give effect name, parameter, value and standard deviation of each fitted value."""

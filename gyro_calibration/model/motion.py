@@ -213,8 +213,11 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
     """
     time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate
     rate, heading = motion.rate_at(time), motion.heading_at(time)
-    degc = np.broadcast_to(model.reference_temperature if temperature is None else temperature,
-                           len(time)).astype(float)
+    degc = np.array(model.reference_temperature if temperature is None else temperature, float)
+    if degc.shape not in ((), time.shape):
+        raise InputError(f'temperature has the shape {degc.shape}; wanted one number, or one for '
+                         f'each sample, {time.shape}')
+    degc = np.broadcast_to(degc, time.shape).copy()
     channels = ChannelHistory().update(time, degc, heading=heading)
     output = simulate_gyro_output(model, time, channels.with_rate(rate, rate), generator)
     return Log(output=output, time=time, temperature=degc, reference_rate=rate,
