@@ -62,38 +62,21 @@ _MAX_LOST_SHARE = 0.3
 
 @dataclass(frozen=True)
 class RestRecord:
-    """
-    Samples of a gyro at rest at even intervals.
+    """Samples of a gyro at rest at even intervals."""
 
-    Attributes
-    ----------
-    rate : rad/s, shape (n,); nan where a sample is lost or left out
-    interval : s
-    remarks : on bursts, lost samples and outliers, one sentence each
-
-    """
-
-    rate: Array
-    interval: float
-    remarks: tuple[str, ...] = ()
+    rate: Array  # rad/s, shape (n,); nan where a sample is lost or left out
+    interval: float  # s
+    remarks: tuple[str, ...] = ()  # on bursts, lost samples and outliers, one sentence each
 
 
 def build_rest_record(time: Array, output: Array, moving: Array | None = None,
                       heading: Array | None = None) -> RestRecord:
     """
-    Put samples on an even grid; lost ones are nan.
+    Put samples with increasing stamps, s and rad/s, shape (n,), on an even grid; lost are nan.
 
-    Parameters
-    ----------
-    time : stamps, s, increasing, shape (n,)
-    output : rad/s, shape (n,); nan counts as lost
-    moving : 1 where the gyro was moved, by the log; counts as lost
-    heading : by a reference, rad; tested for motion where `moving` is absent
-
-    Raises
-    ------
-    DataRefused : too few samples, a dead gyro, stamps without an even interval, too many losses,
-        or motion
+    An output that is nan counts as lost, as does one with `moving` 1; without `moving` the heading
+    by a reference, rad, is tested for motion. Raise `DataRefused` for too few samples, a dead
+    gyro, stamps without an even interval, too many losses, or motion.
 
     """
     _refuse_few(len(output))
@@ -280,43 +263,25 @@ class Floor:
 
     The lowest deviation is not used: at the end of the chart single points are low by chance.
 
-    Attributes
-    ----------
-    time : averaging time, s
-    deviation, lower, upper : Allan deviation there and its 95 % bounds, rad/s
-
     """
 
-    time: float
-    deviation: float
-    lower: float
+    time: float  # averaging time, s
+    deviation: float  # Allan deviation, rad/s
+    lower: float  # its 95 % bounds, rad/s
     upper: float
 
 
 @dataclass(frozen=True)
 class AllanChart:
-    """
-    The overlapping Allan deviation, each array of shape (n,).
+    """The overlapping Allan deviation, each array of shape (n,)."""
 
-    Attributes
-    ----------
-    interval : between samples, s
-    samples : number in the record, lost ones included
-    size : averaging times in samples
-    deviation : rad/s
-    difference_count : number of second differences in the mean square
-    degrees_of_freedom : equivalent degrees of freedom of the mean square
-    lower, upper : bounds of the deviation with 95 % confidence, rad/s
-
-    """
-
-    interval: float
-    samples: int
-    size: Integers
-    deviation: Array
-    difference_count: Integers
-    degrees_of_freedom: Array
-    lower: Array
+    interval: float  # between samples, s
+    samples: int  # in the record, lost ones included
+    size: Integers  # averaging times in samples
+    deviation: Array  # rad/s
+    difference_count: Integers  # number of second differences in the mean square
+    degrees_of_freedom: Array  # equivalent ones of the mean square
+    lower: Array  # bounds of the deviation with 95 % confidence, rad/s
     upper: Array
 
     @property
@@ -332,11 +297,10 @@ class AllanChart:
         return self.size * self.interval
 
 
-def averaging_sizes(samples: int, per_decade: int = 10) -> Integers:
-    """Return averaging times in samples, evenly spaced in log, up to a third of the record."""
+def averaging_sizes(samples: int) -> Integers:
+    """Return averaging times in samples, ten a decade, up to a third of the record."""
     decades = math.log10(max(samples // 3, 1))
-    return np.unique(
-        np.round(np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
+    return np.unique(np.round(np.logspace(0.0, decades, round(10 * decades) + 1)).astype(np.int64))
 
 
 def allan_deviation(rate: Array, interval: float,
@@ -344,16 +308,10 @@ def allan_deviation(rate: Array, interval: float,
     """
     Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
-    Parameters
-    ----------
-    rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
-    interval : s
-    times : averaging times, s, taken to the nearest whole number of intervals; default: ten a
-        decade, up to a third of the record
-
-    Raises
-    ------
-    DataRefused : too few samples, or an averaging time that does not fit twice into the record
+    The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Averaging
+    times, s, are taken to the nearest whole number of intervals; by default they are ten a decade,
+    up to a third of the record. Raise `DataRefused` for too few samples, or a time that does not
+    fit twice into the record.
 
     """
     _refuse_few(int(np.isfinite(rate).sum()))

@@ -64,29 +64,17 @@ _COMBINATIONS = [combination for count in range(len(NOISE_TERMS))
 
 @dataclass(frozen=True)
 class OctaveVariances:
-    """
-    Allan variances at octaves and the terms of their covariance, all in samples.
+    """Allan variances at octaves and the terms of their covariance, all in samples."""
 
-    Attributes
-    ----------
-    samples : of the record
-    size : averaging times, shape (n,)
-    loss_factor : factor of the scatter of an Allan deviation by lost windows, shape (n,)
-    variance : shape (n,)
-    columns : of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
-    forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or (n,
-        n, 6, 6) with a process
-    process : a process of 1 rad/s, or None
-
-    """
-
-    samples: int
-    size: Integers
-    loss_factor: Array
-    variance: Array
-    columns: Array
+    samples: int  # of the record
+    size: Integers  # averaging times, shape (n,)
+    loss_factor: Array  # of the scatter of an Allan deviation by lost windows, shape (n,)
+    variance: Array  # shape (n,)
+    columns: Array  # of each term, a process, and a bend, for a coefficient of 1, shape (n, 7)
+    #: The covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5), or
+    #: (n, n, 6, 6) with a process.
     forms: Array
-    process: GaussMarkov | None = None
+    process: GaussMarkov | None = None  # of 1 rad/s
 
     @classmethod
     def from_chart(cls, chart: AllanChart) -> OctaveVariances:
@@ -139,20 +127,11 @@ def _octave_covariance_forms(samples: int, sizes: tuple[int, ...],
 
 @dataclass(frozen=True)
 class CombinationFit:
-    """
-    A combination of terms, fitted to octaves.
-
-    Attributes
-    ----------
-    octaves : the fitted Allan variances
-    squares : squared coefficients, shape (6,)
-    cholesky_factor : Cholesky factor of the covariance of the variances
-
-    """
+    """A combination of terms, fitted to octaves."""
 
     octaves: OctaveVariances
-    squares: Array
-    cholesky_factor: Array
+    squares: Array  # of the coefficients, shape (7,)
+    cholesky_factor: Array  # of the covariance of the variances
 
     @property
     def active_terms(self) -> list[int]:
@@ -257,22 +236,13 @@ def fit_combination(octaves: OctaveVariances, indices: tuple[int, ...], misfit: 
 
 @dataclass(frozen=True)
 class Ranking:
-    """
-    All combinations of terms, fitted to the same octaves.
+    """All combinations of terms, fitted to the same octaves."""
 
-    Attributes
-    ----------
-    first_octave : the first octave that is fitted
-    misfit : see `NoiseFit`
-    fits : the likeliest first
-    process_fits : the best with a Gauss-Markov process in place of its flicker and rate random
-        walk, and in place of the walk alone
-
-    """
-
-    first_octave: int
-    misfit: float
-    fits: tuple[CombinationFit, ...]
+    first_octave: int  # that is fitted
+    misfit: float  # see `NoiseFit`
+    fits: tuple[CombinationFit, ...]  # the likeliest first
+    #: The best with a Gauss-Markov process in place of its flicker and rate random walk, and in
+    #: place of the walk alone.
     process_fits: tuple[CombinationFit, ...] = ()
 
     @property
@@ -330,10 +300,7 @@ def rank_combinations(octaves: OctaveVariances) -> Ranking:
 
     The first octave is the earliest one from which the residuals are within chance; if there is
     none, a misfit is added. Filters bend the short end gradually: one more octave is left out.
-
-    Raises
-    ------
-    DataRefused : no combination fits the octaves
+    Raise `DataRefused` where no combination fits.
 
     """
     last = max(len(octaves.variance) // 2 - 1, 0)
@@ -393,23 +360,13 @@ def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
 
 @dataclass(frozen=True)
 class NoiseFigure:
-    """
-    The coefficient of one noise term.
-
-    Attributes
-    ----------
-    term : the term
-    value : its coefficient, in the unit of the term; 0 where it is not detected
-    standard_deviation : of the coefficient, if only the detected terms are present; nan where it
-        is not detected
-    lower, upper : bounds with 95 % confidence, which allow for undetected terms; where it is not
-        detected, 0 and the largest undetectable coefficient
-
-    """
+    """The coefficient of one noise term, in the unit of the term."""
 
     term: NoiseTerm
-    value: float
-    standard_deviation: float
+    value: float  # 0 where it is not detected
+    standard_deviation: float  # if only the detected terms are present; nan where not detected
+    #: Bounds with 95 % confidence, which allow for undetected terms; where it is not detected, 0
+    #: and the largest undetectable coefficient.
     lower: float
     upper: float
 
@@ -420,28 +377,16 @@ class NoiseFigure:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """
-    The noise figures of a record.
+    """The noise figures of a record."""
 
-    Attributes
-    ----------
-    figures : by symbol: N, B, K, Q, R
-    chart : the Allan deviations that were fitted, at octaves
-    min_time, max_time : the range of averaging times of the fit, s
-    misfit : relative difference between the Allan deviations and the sum of the terms, beyond
-        chance
-    alternatives : the symbols of other combinations of terms that fit the record nearly as well
-    process : a Gauss-Markov process in place of flicker and rate random walk, where it fits
-        better; these two then approximate it at the averaging times of the chart
-
-    """
-
-    figures: dict[str, NoiseFigure]
-    chart: AllanChart
-    min_time: float
-    max_time: float
-    misfit: float
-    alternatives: tuple[str, ...] = ()
+    figures: dict[str, NoiseFigure]  # by symbol: N, B, K, Q, R
+    chart: AllanChart  # the Allan deviations that were fitted, at octaves
+    min_time: float  # shortest averaging time of the fit, s
+    max_time: float  # s
+    misfit: float  # relative difference of Allan deviations and sum of terms, beyond chance
+    alternatives: tuple[str, ...] = ()  # symbols of combinations that fit nearly as well
+    #: In place of flicker and rate random walk, where it fits better; these two then approximate
+    #: it at the averaging times of the chart.
     process: GaussMarkov | None = None
 
     @property
@@ -478,14 +423,8 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
     penalized likelihood is used. The shortest averaging times, which the filters of a gyro bend,
     are left out until the sum of the terms fits the rest.
 
-    Parameters
-    ----------
-    rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
-    interval : s
-
-    Raises
-    ------
-    DataRefused : too few samples, or no sum of terms fits them
+    The rate, rad/s, shape (n,), has one sample an interval, s; nan where it is lost. Raise
+    `DataRefused` for too few samples, or where no sum of terms fits them.
 
     """
     chart = allan_deviation(

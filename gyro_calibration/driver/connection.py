@@ -70,28 +70,25 @@ class SerialPort:
     Each method raises `PortError` where the device cannot do it or was disconnected; the port is
     then closed.
 
-    `timeout` is how long `read` waits for the first byte, s.
-
     """
 
-    def __init__(self, path: str, baud: int, timeout: float = 0.1):
-        self.path, self.baud, self._timeout = path, baud, timeout
+    def __init__(self, path: str, baud: int):
+        self.path, self.baud = path, baud
         self._port: serial.Serial | None = None
 
     def open(self) -> None:  # noqa: A003
         """Open the port exclusively, and discard earlier input."""
         self.close()
         try:
-            self._port = serial.Serial(self.path, self.baud, timeout=self._timeout,
-                                       write_timeout=1.0, exclusive=True)
+            self._port = serial.Serial(self.path, self.baud, write_timeout=1.0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             raise PortError(f'cannot open {self.path}: {_describe_error(error)}') from error
 
     def read(self) -> bytes:
-        """Return the available bytes; wait for the first one up to the timeout."""
+        """Return the available bytes; wait for the first one up to 0.1 s."""
         with self._open_port() as port:
             # read of pyserial returns the first byte alone, and needs two more calls for the rest
-            if not select.select([port], [], [], self._timeout)[0]:
+            if not select.select([port], [], [], 0.1)[0]:
                 return b''
             data = os.read(port.fileno(), 65536)
             if not data:
@@ -209,18 +206,10 @@ class Connection:
     first listens, at each baud in turn unless one is given, and sends nothing. The recognized
     protocol is kept after a loss of the port, as long as its samples come.
 
-    Parameters
-    ----------
-    port : path, or a pattern that finds it under any name
-    protocol : name of a protocol, or ``'auto'``
-    baud : bits per second; 0 for that of the protocol
-    on_change : is called with each new `ConnectionState`, in the thread that reads
-    clock : returns seconds of a steady clock
-    make_port : makes a `SerialPort` of a path and a baud
-
-    Raises
-    ------
-    ValueError : the protocol is unknown, or settings that it needs are missing
+    The port is a path, or a pattern that finds it under any name; the baud is in bit/s, 0 for that
+    of the protocol. `on_change` is called in the thread that reads. Raise `ValueError` where the
+    protocol is unknown, or settings that it needs are missing. Tests have a clock of their own, s,
+    and ports in place of a `SerialPort`.
 
     """
 

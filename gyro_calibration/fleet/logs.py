@@ -144,12 +144,8 @@ def find_logs(paths: Sequence[str], excluded_folder: str | Path = '') -> list[Fl
     Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
 
     A log that is named several times is one entry. A table inside a folder is used as well; the
-    results of an earlier fleet, and of this one in `excluded_folder`, are not.
-
-    Raises
-    ------
-    InputError : there is none, or a table is wrong or contradicts another one
-    OSError : a table cannot be read
+    results of an earlier fleet, and of this one in `excluded_folder`, are not. Raise `InputError`
+    where there is none, or a table is wrong or contradicts another one.
 
     """
     found: dict[str, FleetLog] = {}
@@ -251,9 +247,7 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
     """
     Return the regular expression of a file name such as ``rc_car_{drive}_unit{unit}``.
 
-    Raises
-    ------
-    ValueError : it names no field, or an unknown one
+    Raise `ValueError` where it names no field, or an unknown one.
 
     """
     parts = re.split(r'\{(\w*)\}', text)
@@ -434,12 +428,10 @@ def process_log(task: LogTask) -> dict[str, Any]:
     It is JSON data, and equal to the bit on all machines. A change of unit, type or drive in a
     table does not cause a new computation.
 
-    Returns
-    -------
     ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
     ``content`` of the values in it; ``values`` has name -> value, standard deviation and unit;
     ``slow`` the same of effects that a single log does not distinguish from the wander of the
-    bias, each fitted alone; ``diagnosis`` a summary
+    bias, each fitted alone; ``diagnosis`` is a summary.
 
     """
     try:
@@ -527,11 +519,7 @@ def calibrate_log(log: Log, technology: str = 'mems') -> tuple[str, GyroModel,
 
     A log in time with a reference heading is calibrated by `calibrate_encoder`, which finds the
     offset and its standard deviation, s; a log at rest gives the bias only, and any other one is
-    calibrated by dwells.
-
-    Raises
-    ------
-    DataRefused : with the reason and the remedy
+    calibrated by dwells. Raise `DataRefused` with the reason and the remedy.
 
     """
     if log.output is None:

@@ -225,11 +225,6 @@ class PooledValue:
     more : name of a variance -> its multiple that is added, for quantities that are not estimated,
         such as the next power-on
 
-    Attributes
-    ----------
-    observed : the values
-    variance_names : of the variances that the logs distinguish
-
     """
 
     def __init__(self, observed: Observations):
@@ -401,9 +396,8 @@ class PooledValue:
         """
         Add the most significant one of several fixed effects.
 
-        Returns
-        -------
-        its place, the value pooled with it, its size, and the p-value of the largest of so many
+        Return its place, the value pooled with it, its size, and the p-value of the largest of so
+        many.
 
         """
         scores, none = [], np.array([-1])

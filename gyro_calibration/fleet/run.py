@@ -90,10 +90,8 @@ def cluster_executors(address: str) -> Iterator[Callable[[int], Executor]]:
     """
     Give a function that makes executors of a Dask cluster.
 
-    Raises
-    ------
-    ImportError : `distributed` is not installed
-    OSError, ValueError : no scheduler answers at the address, or it is no address
+    Raise `ImportError` where `distributed` is not installed, `OSError` or `ValueError` where no
+    scheduler answers at the address, or it is none.
 
     """
     from distributed import Client

@@ -80,51 +80,25 @@ _SIZE_PROBABILITIES = np.array(
 
 @dataclass(frozen=True)
 class Prior:
-    """
-    Prior knowledge of a gyro.
+    """Prior knowledge of a gyro: standard deviations of the bias, and distances."""
 
-    Attributes
-    ----------
-    coefficient : standard deviation of the temperature coefficient of the bias, rad/s/K (L3G4200D
-        data sheet: 0.03 deg/s/K)
-    correlation_length : correlation length of the coefficient, K
-    compensated_share : share of the coefficient that remains inside the range of a model with
-        temperature effects, 1
-    turn_on : standard deviation of the bias from one run to the next, rad/s
-    ageing : standard deviation of the bias at one temperature in a year, beyond the model's noise,
-        rad/s
-    unknown_distance : assumed distance of an unknown temperature, K
-
-    """
-
-    coefficient: float = 0.03 * DEGREE
-    correlation_length: float = 15.0
-    compensated_share: float = 0.1
-    turn_on: float = 0.05 * DEGREE
-    ageing: float = 0.02 * DEGREE
-    unknown_distance: float = 15.0
+    coefficient: float = 0.03 * DEGREE  # with temperature, rad/s/K (data sheet of the L3G4200D)
+    correlation_length: float = 15.0  # of the coefficient, K
+    compensated_share: float = 0.1  # of the coefficient within the range of a compensating model
+    turn_on: float = 0.05 * DEGREE  # from one run to the next, rad/s
+    ageing: float = 0.02 * DEGREE  # at one temperature in a year, beyond the noise, rad/s
+    unknown_distance: float = 15.0  # assumed of an unknown temperature, K
 
 
 @dataclass(frozen=True)
 class Entry:
-    """
-    Mean bias at rest in one run and one temperature bin.
+    """Mean bias at rest in one run and one temperature bin."""
 
-    Attributes
-    ----------
-    temperature : degC
-    bias : rad/s, after the model and before the self-calibration
-    variance : of the bias as a mean around `time`, (rad/s)²
-    time : of the last of these rests, s since 1970
-    run : number of the run of the gyro; between whole numbers for a calibration between runs
-
-    """
-
-    temperature: float
-    bias: float
-    variance: float
-    time: float
-    run: float
+    temperature: float  # degC
+    bias: float  # rad/s, after the model and before the self-calibration
+    variance: float  # of the bias as a mean around `time`, (rad/s)²
+    time: float  # of the last of these rests, s since 1970
+    run: float  # number of the run; between whole numbers for a calibration between runs
 
 
 @dataclass(frozen=True)
@@ -141,14 +115,9 @@ _Dated = TypeVar('_Dated', Entry, Jump)
 
 class BiasTable:
     """
-    Biases at rest over temperature, of one gyro behind one model.
+    Biases at rest over temperature, of one gyro behind one model with a digest.
 
-    Attributes
-    ----------
-    digest : of the model that it belongs to
-    entries, jumps : of all runs
-    run : number of the present run
-    held_back_count : number of estimates that were not used so far
+    `run` is the number of the present run, `held_back_count` that of estimates not used so far.
 
     """
 
@@ -181,18 +150,11 @@ class BiasTable:
 
     def add(self, temperature: float, bias: float, variance: float, time: float) -> str:
         """
-        Add the bias of a rest.
+        Add the bias of a rest; return a sentence why it is not used, or that it jumped, or ''.
 
-        Parameters
-        ----------
-        temperature : degC
-        bias : mean of the rate after the model and before the self-calibration, rad/s
-        variance : of that mean by white noise, (rad/s)²; the wander of the bias is added here
-        time : s since 1970
-
-        Returns
-        -------
-        '', or a sentence why the bias is not used, or that it jumped
+        It is the mean of the rate after the model and before the self-calibration, rad/s, with its
+        variance by white noise, (rad/s)²; the wander of the bias is added here. The temperature is
+        in degC, the time in s since 1970.
 
         """
         given = Entry(float(temperature), float(bias), float(variance), float(time), self.run)
@@ -304,20 +266,11 @@ class BiasTable:
         It is combined with the table as one more estimate of the bias, at its own temperature and
         time. It is for the start of a run, or the restart of a tracker; within a run a
         `TemperatureCorrection` continues from there. The result includes the age: it is to be used
-        as a calibration made at present.
+        as a calibration made at present, and not to be stored. A sentence for diagnostics, '' if
+        neither age nor temperature matters, is returned too.
 
-        Parameters
-        ----------
-        calibration : as it was stored, with a covariance
-        age : of the calibration, s
-        time : now, s since 1970
-        temperature : now, degC; None where it is not known
-        this_run : the calibration was made in this run
-
-        Returns
-        -------
-        the calibration with the present bias and covariance, to be used and not to be stored; and
-        a sentence for diagnostics if age or temperature matters, else ''
+        The age is in s, the present time in s since 1970, and the present temperature in degC,
+        None where it is not known; `this_run` tells that the calibration was made in this run.
 
         """
         assert calibration.covariance is not None
@@ -440,23 +393,13 @@ class BiasTable:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """
-    Estimates of the bias at one temperature, for each of the sizes.
+    """Estimates of the bias at one temperature, for each of the sizes."""
 
-    Attributes
-    ----------
-    probability : probability of each size, shape (sizes,)
-    mean : of the biases less that of the first entry, rad/s, shape (sizes,)
-    information : 1 over the variance of the mean, shape (sizes,)
-    inverse_times_ones, inverse_times_residual : the inverse covariance times ones, and times the
-        deviations of the entries from the mean, shape (sizes, n)
-    inverse : of the covariance, shape (sizes, n, n)
-
-    """
-
-    probability: Array
-    mean: Array
-    information: Array
+    probability: Array  # of each size, shape (sizes,)
+    mean: Array  # of the biases less that of the first entry, rad/s, shape (sizes,)
+    information: Array  # 1 over the variance of the mean, shape (sizes,)
+    #: The inverse covariance times ones, and times the deviations of the entries from the mean,
+    #: shape (sizes, n); and itself, shape (sizes, n, n).
     inverse_times_ones: Array
     inverse_times_residual: Array
     inverse: Array
@@ -479,12 +422,9 @@ class TemperatureCorrection:
 
     def __init__(self, table: BiasTable, begin: float, now: float, coefficient: float):
         """
-        Begin at a temperature, degC.
+        Begin at a temperature, degC, now, s since 1970.
 
-        Parameters
-        ----------
-        now : s since 1970
-        coefficient : standard deviation in which distances are counted, rad/s/K; above 0
+        Distances are counted in the coefficient, a standard deviation in rad/s/K above 0.
 
         """
         self.start_temperature = begin
@@ -556,10 +496,8 @@ def read_bias_table(path: str | Path, model: GyroModel,
     """
     Read the table of earlier runs at the begin of a run.
 
-    Returns
-    -------
-    the table, and '' or a sentence why it is empty although there is a file; such a file is kept
-    under another name when a new one is written
+    A sentence says why it is empty although there is a file, which is kept under another name when
+    a new one is written; else it is ''.
 
     """
     try:
@@ -580,18 +518,10 @@ def read_bias_table(path: str | Path, model: GyroModel,
 def write_bias_table(path: str | Path, table: BiasTable,
                      now: float) -> tuple[str, tuple[int, int]]:
     """
-    Write a table completely or not at all.
+    Write a table completely or not at all, as `files.write_atomically`; return its version.
 
-    A file in its place that is unreadable or not of this model is kept under another name.
-
-    Returns
-    -------
-    '', or in a sentence under which name the old file is kept; and the version that was written,
-    as `files.write_atomically` does
-
-    Raises
-    ------
-    OSError : the folder cannot be written to; the old file is as it was, or has its other name
+    A file in its place that is unreadable or not of this model is kept under another name, in a
+    sentence that is returned first, else ''. Raise `OSError` where the folder is not writable.
 
     """
     message = _keep_aside(Path(path), table.digest)

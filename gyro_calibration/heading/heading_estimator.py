@@ -69,16 +69,11 @@ class Assumptions:
 
     The variance of the tracker contains only the errors that it is given.
 
-    Attributes
-    ----------
-    bias : of an uncalibrated gyro, rad/s
-    scale_factor_error : of an uncalibrated gyro, 1
-    bias_temperature_coefficient : rad/s/K; 0 for a gyro with temperature compensation
-
     """
 
-    bias: float = 0.5 * DEGREE
+    bias: float = 0.5 * DEGREE  # rad/s
     scale_factor_error: float = 0.03
+    #: rad/s/K; 0 for a gyro with temperature compensation.
     bias_temperature_coefficient: float = 0.03 * DEGREE
 
     @property
@@ -100,24 +95,13 @@ def with_assumed_covariance(model: GyroModel, assumptions: Assumptions) -> GyroM
 
 @dataclass
 class _RestStretch:
-    """
-    Samples at rest, as sums.
+    """Samples at rest, as sums."""
 
-    Attributes
-    ----------
-    start_time : stamp of the first, s
-    sensitivity : of the rate to each uncertain value at the end, shape (m,)
-    count, rate_sum, temperature_sum : number, and sums of rates after the model, rad/s, and of
-        temperatures, degC
-    has_ended : whether the rest has ended
-
-    """
-
-    start_time: float
-    sensitivity: Array
+    start_time: float  # stamp of the first, s
+    sensitivity: Array  # of the rate to each uncertain value at the end, shape (m,)
     count: int = 0
-    rate_sum: float = 0.0
-    temperature_sum: float = 0.0
+    rate_sum: float = 0.0  # after the model, rad/s
+    temperature_sum: float = 0.0  # degC
     has_ended: bool = False
 
 
@@ -125,38 +109,20 @@ class HeadingEstimator:
     """
     Estimate the heading of a robot.
 
-    Attributes
-    ----------
-    model : with the stored calibration
-    current_model : the model with the present calibration, by which samples are compensated
-    covariance : of the temperature coefficient of the bias and of the uncertain values of the
-        current model, shape (m, m)
-    tracker : of the heading
-    table : of biases at rest
-    is_calibrated_this_run : whether the calibration was made in this run
-    temperature : last temperature, degC; None before the first
-    rate : last rate, rad/s; zero at rest
-    corrected_rate : last rate before the tracker, rad/s
-    last_compensated : result of the compensation of the last sample
-    restart_count : number of starts of the tracker
-    refused_count : number of implausible samples, which are not used and count as lost
-    refused_temperature_count : number of implausible temperatures, which are not used
+    `model` has the stored calibration, `current_model` the present one, by which samples are
+    compensated. `covariance`, shape (m, m), is that of the temperature coefficient of the bias and
+    of the uncertain values of the current model. `rate` is the last one, rad/s, zero at rest, and
+    `corrected_rate` that before the tracker. `temperature`, degC, is None before the first.
 
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
                  settings: Settings, temperature_timeout: float, now: float, keep: bool = False):
         """
-        Begin at heading zero.
+        Begin at heading zero, now, s since 1970.
 
-        Parameters
-        ----------
-        model : with its stored self-calibration, if it has one
-        assumptions : of uncalibrated values
-        settings : of the tracker
-        temperature_timeout : an older temperature is held, and counts as less and less known, s
-        now : s since 1970
-        keep : the steps of the tracker, for `log_compensation.smooth_track`
+        A temperature older than the timeout, s, is held, and counts as less and less known. The
+        steps of the tracker are kept on request, for `log_compensation.smooth_track`.
 
         """
         self._assumptions, self._settings = assumptions, settings
@@ -368,21 +334,11 @@ class HeadingEstimator:
     def add(self, time: float, output: float, now: float, force: float | None = None,
             wheels: bool | None = None, supply: float | None = None) -> str:
         """
-        Take a sample.
+        Take a sample; return why the integration began anew with it, or ''.
 
-        Parameters
-        ----------
-        time : stamp, s
-        output : rad/s
-        now : s since 1970
-        force : specific force, m/s², if it came
-        wheels : whether wheels or commands move the robot; None where unknown
-        supply : voltage, V, if it came
-
-        Returns
-        -------
-        '', or why the integration began anew with this sample; where the sample is refused, only
-        `refused_count` grows
+        Stamp and present date are in s, the output in rad/s, the specific force in m/s² and the
+        supply in V, where they came; `wheels` tells whether wheels or commands move the robot,
+        None where unknown. Where the sample is refused, only `refused_count` grows.
 
         """
         if not self.is_plausible(time, output, force):
@@ -479,18 +435,10 @@ class HeadingEstimator:
         """
         Take the samples of a log, with the same result as one by one.
 
-        Parameters
-        ----------
-        time, output : s and rad/s, shape (n,)
-        start_time : date of time 0, s since 1970
-        temperature : degC; nan where none came, and None for none at all
-        wheels, force, supply : as in `add`, n of them, or None
-
-        Returns
-        -------
-        heading, its variance, rate, its variance, 1 at rest, the rate before the tracker,
-        and 1 where the temperature was clipped and where the output is beyond the range of the
-        model, shape (n, 8)
+        The arguments are arrays of those of `add`, or None; the start time is the date of time 0,
+        s since 1970, and a temperature that did not come is nan. The result, shape (n, 8), has
+        heading, its variance, rate, its variance, 1 at rest, the rate before the tracker, and 1
+        where the temperature was clipped and where the output is beyond the range of the model.
 
         """
         found, place = np.empty((len(time), 8)), 0
@@ -609,9 +557,7 @@ class HeadingEstimator:
         """
         Add the bias of complete stretches of rest to the table; to be called regularly.
 
-        Returns
-        -------
-        '', or the message of the table since the last call
+        Return the message of the table since the last call, or ''.
 
         """
         self._add_to_table(now, self.tracker.is_resting and not ending)

@@ -51,11 +51,7 @@ class Intervals:
     """
     The usual interval of stamps that may jitter or come in bursts, and the samples lost in others.
 
-    Attributes
-    ----------
-    usual_interval : s; inf while it is not known
-    lost_samples : samples lost so far
-    longest_gap : gap, s; 0 where there was none
+    `usual_interval`, s, is inf while it is not known; `longest_gap`, s, is 0 where there was none.
 
     """
 
@@ -76,11 +72,9 @@ class Intervals:
 
     def add_many(self, intervals: Array) -> tuple[Array, Array]:
         """
-        Take intervals, s, as `add` does one by one.
+        Take intervals, s, as `add` does one by one, and return two arrays of shape (n,).
 
-        Returns
-        -------
-        usual interval after each, s, and number of samples lost in it, shape (n,) each
+        They are the usual interval after each, s, and the number of samples lost in it.
 
         """
         taken, usual, lost = 0, np.empty(len(intervals)), np.zeros(len(intervals), int)
@@ -135,11 +129,8 @@ def block_ends(intervals: Array, length: float, elapsed: float = 0.0) -> list[in
     """
     Return the numbers of samples up to the ends of blocks of `length` s or slightly longer.
 
-    Parameters
-    ----------
-    intervals : before each sample, s
-    length : s
-    elapsed : elapsed duration of the first block, s
+    The intervals are those before each sample; `elapsed` is the duration of the first block so
+    far, s.
 
     """
     until, ends = np.cumsum(intervals).tolist(), list[int]()
@@ -156,11 +147,8 @@ def gap_variances(noise: Noise, usual: Array | float, lost: Array | int, interva
     """
     Return the variances of an integral over gaps by motion, and additional ones by noise, rad².
 
-    Parameters
-    ----------
-    usual : interval, s
-    lost : number of samples
-    interval, step : between the samples around a gap, s, and change of the rate, rad/s
+    Given are the usual interval, s, the number of lost samples, and the interval, s, and the step
+    of the rate, rad/s, between the samples around a gap.
 
     """
     ends = noise.angle_random_walk ** 2 / usual
@@ -181,12 +169,8 @@ def varied_variance(noise: Noise, usual: float, interval: float, time: Array,
     Return the variance of an integral over a gap, rad², where the rate varies as before it.
 
     The ends of a gap do not show a vibration. It is the mean square of the same error over all
-    intervals of this length without the gap, less that by noise.
-
-    Parameters
-    ----------
-    usual, interval : usual interval, and that between the samples around the gap, s
-    time, rate : in the seconds before the gap, s and rad/s, shape (n,)
+    intervals of this length without the gap, less that by noise. Given are the usual interval, and
+    that of the gap, s, and samples before it, s and rad/s, shape (n,).
 
     """
     ends = time[time >= time[0] + interval]
@@ -200,20 +184,12 @@ def varied_variance(noise: Noise, usual: float, interval: float, time: Array,
 
 @dataclass(frozen=True)
 class Threshold:
-    """
-    Settings of the threshold filter (Hong and Park, eq. 12).
+    """Settings of the threshold filter (Hong and Park, eq. 12)."""
 
-    Attributes
-    ----------
-    rate : rad/s; below it the robot is taken to be at rest; 0 disables the filter
-    window : s; the mean over it is compared with the rate. 0 compares single samples, as published
-    angle_random_walk : rad/√s; a window whose standard deviation exceeds three times that of this
-        noise is motion, whatever its mean; 0 disables this test
-
-    """
-
-    rate: float = 0.3 * DEGREE
-    window: float = 0.2
+    rate: float = 0.3 * DEGREE  # rad/s; below it the robot is at rest; 0 disables the filter
+    window: float = 0.2  # s, of the mean that is compared; 0: single samples, as published
+    #: rad/√s; a window whose standard deviation exceeds three times that of this noise is motion,
+    #: whatever its mean; 0 disables this test.
     angle_random_walk: float = 0.0
 
 
@@ -303,10 +279,6 @@ class BlockIntegrator:
 
     The result is that of a `tracker.HeadingTracker` that does not detect rest. Over a gap longer
     than `MAX_GAP` nothing is integrated: the robot may have turned to any direction.
-
-    Attributes
-    ----------
-    intervals : of the samples, with the number of lost ones
 
     """
 

@@ -39,33 +39,18 @@ HEADING_INDEX, WALK_INDEX, _FLICKER_INDEX = 0, 1, 2
 
 @dataclass(slots=True)
 class RateIntegral:
-    """
-    Integral of the rates over some time.
+    """Integral of the rates over some time."""
 
-    Attributes
-    ----------
-    duration : s
-    angle : integral of the compensated rate, rad
-    sensitivity : integral of the sensitivity of the rate to the calibration, shape (m,)
-    lost_variance : variance of rotation that was not measured, rad²
-    extra_noise_variance : additional variance of the noise by lost samples, rad²
-    wander_variance : variance of the rotation during a detected rest that may be a straight drive,
-        rad²
-    block_count, block_square_sum : number of blocks, and sum of their squared angles over their
-        durations, rad²/s
-    is_unobserved : there were no rates: the heading is constant, and errors of rates do not affect
-        it; not to be added to others
-
-    """
-
-    duration: float
-    angle: float
-    sensitivity: Array
-    lost_variance: float = 0.0
-    extra_noise_variance: float = 0.0
-    wander_variance: float = 0.0
+    duration: float  # s
+    angle: float  # integral of the compensated rate, rad
+    sensitivity: Array  # integral of that of the rate to the calibration, shape (m,)
+    lost_variance: float = 0.0  # of rotation that was not measured, rad²
+    extra_noise_variance: float = 0.0  # additional variance of the noise by lost samples, rad²
+    wander_variance: float = 0.0  # of the rotation in a rest that may be a straight drive, rad²
     block_count: int = 0
-    block_square_sum: float = 0.0
+    block_square_sum: float = 0.0  # of the angles of blocks, over their durations, rad²/s
+    #: There were no rates: the heading is constant, and errors of rates do not affect it; not to
+    #: be added to others.
     is_unobserved: bool = False
 
     def __add__(self, other: RateIntegral) -> RateIntegral:
@@ -94,21 +79,11 @@ class RateIntegral:
 
 @dataclass(frozen=True)
 class Transition:
-    """
-    Transition of the state over some time, without the rotation itself.
+    """Transition of the state over some time, without the rotation itself."""
 
-    Attributes
-    ----------
-    observation : contribution of each component to the integral of the compensated rate, shape
-        (n,)
-    retention : decay factor of each component, shape (n,)
-    process_noise : covariance of the process noise, shape (n, n); the first row and column are
-        those of the integral of the rate, negated
-
-    """
-
-    observation: Array
-    retention: Array
+    observation: Array  # of each component in the integral of the compensated rate, shape (n,)
+    retention: Array  # decay factor of each component, shape (n,)
+    #: Covariance, shape (n, n); first row and column: of the integral of the rate, negated.
     process_noise: Array
 
 
@@ -247,16 +222,12 @@ class HeadingState:
 def initial_state(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,
                   age: float | None = None) -> HeadingState:
     """
-    Return the state some time after a calibration.
+    Return the state at a heading, rad, and its variance, rad², some time after a calibration.
 
-    Parameters
-    ----------
-    noise : of the model
-    covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
-    heading, variance : rad and rad²
-    age : of a self-calibration, s, whose bias, the last value, is a mean over
-        `BIAS_AVERAGING_TIME`; None without one. Its variance contains the floor of the Allan
-        deviation for the flicker, which is replaced here by that of the flicker components
+    The covariance is that of the calibration, shape (m, m), by `uncertainty_covariance`. The age,
+    s, is that of a self-calibration, whose bias, the last value, is a mean over
+    `BIAS_AVERAGING_TIME`; None without one. Its variance contains the floor of the Allan deviation
+    for the flicker, which is replaced here by that of the flicker components.
 
     """
     constants, flicker_variances = noise.flicker_processes()
@@ -333,10 +304,7 @@ def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral]
     """
     Return the states smoothed by all later data (Rauch, Tung and Striebel).
 
-    Parameters
-    ----------
-    states : before each turn, and after the last; n + 1 of them
-    rate_integrals, resting : n each
+    Given are n + 1 states, before each of n integrals and after the last.
 
     """
     later = [states[-1]]

@@ -22,7 +22,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.heading.integration import (
@@ -93,21 +93,13 @@ _POWER_SIGMAS = 1.645
 
 @dataclass(frozen=True)
 class Settings:
-    """
-    Settings of the heading tracker.
+    """Settings of the heading tracker."""
 
-    Attributes
-    ----------
-    false_alarms : false detections of motion per hour at rest, 1/h; 0 disables the detection of
-        rest, as does an unknown noise
-    threshold : of the filter of Hong and Park, eq. 12; used without detection of rest
-    maximum_gap : longest gap in the stamps that is integrated, s
-
-    """
-
+    #: False detections of motion at rest, 1/h; 0 disables the detection of rest, as does an
+    #: unknown noise; then the threshold is used.
     false_alarms: float = 0.1
-    threshold: Threshold = field(default_factory=lambda: Threshold(0.0))
-    maximum_gap: float = MAX_GAP
+    threshold: Threshold = Threshold(0.0)
+    maximum_gap: float = MAX_GAP  # longest gap in the stamps that is integrated, s
 
 
 @dataclass(frozen=True)
@@ -122,21 +114,11 @@ class TrackStep:
 
 class HeadingTracker:
     """
-    Track the heading sample by sample.
+    Track the heading, rad, which is continuous, and the rate, rad/s, zero at rest.
 
-    Attributes
-    ----------
-    heading : published heading, rad, continuous, not wrapped
-    rate : rad/s; zero at rest
-    is_resting : whether the robot is at rest
-    deleted_heading : heading attributed to bias or noise at rest, or deleted by the threshold
-        filter, rad
-    intervals : of the samples, with the number of lost ones
-    refused_count : number of samples beyond the largest rate; they count as lost
-    outlier_count : number of samples beyond the largest acceleration; they count as lost
-    rebuild_count : number of times that the state was not finite and was initialized again
-    steps : the drive so far, if it is kept
-    recalibrations : numbers of steps before another calibration was used, and the state before it
+    `deleted_heading` is that attributed to bias or noise at rest, or deleted by the threshold
+    filter, rad. Samples beyond the largest rate are refused, those beyond the largest acceleration
+    are outliers, and both count as lost; `rebuild_count` tells how often the state was not finite.
 
     """
 
@@ -146,18 +128,16 @@ class HeadingTracker:
         """
         Begin at heading zero.
 
-        Parameters
-        ----------
-        noise : of the model
-        covariance : of the calibration, shape (m, m), from `compensation.uncertainty_covariance`
-        age : of the self-calibration, whose s and b are the last values, s; None without one
-        keeps_steps : the `steps`, for `log_compensation.smooth_track`
-        sensitivity_slope : change of the sensitivity with the rate, shape (m,): the rates include
-            the bias estimated at rest, on which a scale factor error does not act
+        The covariance is that of the calibration, shape (m, m), by `uncertainty_covariance`, and
+        the age, s, that of a self-calibration, whose s and b are the last values; None without
+        one. Steps are kept for `log_compensation.smooth_track`. The slope is the change of the
+        sensitivity with the rate, shape (m,): the rates include the bias estimated at rest, on
+        which a scale factor error does not act.
 
         """
         self._sensitivity_slope = sensitivity_slope
         self.steps, self._keeps_steps = list[TrackStep](), keeps_steps
+        # numbers of steps before another calibration was used, and the states before it
         self.recalibrations = list[tuple[int, HeadingState]]()
         self._interval, self._last_time, self.intervals = math.inf, 0.0, Intervals()
         self._last_sample: tuple[float, float, float, Array] | None = None
@@ -275,22 +255,13 @@ class HeadingTracker:
     def add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None = None,
             still: Array | None = None) -> str:
         """
-        Take one sample.
+        Take one sample; return why the integration was restarted with it, or ''.
 
-        Parameters
-        ----------
-        time : stamp, s
-        rate : compensated, rad/s
-        sensitivity : of the rate to the calibration, shape (m,), as in `compensation`
-        wheels : whether wheels or commands move the robot, or moved it since the last sample; None
-            where that is not known
-        still : the sensitivity if the true rate is zero; without it that of the samples is used at
-            rest too: their noise then acts as a scale factor error, which matters unless the scale
-            factor is well known
-
-        Returns
-        -------
-        '', or why the integration was restarted with this sample
+        The stamp is in s, the compensated rate in rad/s; the sensitivity, shape (m,), is that of
+        the rate to the calibration, and `still` that of a true rate of zero. Without the latter
+        that of the samples is used at rest too: their noise then acts as a scale factor error,
+        which matters unless the scale factor is well known. `wheels` tells whether wheels or
+        commands move the robot, or moved it since the last sample; None where that is not known.
 
         """
         if not -MAX_RATE < rate < MAX_RATE:
@@ -378,18 +349,10 @@ class HeadingTracker:
     def follow(self, time: Array, rate: Array, sensitivity: Array,
                wheels: Sequence[bool | None] | None = None, still: Array | None = None) -> Array:
         """
-        Take samples as `add` does, in whole blocks where no decision falls within them.
+        Take n samples as `add` does, in whole blocks where no decision falls within them.
 
-        Parameters
-        ----------
-        time, rate : as in `add`, shape (n,)
-        sensitivity : as in `add`, shape (n, m)
-        wheels : as in `add`, n of them, or None
-        still : as in `add`, shape (m,) or (n, m)
-
-        Returns
-        -------
-        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, (n, 5)
+        The sensitivity has shape (n, m), `still` too, or (m,). The result, shape (n, 5), has
+        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them.
 
         """
         given = Samples(time, rate, sensitivity, wheels, None if still is None

@@ -168,12 +168,8 @@ def take_messages(topics: Sequence[str], all_topics: bool,
     Receive the messages of these topics, or of all, until an event is set.
 
     `on_message` is called with each message and its definition, and `tick` at least every 50 ms
-    with the node.
-
-    Raises
-    ------
-    LogError : a topic name is not valid, or ROS 2 cannot be started, as with an invalid
-        ROS_DOMAIN_ID
+    with the node. Raise `LogError` where a topic name is not valid, or ROS 2 cannot be started, as
+    with an invalid ROS_DOMAIN_ID.
 
     """
     context = rclpy.Context()

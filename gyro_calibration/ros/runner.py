@@ -80,11 +80,11 @@ def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_Q
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
-def subscribe_to(node: Node, kind: type, topic: str, callback: Callable[..., None],
-                 qos: QoSProfile = SENSOR_QOS) -> Subscription:
+def subscribe_to(node: Node, kind: type, topic: str,
+                 callback: Callable[..., None]) -> Subscription:
     """Return a subscription whose quality of service parameters may override."""
     return node.create_subscription(
-        kind, topic, callback, qos,
+        kind, topic, callback, SENSOR_QOS,
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
@@ -95,11 +95,8 @@ def declare_parameters(
     """
     Declare the parameters of a table and return their values as one record.
 
-    `on_change` is called with the record of all values after a change.
-
-    Raises
-    ------
-    ValueError : an override has the wrong type or is out of range; the message is one sentence
+    `on_change` is called with the record of all values after a change. `ValueError` says in a
+    sentence that an override has the wrong type or is out of range.
 
     """
     known = {each.name: each for each in table}

@@ -267,12 +267,7 @@ class Decoder:
 
     Values that span several frames are joined only if nothing was lost between them. A refused
     sample counts as missing before the next one; a refused temperature is left out of its sample.
-
-    Attributes
-    ----------
-    device_faults : frames whose value the device marks as invalid
-    refused_samples : frames whose value is not finite, or beyond full scale
-    refused_temperatures : not finite, or beyond -100 to 300 degC
+    The counts are those of `ConnectionCounts`.
 
     """
 
@@ -343,11 +338,7 @@ class LineSplitter(Splitter):
     Splits bytes into complete, nonempty lines without their ends.
 
     A port may be opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``. So the
-    first line is discarded, unless it begins as only complete lines do.
-
-    Parameters
-    ----------
-    line_starts : first bytes that occur only at the beginning of a line
+    first line is discarded, unless it begins with bytes with which only complete lines begin.
 
     """
 
@@ -385,11 +376,7 @@ class FrameSplitter(Splitter):
     """
     Splits bytes into frames that match a pattern and pass their check, from any byte on.
 
-    Parameters
-    ----------
-    pattern : regular expression that a frame matches; ``.`` is any byte
-    length : bytes of a frame
-    is_intact : whether the checksum of a frame is right
+    In the pattern, a regular expression, ``.`` is any byte; the length is in bytes.
 
     """
 
