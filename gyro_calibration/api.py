@@ -26,13 +26,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.allan import (
-    allan_deviation,
-    AllanChart,
-    build_rest_record,
-    fit_noise,
-    NoiseFit,
-)
+from gyro_calibration.allan.deviation import allan_deviation, AllanChart, build_rest_record
+from gyro_calibration.allan.noise_fit import fit_noise, NoiseFit
 from gyro_calibration.calibration.encoder import EncoderCalibration
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit

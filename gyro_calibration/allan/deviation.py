@@ -28,12 +28,7 @@ from typing import Any
 
 from gyro_calibration.calibration.likelihood import MAX_NOISE_SIGMAS
 from gyro_calibration.logs.log import Array, DataRefused, Mask
-from gyro_calibration.logs.quality import (
-    bridge_gaps,
-    find_runs,
-    mask_outliers,
-    robust_deviation,
-)
+from gyro_calibration.logs.quality import bridge_gaps, find_runs, mask_outliers, robust_deviation
 from gyro_calibration.logs.stamps import fit_stamp_grid, Integers, MIN_WINDOWS, StampGrid
 from gyro_calibration.model.noise import (
     ANGLE_RANDOM_WALK,
@@ -149,12 +144,8 @@ def _refuse_dead(time: Array, output: Array) -> None:
 
 
 def _remove_outliers(rate: Array, stamps: StampGrid) -> list[str]:
-    """
-    Remove single samples far beyond the noise, and return a remark on them.
-
-    A motion or a jolt lasts longer than two samples and is not removed.
-
-    """
+    """Remove single samples far beyond the noise, and return a remark on them."""
+    # A motion or a jolt lasts longer than two samples and is not removed.
     outliers = np.flatnonzero(mask_outliers(bridge_gaps(rate), MAX_NOISE_SIGMAS))
     if not outliers.size or outliers.size > 0.001 * len(rate):
         return []
@@ -206,13 +197,9 @@ def integrate_angle(rate: Array) -> Array:
 
 
 def _fill_gaps(rate: Array) -> Array:
-    """
-    Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side.
-
-    A line between the samples at both ends would integrate their noise over the whole gap, which
-    passes for a random walk.
-
-    """
+    """Return the rate minus its mean; gaps get the mean over 5 gap lengths on each side."""
+    # A line between the samples at both ends would integrate their noise over the whole gap, which
+    # passes for a random walk.
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
     if known.all():
@@ -388,13 +375,9 @@ def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array
 
 
 def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
-    """
-    Return the random term that fits the slope of each Allan variance best.
-
-    The slope of the logarithm is that from half to twice each time, -1 for a single one.
-    Quantization is assumed at the short end only; a steep slope elsewhere is chance.
-
-    """
+    """Return the random term that fits the slope of each Allan variance best."""
+    # The slope of the logarithm is that from half to twice each time, -1 for a single one.
+    # Quantization is assumed at the short end only; a steep slope elsewhere is chance.
     low = np.searchsorted(sizes, sizes / 2.0)
     high = np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
     rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))

@@ -139,12 +139,8 @@ class CombinationFit:
         return np.nonzero(self.squares)[0].tolist()
 
     def _normal_scores(self) -> tuple[Array, float]:
-        """
-        Return standard normal scores, and -2 ln of the normalization of their density.
-
-        The cube root of a mean square is nearly Gaussian (Wilson and Hilferty, 1931).
-
-        """
+        """Return standard normal scores, and -2 ln of the normalization of their density."""
+        # The cube root of a mean square is nearly Gaussian (Wilson and Hilferty, 1931).
         model = self.octaves.model_variance(self.squares)
         deviation = np.sqrt((self.cholesky_factor ** 2).sum(axis=1))
         ninth = (deviation / model) ** 2 / 9.0
@@ -161,13 +157,9 @@ class CombinationFit:
         return float(normal @ normal) + density
 
     def penalized_deviance(self) -> float:
-        """
-        Return -2 ln likelihood plus a penalty for each term.
-
-        The penalty of a ramp is larger, since in a single record a random walk looks like one. A
-        Gauss-Markov process counts as two terms.
-
-        """
+        """Return -2 ln likelihood plus a penalty for each term."""
+        # The penalty of a ramp is larger, since in a single record a random walk looks like one. A
+        # Gauss-Markov process counts as two terms.
         return (self.deviance
                 + _TERM_PENALTY * (len(self.active_terms) + (_PROCESS in self.active_terms))
                 + _ALTERNATIVE_LIMIT * (_R in self.active_terms))
@@ -258,13 +250,9 @@ class Ranking:
                 if found and found.penalized_deviance() < self.best.penalized_deviance() else None)
 
     def is_replaceable(self, index: int) -> bool:
-        """
-        Tell whether a process may replace a term.
-
-        A random walk is a process with an infinite correlation time, so the likelihoods are
-        compared. In place of flicker, the penalized likelihoods are compared.
-
-        """
+        """Tell whether a process may replace a term."""
+        # A random walk is a process with an infinite correlation time, so the likelihoods are
+        # compared. In place of flicker, the penalized likelihoods are compared.
         best = self.best
         return any(index not in each.active_terms
                    and (each.deviance - best.deviance if index == _K
@@ -328,15 +316,12 @@ def _rank_from_octave(octaves: OctaveVariances, start: int, misfit: float) -> Ra
 
 def _fit_with_process(best: CombinationFit, kept_terms: tuple[int, ...],
                       misfit: float) -> CombinationFit | None:
-    """
-    Return the best fit of some terms and a Gauss-Markov process, or None without one.
-
-    The peak of the Allan deviation of the process, at 1.9 correlation times, must be in the chart:
-    a process with a longer correlation time is a random walk. It must make less than half of the
-    first Allan variance: white noise after a first-order lag is such a process too. The
-    correlation time is found with the covariance of the best fit, scaled by the Allan deviations.
-
-    """
+    """Return the best fit of some terms and a Gauss-Markov process, or None without one."""
+    # The peak of the Allan deviation of the process, at 1.9 correlation times, must be in the
+    # chart: a process with a longer correlation time is a random walk. It must make less than half
+    # of the first Allan variance: white noise after a first-order lag is such a process too. The
+    # correlation time is found with the covariance of the best fit, scaled by the Allan
+    # deviations.
     octaves, places = best.octaves, (*kept_terms, _PROCESS)
     longest, known = octaves.size[-1] / 1.9, octaves.model_variance(best.squares)
 
@@ -471,13 +456,9 @@ def _build_figure(ranking: Ranking, index: int, interval: float) -> NoiseFigure:
 
 
 def _likelihood_bounds(ranking: Ranking, best: CombinationFit, index: int) -> tuple[float, float]:
-    """
-    Return the bounds of a coefficient, between which -2 ln likelihood is near its minimum.
-
-    At each coefficient the other terms are fitted anew (profile likelihood): those of the best
-    fits, N, B and K, detected or not, and a process where it is fitted with the term.
-
-    """
+    """Return the bounds of a coefficient, between which -2 ln likelihood is near its minimum."""
+    # At each coefficient the other terms are fitted anew (profile likelihood): those of the best
+    # fits, N, B and K, detected or not, and a process where it is fitted with the term.
     held = {_N, _B, _K, *(each for one in (best, *ranking.plausible_fits, *ranking.alternatives)
                           for each in one.active_terms)}
     others = tuple(sorted(held - {index}))

@@ -24,7 +24,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from gyro_calibration.allan import AllanChart, NoiseFit
+from gyro_calibration.allan.deviation import AllanChart
+from gyro_calibration.allan.noise_fit import NoiseFit
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration, TurnErrors
 from gyro_calibration.calibration.scatter import rms
@@ -254,12 +255,8 @@ def _draw_errors(axes: Any, across: Array, error: Array, is_inlier: Mask,
 
 
 def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: float) -> Any:
-    """
-    Draw the errors of full turns with a static bias only and with the model.
-
-    They are figures 8 and 9 of Ojeda et al.; turns slower than `min_rate`, rad/s, are left out.
-
-    """
+    """Draw the errors of full turns with a static bias only and with the model."""
+    # They are figures 8 and 9 of Ojeda et al.; turns slower than `min_rate`, rad/s, are left out.
     figure, panels = _panels(2, 1, (8.5, 8))
     temperature = errors.turns.temperature
     for axes, error, words in zip(panels[:, 0], (errors.static, errors.modelled),
