@@ -21,7 +21,7 @@ repeats over many logs, wander does not.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import asdict, dataclass, replace
@@ -244,12 +244,7 @@ def _read_rows(path: str, columns: Sequence[str]) -> Iterator[FleetLog]:
 
 
 def compile_file_pattern(text: str) -> re.Pattern[str]:
-    """
-    Return the regular expression of a file name such as ``rc_car_{drive}_unit{unit}``.
-
-    Raise `ValueError` where it names no field, or an unknown one.
-
-    """
+    """Return the pattern of a name such as ``rc_car_{drive}_unit{unit}``, or `ValueError`."""
     parts = re.split(r'\{(\w*)\}', text)
     unknown = [name for name in parts[1::2] if name not in ENTRY_KEYS]
     if unknown or len(parts) < 3 or len(set(parts[1::2])) < len(parts[1::2]):
@@ -358,15 +353,8 @@ def _duration(log: Log) -> float:
     return float(time[-1] - time[0]) if len(time) >= 100 else 0.0
 
 
-def fit_slow_effects(log: Log, time_offset: float = 0.0,
-                     names: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
-    """
-    Return the slow effects of a log in time, by name: value, standard deviation and unit.
-
-    The log has a reference, which the gyro lags by the time offset, s, or is at rest. `names` are
-    those of the effects; None for all.
-
-    """
+def fit_slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, Any]]:
+    """Return the slow effects of a log in time, by name; the gyro lags its reference, if any."""
     assert log.time is not None
     heading = None
     if log.reference_heading is not None and np.isfinite(log.reference_heading).sum() > 1:
@@ -380,10 +368,9 @@ def fit_slow_effects(log: Log, time_offset: float = 0.0,
     if len(spans.edges) < 10:
         return {}
     for name, unit, angle in _slow_effects(log, spans.edges):
-        if names is None or name in names:
-            value, deviation = spans.fit(np.diff(angle))
-            if math.isfinite(deviation) and deviation > 0.0:
-                found[name] = _value_record(value, deviation, unit)
+        value, deviation = spans.fit(np.diff(angle))
+        if math.isfinite(deviation) and deviation > 0.0:
+            found[name] = _value_record(value, deviation, unit)
     return found
 
 

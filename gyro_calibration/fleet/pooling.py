@@ -299,12 +299,8 @@ class PooledValue:
         return best
 
     def _sample_variances(self) -> tuple[Array, Array]:
-        """
-        Return points of the variances, shape (points, names), and their weights.
-
-        Each coordinate is drawn by a slice through the likeliest point.
-
-        """
+        """Return points of the variances, shape (points, names), and their weights."""
+        # Each coordinate is drawn by a slice through the likeliest point.
         if not self.variance_names:
             return np.empty((1, 0)), np.ones(1)
         uniform = qmc.Halton(len(self.variance_names), scramble=False).random(

@@ -151,8 +151,3 @@ def _describe_failure(error: Exception) -> str:
         return ('its worker was killed, perhaps since memory ran out; check the log, '
                 'or give --workers 1')
     return f'its worker failed ({type(error).__name__}: {str(error)[:200]})'
-
-
-def count_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return max(len(os.sched_getaffinity(0)), 1)
