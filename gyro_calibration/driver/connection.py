@@ -254,12 +254,8 @@ class Connection:
                                 past.discarded_bytes + decoder.discarded_bytes)
 
     def chunks(self, stop: threading.Event) -> Iterator[Chunk]:
-        """
-        Give samples as they arrive, until the event is set; the port is then closed.
-
-        While the port is missing, no chunk is given.
-
-        """
+        """Give samples as they arrive, until the event is set; the port is then closed."""
+        # While the port is missing, no chunk is given.
         try:
             while not stop.is_set():
                 try:
@@ -297,13 +293,9 @@ class Connection:
         return port
 
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
-        """
-        Find protocol and baud; they stay unknown only after a stop.
-
-        The port stays open, since opening it restarts many microcontrollers, which then need some
-        time until they send.
-
-        """
+        """Find protocol and baud; they stay unknown only after a stop."""
+        # The port stays open, since opening it restarts many microcontrollers, which then need
+        # some time until they send.
         self._set_state(ConnectionState('listening'))
         end = self._read_clock() + _SILENCE_TIMEOUT + _RESTART_DURATION
         while True:

@@ -94,17 +94,10 @@ class Settings:
 
 @dataclass(frozen=True)
 class Reading:
-    """
-    The content of one frame.
+    """The content of one frame; what is not said here is as in `Sample`."""
 
-    The value is in the unit and the sense of rotation of the device; `valid` is the status that
-    the device reports. A correct frame without a rate has the value None. The rest is as in
-    `Sample`.
-
-    """
-
-    value: float | None
-    valid: bool = True
+    value: float | None  # in unit and sense of the device; None in a correct frame without a rate
+    valid: bool = True  # by the status that the device reports
     temperature: float | None = None
     time: float | None = None
     sequence: int | None = None
