@@ -75,20 +75,15 @@ class Channels:
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    A coefficient or a nonlinear parameter: name, unit, default value and bounds.
-
-    A parameter with a default is a convention, such as a reference temperature; one without is a
-    property of the gyro, and is fitted. `begin_with` holds the initial values of a nonlinear
-    parameter in the search of a diagnosis.
-
-    """
+    """A coefficient or a nonlinear parameter."""
 
     name: str
     unit: str
+    # a convention, such as a reference temperature; without one it is a property of the gyro, and
+    # is fitted
     default: float | None = None
     bounds: tuple[float, float] = (-np.inf, np.inf)
-    begin_with: tuple[float, ...] = ()
+    begin_with: tuple[float, ...] = ()  # of a nonlinear one in the search of a diagnosis
 
 
 @dataclass(frozen=True)
@@ -164,13 +159,9 @@ def lagged_signal(signal: Array, time: Array, time_constant: float) -> Array:
 
 
 def _solve_recurrence(factors: Array, added: Array, initial: float) -> Array:
-    """
-    Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,).
-
-    Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
-    row before is propagated through each row.
-
-    """
+    """Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,)."""
+    # Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
+    # row before is propagated through each row.
     count = len(factors)
     width = math.isqrt(max(count - 1, 0)) + 1
     padding = (0, -count % width)
