@@ -106,13 +106,9 @@ def run(given: argparse.Namespace) -> Answer:
 
 @contextmanager
 def _stop_event(seconds: float | None) -> Iterator[threading.Event]:
-    """
-    Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets.
-
-    A second signal changes nothing, since the file is being closed. SIGHUP stays ignored where it
-    is ignored already (nohup).
-
-    """
+    """Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets."""
+    # A second signal changes nothing, since the file is being closed. SIGHUP stays ignored where
+    # it is ignored already (nohup).
     stop = threading.Event()
     previous_handlers = {number: signal.signal(number, lambda *_: stop.set())
                          for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -137,16 +133,13 @@ class DiskFull(OSError):
 
 
 class _Recorder:
-    """
-    A new file that grows by complete pieces, and is removed at the end if it has none.
-
-    `size` is that of the complete pieces, bytes; `is_full` tells that one could not be written.
-
-    """
+    """A new file that grows by complete pieces, and is removed at the end if it has none."""
 
     def __init__(self, path: str, notes: Callable[[], Mapping[str, str]]):
         """Create the file; `notes` is called with the first piece, when all are known."""
-        self.path, self.size, self.is_full, self._notes = path, 0, False, notes
+        # size of the complete pieces, bytes, and whether one could not be written
+        self.size, self.is_full = 0, False
+        self.path, self._notes = path, notes
         try:
             self._file = io.FileIO(path, 'xb')
         except FileExistsError:
@@ -237,8 +230,7 @@ class CsvRecorder(_Recorder):
     Samples as rows of the log format.
 
     The columns are fixed with the first piece. Values that come less often than samples, such as
-    the temperature, are repeated until the next one. `late_columns` are those that came after the
-    first piece, and are not in the file.
+    the temperature, are repeated until the next one.
 
     """
 
@@ -248,7 +240,7 @@ class CsvRecorder(_Recorder):
         self._held_values: dict[str, float] = {}
         self._columns: list[str] = []
         self._start_stamp = 0
-        self.late_columns: set[str] = set()
+        self.late_columns: set[str] = set()  # came after the first piece, and are not in the file
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Add a sample; the stamp is in ns."""
@@ -479,8 +471,9 @@ class _TopicSession:
             if self._is_waiting and time.monotonic() - self._start_time > _PUBLISHER_TIMEOUT:
                 self._is_waiting = False
                 if missing := node.missing_topics:
+                    known = sorted(name for name, _ in node.get_topic_names_and_types())
                     verb.print_message(f'no publisher so far of {", ".join(missing)}; '
-                                       f'there are {", ".join(node.known_topics()) or "none"}')
+                                       f'there are {", ".join(known) or "none"}')
 
         # prints of the middleware go to standard error; standard output is the answer
         sys.stdout.flush()

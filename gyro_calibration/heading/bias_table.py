@@ -114,12 +114,7 @@ _Dated = TypeVar('_Dated', Entry, Jump)
 
 
 class BiasTable:
-    """
-    Biases at rest over temperature, of one gyro behind one model with a digest.
-
-    `run` is the number of the present run, `held_back_count` that of estimates not used so far.
-
-    """
+    """Biases at rest over temperature, of one gyro behind one model with a digest."""
 
     def __init__(self, model: GyroModel, prior: Prior | None = None,
                  entries: Sequence[Entry] = (), jumps: Sequence[Jump] = ()):
@@ -129,7 +124,7 @@ class BiasTable:
         self.run = 1 + max([-1, *(math.floor(each.run) for each in entries),
                             *(each.run for each in jumps)])
         self._first_run = self.run
-        self.held_back_count = 0
+        self.held_back_count = 0  # of estimates not used so far
         self._model, self._prior = model, prior or Prior()
         self._held_entries: list[Entry] = []
         self._written_entries, self._write_time = tuple(self.entries), -math.inf
@@ -198,28 +193,24 @@ class BiasTable:
     def _add_entry(self, given: Entry) -> None:
         for place, entry in enumerate(self.entries):
             if entry.run == given.run and _bin_number(entry) == _bin_number(given):
-                self.entries[place] = self._merge_entries(entry, given)
+                # with the older aged until the newer
+                older = entry.variance + self._wander_variance(given.time - entry.time)
+                weight = float(older / (older + given.variance))
+                self.entries[place] = replace(
+                    given, bias=entry.bias + weight * (given.bias - entry.bias),
+                    variance=max(weight * given.variance, 2.0 * _MIN_VARIANCE),
+                    temperature=(entry.temperature
+                                 + weight * (given.temperature - entry.temperature)))
                 return
         self.entries.append(given)
         if len(self.entries) > MAX_ENTRIES:
-            self._drop_oldest_entry()
-
-    def _merge_entries(self, entry: Entry, given: Entry) -> Entry:
-        """Return both as one entry at the time of the newer, with the older aged until then."""
-        older = entry.variance + self._wander_variance(given.time - entry.time)
-        weight = float(older / (older + given.variance))
-        return replace(
-            given, bias=entry.bias + weight * (given.bias - entry.bias),
-            variance=max(weight * given.variance, 2.0 * _MIN_VARIANCE),
-            temperature=entry.temperature + weight * (given.temperature - entry.temperature))
-
-    def _drop_oldest_entry(self) -> None:
-        """Drop the oldest entry of the fullest bin, and the jumps that no entry precedes."""
-        (fullest, _), = Counter(map(_bin_number, self.entries)).most_common(1)
-        self.entries.remove(min((each for each in self.entries if _bin_number(each) == fullest),
-                                key=lambda each: (each.run, each.time)))
-        first = min(each.run for each in self.entries)
-        self.jumps = [each for each in self.jumps if each.run > first]
+            # the oldest of the fullest bin, and the jumps that no entry precedes
+            (fullest, _), = Counter(map(_bin_number, self.entries)).most_common(1)
+            self.entries.remove(min(
+                (each for each in self.entries if _bin_number(each) == fullest),
+                key=lambda each: (each.run, each.time)))
+            first = min(each.run for each in self.entries)
+            self.jumps = [each for each in self.jumps if each.run > first]
 
     def predict(self, temperature: float, time: float) -> tuple[float, float]:
         """Return the bias in this run, rad/s, and its variance, (rad/s)²; 0 and inf if unknown."""
@@ -310,26 +301,17 @@ class BiasTable:
         return (float(_SIZE_PROBABILITIES @ _SIZES[:, 0] ** 2)
                 * (self._prior.coefficient * self._prior.unknown_distance) ** 2)
 
-    def _prior_coefficient(self) -> float:
-        """Return the prior temperature coefficient within the range of the model, rad/s/K."""
-        return self._prior.coefficient * (
-            self._prior.compensated_share if self._model.uses_channel('temperature') else 1.0)
-
     def _temperature_variance(self, here: Array | float, there: Array) -> Array:
         """Return the variance of the bias between temperatures, (rad/s)², shape (sizes, ...)."""
-        inside = (self._prior_coefficient() ** 2
-                  * _mean_square_change(there - here, self._prior.correlation_length))
-        return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, inside)
-                          + self._out_of_range_variance(here, there))
-
-    def _out_of_range_variance(self, here: Array | float, there: Array) -> Array | float:
-        """Return the part of that variance from outside the temperature range of the model."""
-        if not self._model.uses_channel('temperature'):
-            return 0.0
-        low, high = self._model.temperature_range
-        below = np.minimum(there - low, 0.0) - np.minimum(here - low, 0.0)
-        above = np.maximum(there - high, 0.0) - np.maximum(here - high, 0.0)
-        return self._prior.coefficient ** 2 * (below ** 2 + above ** 2)
+        inside, outside, coefficient = self._prior.coefficient, 0.0, self._prior.coefficient
+        if self._model.uses_channel('temperature'):
+            inside = coefficient * self._prior.compensated_share
+            low, high = self._model.temperature_range
+            below = np.minimum(there - low, 0.0) - np.minimum(here - low, 0.0)
+            above = np.maximum(there - high, 0.0) - np.maximum(here - high, 0.0)
+            outside = coefficient ** 2 * (below ** 2 + above ** 2)
+        change = inside ** 2 * _mean_square_change(there - here, self._prior.correlation_length)
+        return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, change) + outside)
 
     def _wander_variance(self, age: Array | float) -> Any:
         """Return the variance of the wander of the bias by the noise of the gyro, (rad/s)²."""
@@ -364,18 +346,12 @@ class BiasTable:
             -np.abs(_pairwise_differences(temperatures)) / self._prior.correlation_length)
         ageing = self._prior.ageing ** 2 / YEAR * alike * np.minimum(age[:, None], age)
         fixed = (_covariance_of_differences(self._wander_variance(age), wander)
-                 + np.diag(variances) + ageing + self._jump_covariance(runs))
+                 + np.diag(variances) + ageing)
+        for jump in self.jumps:  # shared by all entries before it
+            fixed += jump.variance * np.outer(runs < jump.run, runs < jump.run)
         by_run = (self._prior.turn_on ** 2
                   * _covariance_of_differences(2.0 * (runs != self.run), 2.0 * runs_apart))
         return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
-
-    def _jump_covariance(self, runs: Array) -> Array:
-        """Return the covariance by jumps, (rad/s)², shape (n, n), shared by all before a jump."""
-        total = np.zeros((len(runs), len(runs)))
-        for each in self.jumps:
-            before = runs < each.run
-            total += each.variance * np.outer(before, before)
-        return total
 
     def is_write_due(self, now: float, ending: bool = False) -> bool:
         """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
@@ -412,21 +388,10 @@ def _mixture_moments(probability: Array, means: Array, variances: Array) -> tupl
 
 
 class TemperatureCorrection:
-    """
-    Change of the bias from one temperature to others, by a bias table as it is now.
-
-    Later entries of the table come from rests that the tracker has used itself. So they are not
-    used here until the tracker is restarted.
-
-    """
+    """Change of the bias from one temperature to others, by a bias table as it is now."""
 
     def __init__(self, table: BiasTable, begin: float, now: float, coefficient: float):
-        """
-        Begin at a temperature, degC, now, s since 1970.
-
-        Distances are counted in the coefficient, a standard deviation in rad/s/K above 0.
-
-        """
+        """Begin at a temperature, degC, now, s since 1970, with a coefficient above 0, rad/s/K."""
         self.start_temperature = begin
         self._steps = begin + np.arange(-_MAX_DISTANCE, _MAX_DISTANCE + 0.5, 0.5)
         self._changes, variances = table.bias_difference(begin, self._steps, now)
@@ -439,13 +404,9 @@ class TemperatureCorrection:
 
 
 def _mean_square_change(distance: Array | float, length: float) -> Any:
-    """
-    Return the mean square, K², of the integral of a process of variance 1 over a distance.
-
-    Its covariance is (1 + |d|/length) exp(-|d|/length). Its paths have a slope, unlike those of a
-    Gauss-Markov process: the bias over temperature is as smooth.
-
-    """
+    """Return the mean square, K², of the integral of a process of variance 1 over a distance."""
+    # Its covariance is (1 + |d|/length) exp(-|d|/length). Its paths have a slope, unlike those of
+    # a Gauss-Markov process: the bias over temperature is as smooth.
     lengths = np.abs(distance) / length
     return 2.0 * length ** 2 * (2.0 * lengths - 3.0 + (3.0 + lengths) * np.exp(-lengths))
 

@@ -117,16 +117,9 @@ class HeadingEstimator:
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
-                 settings: Settings, temperature_timeout: float, now: float, keep: bool = False):
-        """
-        Begin at heading zero, now, s since 1970.
-
-        A temperature older than the timeout, s, is held, and counts as less and less known. The
-        steps of the tracker are kept on request, for `log_compensation.smooth_track`.
-
-        """
-        self._assumptions, self._settings = assumptions, settings
-        self._temperature_timeout, self._keeps_steps = temperature_timeout, keep
+                 settings: Settings, now: float, keep: bool = False):
+        """Begin at heading zero, now, s since 1970; `keep` steps for `smooth_track`."""
+        self._assumptions, self._settings, self._keeps_steps = assumptions, settings, keep
         self.temperature: float | None = None
         self._temperature_time, self._follows_temperature = -math.inf, False
         self.is_calibrated_this_run = self._age_changed = False
@@ -139,15 +132,9 @@ class HeadingEstimator:
         self._pending_stretches: deque[_RestStretch] = deque(maxlen=8)
         self._table_message = ''
         self.model, self.table = model, table
-        self._tracker: HeadingTracker | None = None
         self._history = model.start_history()
+        self.tracker: HeadingTracker  # of the first start
         self._restart(now)
-
-    @property
-    def tracker(self) -> HeadingTracker:
-        """Return the tracker of the heading."""
-        assert self._tracker is not None
-        return self._tracker
 
     def use_calibration(self, model: GyroModel, now: float) -> None:
         """Use a self-calibration that was made just now; the heading does not jump."""
@@ -201,11 +188,11 @@ class HeadingEstimator:
         slope = None if self.current_model.needs_history else np.subtract(
             *(self._uncertain_sensitivity(rate, rate, temperature, None, 0.0)
               for rate in (DEGREE, 0.0))) / DEGREE
-        if self._tracker is None:
-            self._tracker = HeadingTracker(self.current_model.noise, self.covariance,
-                                           self._settings, age, self._keeps_steps, slope)
+        if self.restart_count:
+            self.tracker.use_calibration(self.current_model.noise, self.covariance, age, slope)
         else:
-            self._tracker.use_calibration(self.current_model.noise, self.covariance, age, slope)
+            self.tracker = HeadingTracker(self.current_model.noise, self.covariance,
+                                          self._settings, age, self._keeps_steps, slope)
         self._start_time = now
         self._start_correction(now)
         self._unknown_since = (self._time if is_fresh and not self._follows_temperature
@@ -226,13 +213,9 @@ class HeadingEstimator:
                             if here is not None and coefficient else None)
 
     def _resume_temperature(self, now: float, around: Channels | None) -> None:
-        """
-        Continue at the first temperature with a calibration of this run made without one.
-
-        It was made after the model at the temperature that was assumed up to the last sample. The
-        different output of the model at the present temperature is not a change of the rate.
-
-        """
+        """Continue at the first temperature with a calibration of this run made without one."""
+        # It was made after the model at the temperature that was assumed up to the last sample.
+        # The different output of the model at the present temperature is not a change of the rate.
         here = compensate(self.current_model, 0.0, self.temperature, around).model_rate
         last = self.last_compensated.temperature
         before = None if around is None else replace(around, temperature=last)
@@ -409,17 +392,13 @@ class HeadingEstimator:
     @property
     def _temperature_lateness(self) -> float:
         """Return the time since the temperature is too old, s."""
-        return abs(self._time - self._temperature_time) - self._temperature_timeout
+        return abs(self._time - self._temperature_time) - TEMPERATURE_TIMEOUT
 
     def _follow_channels(self, interval: float, force: float | None,
                          supply: float | None) -> Channels:
-        """
-        Return the channels of effects other than rate, output and temperature.
-
-        Time increases with the stamps, also over gaps, and is constant when they jump back. The
-        heading is that of the tracker without its resets, extrapolated to this sample.
-
-        """
+        """Return the channels of effects other than rate, output and temperature."""
+        # Time increases with the stamps, also over gaps, and is constant when they jump back. The
+        # heading is that of the tracker without its resets, extrapolated to this sample.
         interval = max(interval, 0.0) if interval < math.inf else 0.0
         self._elapsed += interval
         ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
@@ -554,12 +533,7 @@ class HeadingEstimator:
             self._stretch = None
 
     def update_table(self, now: float, ending: bool = False) -> str:
-        """
-        Add the bias of complete stretches of rest to the table; to be called regularly.
-
-        Return the message of the table since the last call, or ''.
-
-        """
+        """Add the bias of complete rests to the table, regularly; return its message, or ''."""
         self._add_to_table(now, self.tracker.is_resting and not ending)
         message, self._table_message = self._table_message, ''
         return message
@@ -570,13 +544,9 @@ class HeadingEstimator:
             each.has_ended = True
 
     def _add_to_table(self, now: float, resting: bool) -> None:
-        """
-        Add the bias of complete stretches of rest to the table.
-
-        A stretch is pending until the next one is complete, or the rest or the run has ended: by
-        then the tracker has detected a slow turn.
-
-        """
+        """Add the bias of complete stretches of rest to the table."""
+        # A stretch is pending until the next one is complete, or the rest or the run has ended: by
+        # then the tracker has detected a slow turn.
         while len(self._pending_stretches) > resting:
             stretch = self._pending_stretches.popleft()
             bias, temperature = (total / stretch.count
@@ -592,13 +562,9 @@ class HeadingEstimator:
                 self._restart(now)
 
     def _expected_bias(self, temperature: float, seen: Array) -> tuple[float, float]:
-        """
-        Return bias at a temperature and its standard deviation by the tracker at present, rad/s.
-
-        It is the bias after the model and before the self-calibration. When a stretch is tested,
-        its rest may be over, and the temperature may have changed.
-
-        """
+        """Return bias at a temperature and its deviation by the tracker at present, rad/s."""
+        # It is the bias after the model and before the self-calibration. When a stretch is tested,
+        # its rest may be over, and the temperature may have changed.
         calibration = self.current_model.self_calibration or SelfCalibration()
         change = self._bias_shift
         if self._correction is not None:

@@ -48,15 +48,11 @@ _SHORT_RATIO, _MIN_BURST_SHARE = 0.5, 0.1
 
 
 class Intervals:
-    """
-    The usual interval of stamps that may jitter or come in bursts, and the samples lost in others.
-
-    `usual_interval`, s, is inf while it is not known; `longest_gap`, s, is 0 where there was none.
-
-    """
+    """The usual interval of stamps, with jitter or bursts, and the samples lost in others."""
 
     def __init__(self) -> None:
         """Begin with nothing known."""
+        # usual interval, s, and longest gap, s; inf and 0 where there is none
         self.usual_interval, self.lost_samples, self.longest_gap = math.inf, 0, 0.0
         self._history: deque[float] = deque(maxlen=_MAX_INTERVALS)
         self._until_update, self._gap_limit = _MIN_INTERVALS, math.inf
@@ -194,14 +190,7 @@ class Threshold:
 
 
 class ThresholdFilter:
-    """
-    Set the rate to zero while the robot is at rest, sample by sample.
-
-    The published filter uses single samples. With the noise of a cheap gyro this has little effect
-    at rest, so the mean over a short window is used here. A turn slower than the threshold is
-    lost; the caller counts the deleted heading.
-
-    """
+    """Set the rate to zero at rest, sample by sample; the caller counts the deleted heading."""
 
     def __init__(self, settings: Threshold):
         """Begin with an empty window."""
@@ -216,9 +205,6 @@ class ThresholdFilter:
         """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
         if not self.settings.rate:
             return rate
-        return 0.0 if self._is_standing(time, rate) else rate
-
-    def _is_standing(self, time: float, rate: float) -> bool:
         window = self._window
         window.append((time, min(max(rate, -MAX_RATE), MAX_RATE)))
         while window[0][0] <= time - self.settings.window and len(window) > 1:
@@ -227,11 +213,11 @@ class ThresholdFilter:
         rates = [each for _, each in window]
         mean = sum(rates) / len(rates)
         if not abs(mean) < self.settings.rate:
-            return False
+            return rate
         # motion if the window varies by more than the noise
         explained = 9.0 * self.settings.angle_random_walk ** 2 * len(rates)
         variance = sum(each * each for each in rates) / len(rates) - mean * mean
-        return not 0.0 < explained < variance * (time - window[0][0])
+        return rate if 0.0 < explained < variance * (time - window[0][0]) else 0.0
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:

@@ -137,18 +137,10 @@ class HeadingState:
                      + step.process_noise[HEADING_INDEX, HEADING_INDEX])
 
     def advance_at_rest(self, rate_integral: RateIntegral) -> HeadingState:
-        """Return the state after a time at rest, with its measurement."""
+        """Return the state after a time of constant heading, with its measurement."""
+        # A `wander_variance` is added to the variance of the measurement and to that of the
+        # heading, which is then the heading at the end.
         step = self.transition(rate_integral)
-        return self.update_at_rest(rate_integral, step).propagate_at_rest(rate_integral, step)
-
-    def update_at_rest(self, rate_integral: RateIntegral, step: Transition) -> HeadingState:
-        """
-        Return the state at the begin of a time at rest, updated by its measurement.
-
-        A `wander_variance` is added to the variance of the measurement and to that of the
-        heading, which is then the heading at the end.
-
-        """
         gain_direction = self.covariance @ step.observation
         noise = step.process_noise[HEADING_INDEX, HEADING_INDEX]
         variance = float(step.observation @ gain_direction + noise) + rate_integral.wander_variance
@@ -158,16 +150,13 @@ class HeadingState:
             gain_direction[HEADING_INDEX] += rate_integral.wander_variance
             covariance = covariance.copy()
             covariance[HEADING_INDEX, HEADING_INDEX] += rate_integral.wander_variance
-        return HeadingState(self.noise, self.mean + gain_direction * (innovation / variance),
-                            covariance - gain_direction[:, None] * gain_direction / variance)
-
-    def propagate_at_rest(self, rate_integral: RateIntegral, step: Transition) -> HeadingState:
-        """Return the state after a time of constant heading without a measurement."""
-        grown = step.process_noise.copy()
+        mean = self.mean + gain_direction * (innovation / variance)
+        covariance = covariance - gain_direction[:, None] * gain_direction / variance
+        grown = step.process_noise
         grown[HEADING_INDEX] = grown[:, HEADING_INDEX] = 0.0
         grown[HEADING_INDEX, HEADING_INDEX] = rate_integral.lost_variance
-        return HeadingState(self.noise, step.retention * self.mean,
-                            step.retention[:, None] * self.covariance * step.retention + grown)
+        return HeadingState(self.noise, step.retention * mean,
+                            step.retention[:, None] * covariance * step.retention + grown)
 
     def expected_rest_angle(self, rate_integral: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
@@ -276,12 +265,8 @@ def _integrated_wander(noise: Noise, durations: Array) -> tuple[Array, Array]:
 @lru_cache(maxsize=4096)
 def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
                        value_count: int) -> tuple[Array, Array, Array]:
-    """
-    Return contributions to the integral, decay, and process noise, with calibrated values last.
-
-    White noise is not included. Without rates, walk and flicker go on, and contribute nothing.
-
-    """
+    """Return contributions to the integral, decay and process noise, calibrated values last."""
+    # White noise is not included. Without rates, walk and flicker go on, and contribute nothing.
     constants, variance = noise.flicker_processes()
     left, walk = np.exp(-duration / constants), noise.rate_random_walk ** 2
     (seen,), (integral,) = _integrated_wander(noise, np.array([duration]))
@@ -331,14 +316,11 @@ def _smooth_state(state: HeadingState, rate_integral: RateIntegral, is_resting: 
         after, transition = state.propagate(rate_integral), np.diag(step.retention)
         transition[HEADING_INDEX] -= step.observation
         shared = state.covariance @ transition.T
-    smoother_gain = shared @ _pseudo_inverse(after.covariance)
+    # the pseudo-inverse of correlations, as variances may be zero and of any size
+    size = np.sqrt(np.diagonal(after.covariance))
+    size = np.where(size > 0.0, size, 1.0)
+    sizes = np.outer(size, size)
+    smoother_gain = shared @ (pinvh(after.covariance / sizes) / sizes)
     change = smoother_gain @ (later.covariance - after.covariance) @ smoother_gain.T
     return replace(start, mean=start.mean + smoother_gain @ (later.mean - after.mean),
                    covariance=start.covariance + change)
-
-
-def _pseudo_inverse(covariance: Array) -> Array:
-    """Return the pseudo-inverse of a covariance that may have zero variances."""
-    size = np.sqrt(np.diagonal(covariance))
-    size = np.where(size > 0.0, size, 1.0)
-    return pinvh(covariance / np.outer(size, size)) / np.outer(size, size)

@@ -101,16 +101,11 @@ _TEST_COUNT, _OVERLAP_FACTOR = len(MEAN_LAGS) + 2, 3.0
 
 
 class EnergyDetector:
-    """
-    The energy of the last `WINDOW_DURATION` s.
-
-    `noise_factor` is the ratio of the noise of the samples to that of the model, by the quietest
-    windows; 1 until there are enough of them.
-
-    """
+    """The energy of the last `WINDOW_DURATION` s."""
 
     def __init__(self, noise: Noise, false_alarms: float):
         """Begin with an empty window."""
+        # ratio of the noise of the samples to that of the model, by the quietest windows
         self.noise_factor = 1.0
         self._blocks = deque[Block]()
         self._energies = deque[tuple[float, float]](maxlen=_MAX_WINDOWS)
@@ -166,13 +161,9 @@ class EnergyDetector:
 
     def _update_noise_factor(self, duration: float, count: int, energy: float,
                              differences: float) -> None:
-        """
-        Update the noise of the samples by the quietest tenth of the windows.
-
-        Vibration in a straight drive is not noise; it contributes less to differences of
-        neighbours.
-
-        """
+        """Update the noise of the samples by the quietest tenth of the windows."""
+        # Vibration in a straight drive is not noise; it contributes less to differences of
+        # neighbours.
         self._since_last_window += duration
         if self._since_last_window < WINDOW_DURATION - TIME_TOLERANCE:
             return
@@ -184,12 +175,8 @@ class EnergyDetector:
             self.noise_factor = math.sqrt(min(max(quietest, 1.0), _MAX_NOISE_FACTOR ** 2))
 
     def sudden_limit(self) -> float:
-        """
-        Return the largest deviation of a single sample at rest, rad/s.
-
-        Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
-
-        """
+        """Return the largest deviation of a single sample at rest, rad/s."""
+        # Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
         if self._sudden_limit is None:
             limit = mean_threshold_sigmas(round(self._interval, 9), self._sample_false_alarms)
             self._sudden_limit = limit * self.noise_factor * math.sqrt(
@@ -215,12 +202,7 @@ class Snapshot:
 
 
 class RestScatter:
-    """
-    Distribution of the scatter of the rates in detected rests.
-
-    `counts` are those of rests with each of `SCATTER_RATIOS` that pass in this rest, shape (k,).
-
-    """
+    """Distribution of the scatter of the rates in detected rests."""
 
     def __init__(self) -> None:
         """Begin with the prior numbers."""
@@ -229,13 +211,9 @@ class RestScatter:
         self.begin_rest(0.0)
 
     def begin_rest(self, bias_ratio: float) -> None:
-        """
-        Begin a rest.
-
-        The ratio is that of the variance of the bias, over 1 s, to that of the white noise.
-
-        """
+        """Begin a rest with a ratio of the variance of the bias, over 1 s, to the white noise."""
         passes = max(bias_ratio, _MAX_SCATTER_RATIO) >= SCATTER_RATIOS
+        # numbers of rests with each of `SCATTER_RATIOS` that pass in this rest, shape (k,)
         self.counts = self._learned + self._retention * _PRIOR_COUNTS * passes
 
     def probabilities(self, likelihood: Array) -> Array:
@@ -302,12 +280,7 @@ class Epoch:
 
 
 class EvenSamples:
-    """
-    n samples without jumps and gaps, and their sums over k blocks.
-
-    `results` is that of `HeadingTracker.follow`, and `whole_blocks` the range of complete blocks.
-
-    """
+    """n samples without jumps and gaps, and their sums over k blocks."""
 
     def __init__(self, given: Samples, where: slice, last: tuple[float, float, float, Array],
                  begun: float, rested: bool, found: Array):

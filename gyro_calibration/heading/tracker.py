@@ -268,7 +268,8 @@ class HeadingTracker:
             self.refused_count += 1
             return ''
         spike, self._held_jump = self._held_jump, None
-        if self._last_sample is not None and self._is_jump(time, rate):
+        if self._last_sample is not None and self._is_jump(
+                time - self._last_sample[0], rate - self._last_sample[1]):
             if spike is None:
                 self._held_jump = time, rate, sensitivity, wheels, still
                 return ''
@@ -285,12 +286,10 @@ class HeadingTracker:
             self.outlier_count += 1
         return self._take_sample(time, rate, sensitivity, wheels, still)
 
-    def _is_jump(self, time: float, rate: float) -> bool:
-        """Tell whether the rate changed by more than a robot can since the last sample."""
-        if self._last_sample is None:
-            return False
-        interval, step = time - self._last_sample[0], abs(rate - self._last_sample[1])
-        return (step > MAX_RATE_STEP and step > MAX_RATE_STEP + MAX_ACCELERATION * interval
+    def _is_jump(self, interval: float, step: float) -> bool:
+        """Tell whether the rate changed by more than a robot can in an interval."""
+        return (abs(step) > MAX_RATE_STEP
+                and abs(step) > MAX_RATE_STEP + MAX_ACCELERATION * interval
                 and 0.0 <= interval <= self._settings.maximum_gap)
 
     def _take_sample(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
@@ -591,13 +590,9 @@ class HeadingTracker:
         return stands
 
     def _accept_slow_turn_as_bias(self) -> bool:
-        """
-        Attribute a slow turn of constant rate to a change of the bias at rest; tell whether so.
-
-        A robot does not turn at a constant rate for minutes. Otherwise a bias that wanders by more
-        than the model states would cause a permanent drift of the heading at rest.
-
-        """
+        """Attribute a slow, constant turn to a change of the bias at rest; tell whether so."""
+        # A robot does not turn at a constant rate for minutes. Otherwise a bias that wanders by
+        # more than the model states would cause a permanent drift of the heading at rest.
         suspected, held = self._suspected_turn, self._with_still_sensitivity(self._held_integral)
         if suspected is None:
             return False
@@ -691,13 +686,9 @@ class HeadingTracker:
 
     def _locate_motion_start(self, snapshot: Snapshot,
                              turn: RateIntegral) -> tuple[Snapshot, RateIntegral]:
-        """
-        Return the state after the last block at rest after a snapshot, and the integral since.
-
-        The begin of motion is located by maximum likelihood, with rates of unknown scatter in
-        motion; the block before it is counted as motion, as it may contain the begin.
-
-        """
+        """Return the state at the last block at rest since a snapshot, and the integral after."""
+        # The begin of motion is located by maximum likelihood, with rates of unknown scatter in
+        # motion; the block before it is counted as motion, as it may contain the begin.
         blocks, duration = list[RateIntegral](), 0.0
         for block in reversed(self._rest_blocks):
             if duration + block.duration > turn.duration + TIME_TOLERANCE:
@@ -738,13 +729,9 @@ class HeadingTracker:
                 if abs(rate) < _SLOW_TURN_FACTOR * least else None)
 
     def _restart_after_gap(self, interval: float, fastest: float, may_have_turned: bool) -> str:
-        """
-        Restart after a gap or a backward jump of the stamps, over which nothing is integrated.
-
-        Unless the wheels stood, the robot may have turned to any direction meanwhile, also between
-        two rests. The duration of a backward jump is unknown.
-
-        """
+        """Restart after a gap or a backward jump of the stamps; nothing is integrated over it."""
+        # Unless the wheels stood, the robot may have turned to any direction meanwhile, also
+        # between two rests. The duration of a backward jump is unknown.
         self._advance_to_last_sample()
         assert self._last_sample is not None
         self._last_time = self._last_sample[0]

@@ -176,12 +176,7 @@ class Diagnostics:
 
     def __init__(self, node: Node, name: str, report: Callable[[], Report],
                  hardware_id: str = 'none'):
-        """
-        Create the publisher of diagnostics with a status name, such as ``'gyro'``.
-
-        `report` is never called concurrently, and must not call `publish`.
-
-        """
+        """Create the publisher; `report` is never called concurrently, nor may call `publish`."""
         self.level: bytes | None = None
         self._node, self._name, self._hardware = node, name, hardware_id
         self._report, self._lock = report, threading.Lock()
