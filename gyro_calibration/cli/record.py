@@ -34,7 +34,7 @@ from typing import Any
 from gyro_calibration import __version__
 from gyro_calibration.cli import verb
 from gyro_calibration.cli.verb import Answer, UsageError
-from gyro_calibration.driver.connection import Connection, ConnectionState
+from gyro_calibration.driver.connection import Connection, ConnectionState, MAX_BAUD
 from gyro_calibration.driver.protocols import AUTO, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
@@ -52,7 +52,6 @@ _EXISTS = '{}: exists already, and recordings are never overwritten; give a new 
 _FILE_SUFFIXES = '.csv', '.csv.gz', '.mcap'
 _DEFAULT_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _INCREMENT_OPTIONS = {'always': True, 'never': False, 'default': None}
-_MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _PUBLISHER_TIMEOUT = 5.0  # s; after which topics without a publisher are named
 _WRITE_INTERVAL = 0.5  # s; the longest time that samples stay in memory
 #: Time, s, for which the header of a log waits for values that come seldom: with and without a
@@ -342,8 +341,8 @@ class _PortSession:
         if given.topic or given.temperature_topic or given.reference_topic or given.all:
             raise UsageError('--port and topics were both given; record one of them, '
                              'or the topics of a driver on that port')
-        if not 0 <= given.baud <= _MAX_BAUD:
-            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_MAX_BAUD}; '
+        if not 0 <= given.baud <= MAX_BAUD:
+            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {MAX_BAUD}; '
                              'leave it out for that of the protocol')
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         try:

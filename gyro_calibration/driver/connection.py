@@ -134,6 +134,7 @@ def _describe_error(error: BaseException) -> str:
     return f'{error}: set another port or baud'
 
 
+MAX_BAUD = 4_000_000  # bit/s; the fastest serial line of Linux
 _SILENCE_TIMEOUT = 2.0  # s; time without a sample, after which the port is opened again
 _SILENCE_PERIODS = 3.0  # periods without a sample, for a gyro that is slower than that
 #: Longest silence of a board that restarts when its port is opened, and longest delay before a

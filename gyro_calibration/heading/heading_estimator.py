@@ -74,7 +74,7 @@ class Assumptions:
     bias: float = 0.5 * DEGREE  # rad/s
     scale_factor_error: float = 0.03
     #: rad/s/K; 0 for a gyro with temperature compensation.
-    bias_temperature_coefficient: float = 0.03 * DEGREE
+    bias_temperature_coefficient: float = Prior.coefficient
 
     @property
     def covariance(self) -> tuple[tuple[float, float], tuple[float, float]]:

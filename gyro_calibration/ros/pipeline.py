@@ -31,6 +31,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
+from gyro_calibration.calibration.self_calibration import RunLimits
 from gyro_calibration.driver.timestamps import HostTimeConverter, read_clock_pair
 from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import (
@@ -78,15 +79,15 @@ PARAMETERS = (
     Parameter('stationary.method', 'rest',
               'How standstill is found: by the statistics of the rate, by the threshold filter, '
               'or not at all.', dynamic=True, choices=('rest', 'threshold', 'none')),
-    Parameter('stationary.threshold', 0.3 * DEGREE,
+    Parameter('stationary.threshold', Threshold.rate,
               'Threshold filter: a mean rate over 0.2 s below it is zero; 0 switches it off.',
               'rad/s', (0.0, 0.1), True),
-    Parameter('assumed.bias', 0.5 * DEGREE,
+    Parameter('assumed.bias', Assumptions.bias,
               'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
-    Parameter('assumed.scale_factor_error', 0.03,
+    Parameter('assumed.scale_factor_error', Assumptions.scale_factor_error,
               'Standard deviation of the scale factor error without a calibration.', '1',
               (0.0, 1.0)),
-    Parameter('assumed.bias_temperature_coefficient', 0.03 * DEGREE,
+    Parameter('assumed.bias_temperature_coefficient', Assumptions.bias_temperature_coefficient,
               'Standard deviation of the change of the bias with temperature; 0 for a gyro that '
               'compensates it.', 'rad/s/K', (0.0, 0.1)),
     Parameter('calibration.reference', 'profile', 'What calibrate compares the gyro with.',
@@ -101,7 +102,7 @@ PARAMETERS = (
               'number that the gyro shows.', '', (-100, 100), True),
     Parameter('calibration.odometry_scale_deviation', 0.01,
               'Standard deviation of the scale of turns by odometry.', '1', (0.0, 0.5), True),
-    Parameter('calibration.maximum_bias', 10.0 * DEGREE,
+    Parameter('calibration.maximum_bias', RunLimits.max_bias,
               'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
 )
 
