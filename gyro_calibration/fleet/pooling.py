@@ -86,10 +86,6 @@ class Observations:
         ones = np.ones((len(self.value), 1))
         return np.hstack([ones, self.columns]) if self.columns.size else ones
 
-    def add_column(self, column: Array) -> Observations:
-        """Return the same with one more fixed effect."""
-        return replace(self, columns=np.column_stack([self.fixed_effects[:, 1:], column]))
-
 
 @dataclass(frozen=True)
 class Interval:
@@ -405,7 +401,8 @@ class PooledValue:
                                             np.zeros(equations.parts))
             scores.append(abs(mean[0, 0]) / math.sqrt(variance[0, 0]))
         place = int(np.argmax(scores))
-        extended = PooledValue(self.observed.add_column(columns[place].astype(float)))
+        effects = np.column_stack([self.observed.fixed_effects[:, 1:], columns[place]])
+        extended = PooledValue(replace(self.observed, columns=effects))
         row = np.eye(len(extended._column_scales))[-1:]
         return (place, extended, float(extended.estimate(fixed=row).value[0]),
                 min(float(extended.p_value(fixed=row)[0]) * len(columns), 1.0))

@@ -20,7 +20,7 @@ robot drives, and adds the bias at rest to the table for the next run.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 import math
@@ -571,11 +571,6 @@ class HeadingEstimator:
             change += float(self._correction.change_at(temperature)[0])
         off, deviation = self.tracker.bias_for(seen)
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
-
-    def missing_channels(self, available: Collection[str]) -> list[str]:
-        """Return the channels that the model needs and that no message contains."""
-        return [channel for channel in ('supply', 'specific_force')
-                if self.current_model.uses_channel(channel) and channel not in available]
 
 
 def _lost_temperature_distance(delay: float) -> float:

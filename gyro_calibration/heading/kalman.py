@@ -71,11 +71,6 @@ class RateIntegral:
                             block_count=self.block_count - other.block_count,
                             block_square_sum=self.block_square_sum - other.block_square_sum)
 
-    @property
-    def block_scatter(self) -> float:
-        """Return the sum of squared deviations of the blocks from their mean, rad²/s."""
-        return self.block_square_sum - self.angle ** 2 / self.duration
-
 
 @dataclass(frozen=True)
 class Transition:

@@ -193,11 +193,15 @@ class HeadingTracker:
                                        else settings.threshold)
         self._sigmas = {lag: _NOISE_TOLERANCE * mean_threshold_sigmas(lag, settings.false_alarms)
                         for lag in (WINDOW_DURATION, *MEAN_LAGS)} if self._detects_rest else {}
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Begin the present rest or motion again, with the state as it is."""
         if self.is_resting and self._detects_rest:
             self._enter_rest()
         else:
             self._enter_motion(WINDOW_DURATION)
-        self._adopt_state()
+            self._adopt_state()
 
     def use_calibration(self, noise: Noise, covariance: Array, age: float | None = 0.0,
                         sensitivity_slope: Array | None = None) -> None:
@@ -231,11 +235,7 @@ class HeadingTracker:
         self._advance_to_last_sample()
         self.heading, self._suspected_turn = heading, None
         self._state = self._state.with_heading(heading, variance)
-        if self.is_resting:
-            self._enter_rest()
-        else:
-            self._enter_motion(WINDOW_DURATION)
-        self._adopt_state()
+        self._begin_anew()
 
     @property
     def variance(self) -> float:
@@ -549,7 +549,6 @@ class HeadingTracker:
         if quiet and self._is_mean_at_rest(wheels):
             self._advance_state(self._held_rest_integral())
             self._enter_rest()
-            self._adopt_state()
             self._rest_blocks.extend([*self._recent_blocks][1:])
 
     def _close_block(self) -> RateIntegral:
@@ -611,7 +610,6 @@ class HeadingTracker:
                           self._last_sample[0] - self._block_integral.duration - held.duration))
         self._state, self._open_integral, self._suspected_turn = moved, self._held_integral, None
         self._enter_rest()
-        self._adopt_state()
         return True
 
     def _normalized_innovation(self, state: HeadingState, turn: RateIntegral,
@@ -638,7 +636,6 @@ class HeadingTracker:
                     self._state = self._state.with_added_variance(
                         WALK_INDEX, ((turn.angle - expected) / turn.duration) ** 2)
                     self._enter_rest()
-                    self._adopt_state()
                 else:
                     self._revert_to_motion(lag)
                 return
@@ -652,7 +649,7 @@ class HeadingTracker:
     # From rest to motion and back
 
     def _enter_rest(self) -> None:
-        """Begin a rest."""
+        """Begin a rest with the state as it is."""
         self.is_resting, self._rest_integral = True, self._zero_integral
         self._wheels_stand = False
         self._rest_blocks = deque(maxlen=_MAX_REST_BLOCKS)
@@ -661,6 +658,7 @@ class HeadingTracker:
         _, median = self._rest_scatter.mean_and_median(np.zeros(1))
         self._snapshots = [Snapshot(self._state, self._zero_integral, self.deleted_heading,
                                     len(self.steps), scatter=median)]
+        self._adopt_state()
 
     def _enter_motion(self, quiet_duration: float) -> None:
         """Begin a motion, which lasts until the rate is quiet for `quiet_duration` s."""
@@ -782,7 +780,9 @@ class HeadingTracker:
         shared = SCATTER_CORRELATIONS * wander
         gain = shared / (before.variance + wander)
         spread = variance + share * wander - gain * shared
-        blocks = turn.block_scatter * turn.duration / (
+        # of the blocks about their mean
+        scatter = turn.block_square_sum - turn.angle ** 2 / turn.duration
+        blocks = scatter * turn.duration / (
             self._energy.noise_factor ** 2 * self._model_noise.angle_random_walk ** 2
             * turn.duration + turn.extra_noise_variance + turn.lost_variance)
         likelihood = before.log_likelihood - 0.5 * (

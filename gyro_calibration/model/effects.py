@@ -152,12 +152,6 @@ def lag_difference(interval: Number, change: Number, time_constant: float,
     return _solve_recurrence(fallen + 1.0, change * (fallen / x), initial_difference)
 
 
-def lagged_signal(signal: Array, time: Array, time_constant: float) -> Array:
-    """Return a signal, shape (n,), through a lag that starts at its first value."""
-    interval, change = np.diff(time, prepend=time[:1]), np.diff(signal, prepend=signal[:1])
-    return signal + lag_difference(interval, change, time_constant)
-
-
 def _solve_recurrence(factors: Array, added: Array, initial: float) -> Array:
     """Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,)."""
     # Rows of sqrt(n) samples are computed in parallel, each from zero; then the final value of the
@@ -446,7 +440,9 @@ def _filter_lag(signal: Array, time: Array, time_constant: float) -> Array:
     """Return the signal through a lag, interpolated at 4 points a sample."""
     count = len(time)
     finer = np.interp(np.arange(4 * (count - 1) + 1) / 4, np.arange(count), time)
-    return lagged_signal(_interpolate(finer, time, signal), finer, time_constant)[::4]
+    signal = _interpolate(finer, time, signal)
+    interval, change = np.diff(finer, prepend=finer[:1]), np.diff(signal, prepend=signal[:1])
+    return (signal + lag_difference(interval, change, time_constant))[::4]
 
 
 _FAST_REVERSALS = ('swing fast with quick reversals: a lag reduces the amplitude of fast motion, '

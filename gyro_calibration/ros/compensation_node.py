@@ -420,9 +420,11 @@ class CompensationReport:
         elif estimator.temperature is not None and estimator.is_temperature_lost:
             yield (f'the temperature is missing; {estimator.temperature:.1f} degC, the last one, '
                    'is held, and the standard deviation of the bias increases')
-        for channel in estimator.missing_channels(pipeline.journal.channels):
-            yield (f'the model needs the {channel.replace("_", " ")}, which no message contains; '
-                   'that effect is left out')
+        for channel in ('supply', 'specific_force'):
+            if (estimator.current_model.uses_channel(channel)
+                    and channel not in pipeline.journal.channels):
+                yield (f'the model needs the {channel.replace("_", " ")}, which no message '
+                       'contains; that effect is left out')
         yield from (pipeline.session.warning, pipeline.clock_fault, pipeline.frame_fault,
                     pipeline.odometry_fault, store.calibration_hint, store.shared_hint,
                     monitor.bias_alarm, monitor.noise_alarm, estimator.calibration_message,
