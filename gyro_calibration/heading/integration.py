@@ -31,10 +31,11 @@ from collections import deque
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.logs.log import Array, CACHE_BLOCK_SAMPLES, DEGREE, MIN_SAMPLE_INTERVAL
+from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 #: Tolerance of durations, s: the resolution of stamps in seconds since 1970.
 TIME_TOLERANCE = 1e-6
@@ -222,16 +223,7 @@ class ThresholdFilter:
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
-    heading = np.empty(len(time))
-    heading[:1] = begin
-    for first in range(1, len(time), CACHE_BLOCK_SAMPLES):
-        end = min(first + CACHE_BLOCK_SAMPLES, len(time))
-        turned = np.add(rate[first:end], rate[first - 1:end - 1], out=heading[first:end])
-        turned *= time[first:end] - time[first - 1:end - 1]
-        turned *= 0.5
-        turned[0] += heading[first - 1]
-        np.cumsum(turned, out=turned)
-    return heading
+    return begin + cumulative_trapezoid(rate, time, initial=0.0) if len(time) else np.zeros(0)
 
 
 def integrate_with_curvature(time: Array, rate: Array) -> Array:
@@ -278,16 +270,10 @@ class BlockIntegrator:
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
         """
-        Take the next block, which may be empty.
+        Take the next block, which may be empty; return three arrays of shape (n,).
 
-        Parameters
-        ----------
-        time, rate : s and rad/s, before the threshold filter, shape (n,)
-        sensitivity : of the rates to the calibration, shape (m, n), as in `compensation`
-
-        Returns
-        -------
-        filtered rate, rad/s, heading and its standard deviation, rad, shape (n,) each
+        Rates, rad/s, are those before the threshold filter, and the sensitivity, shape (m, n), as
+        in `compensation`. Returned are filtered rates, heading and its deviation, rad.
 
         """
         if not len(time):

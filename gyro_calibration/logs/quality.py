@@ -48,10 +48,8 @@ def white_noise_deviation(values: Array, order: int = 3) -> float:
     """
     Return the standard deviation of the white part of a signal, by its differences.
 
-    Parameters
-    ----------
-    values : shape (n,); differences with nan are left out
-    order : order of the differences: 3 in motion; 1 at rest, which shows filtered noise best
+    Those with nan are left out. Their order is 3 in motion, and 1 at rest, which shows filtered
+    noise best.
 
     """
     off = np.abs(np.diff(values, order))
