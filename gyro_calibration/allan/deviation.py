@@ -221,12 +221,7 @@ def _count_lost_before(rate: Array) -> Integers | None:
 
 
 def mask_complete_windows(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Mask:
-    """
-    Return which second differences over `size` samples, from `begin` to `end`, have few losses.
-
-    `lost` is the result of `_count_lost_before`.
-
-    """
+    """Return which second differences over `size` samples have few of the samples lost before."""
     return np.asarray(lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step]
                       <= _MAX_LOST_PER_WINDOW * 2 * size)
 
@@ -245,12 +240,7 @@ _SHORT_MEMORY_INDICES = [
 
 @dataclass(frozen=True)
 class Floor:
-    """
-    The point of a chart with the lowest upper bound.
-
-    The lowest deviation is not used: at the end of the chart single points are low by chance.
-
-    """
+    """The point of a chart with the lowest upper bound."""
 
     time: float  # averaging time, s
     deviation: float  # Allan deviation, rad/s
@@ -274,6 +264,7 @@ class AllanChart:
     @property
     def floor(self) -> Floor:
         """Return the lowest point."""
+        # not the lowest deviation: at the end of the chart single points are low by chance
         lowest = int(np.argmin(self.upper))
         return Floor(*(float(values[lowest])
                        for values in (self.time, self.deviation, self.lower, self.upper)))
@@ -391,15 +382,10 @@ def _select_terms_by_slope(sizes: Integers, variance: Array) -> list[NoiseTerm]:
 
 # covariance of second differences of the angle, and of Allan variances
 
-def _lag_covariance(covariance: Callable[[Integers], Array], first: int, second: int,
+def _lag_covariance(angle_covariance: Callable[[Integers], Array], first: int, second: int,
                     lags: Integers) -> Array:
-    """
-    Return the covariance of second differences over `first` and `second` samples at lags.
-
-    `covariance` is that of the angle.
-
-    """
-    return np.sum([a * b * covariance(lags + (j * second - i * first))
+    """Return the covariance of second differences over `first` and `second` samples at lags."""
+    return np.sum([a * b * angle_covariance(lags + (j * second - i * first))
                    for i, a in enumerate((1.0, -2.0, 1.0))
                    for j, b in enumerate((1.0, -2.0, 1.0))], axis=0)
 

@@ -67,13 +67,7 @@ class CallRefused(OSError):
 
 @dataclass
 class SimulatedRobot:
-    """
-    A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model.
-
-    Where this process is delayed, the samples are late, but the robot has turned meanwhile as
-    commanded.
-
-    """
+    """A robot that turns as commanded, at up to 3 rad/s², with the gyro of a model."""
 
     model: GyroModel
     noise: Array  # of each sample, rad/s
@@ -84,6 +78,7 @@ class SimulatedRobot:
 
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
+        # where this process is delayed they are late, but the robot has turned meanwhile
         command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
         for number, noise in enumerate(self.noise):
             due = begin + number * XV3500.interval

@@ -84,16 +84,11 @@ class Transition:
 
 @dataclass(frozen=True)
 class HeadingState:
-    """
-    Mean and covariance of the state, shape (n,) and (n, n).
-
-    n = 2 + parts of the flicker + values of the calibration.
-
-    """
+    """Mean and covariance of the state."""
 
     noise: Noise
-    mean: Array
-    covariance: Array
+    mean: Array  # shape (n,), where n = 2 + parts of the flicker + values of the calibration
+    covariance: Array  # shape (n, n)
 
     @property
     def first_value_index(self) -> int:
@@ -281,12 +276,7 @@ def _padded_transition(noise: Noise, duration: float, is_unobserved: bool,
 
 def smooth_states(states: list[HeadingState], rate_integrals: list[RateIntegral],
                   resting: list[bool]) -> list[HeadingState]:
-    """
-    Return the states smoothed by all later data (Rauch, Tung and Striebel).
-
-    Given are n + 1 states, before each of n integrals and after the last.
-
-    """
+    """Smooth n + 1 states around n integrals by all later data (Rauch, Tung and Striebel)."""
     later = [states[-1]]
     for state, turn, rest in zip(states[-2::-1], rate_integrals[::-1], resting[::-1]):
         later.append(_smooth_state(state, turn, rest, later[-1]))
