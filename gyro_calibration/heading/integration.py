@@ -35,7 +35,6 @@ from gyro_calibration.logs.log import Array, DEGREE, MIN_SAMPLE_INTERVAL
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.noise import Noise
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 #: Tolerance of durations, s: the resolution of stamps in seconds since 1970.
 TIME_TOLERANCE = 1e-6
@@ -223,7 +222,8 @@ class ThresholdFilter:
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
-    return begin + cumulative_trapezoid(rate, time, initial=0.0) if len(time) else np.zeros(0)
+    steps = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
+    return np.cumsum(np.append(begin, steps))[:len(time)]
 
 
 def integrate_with_curvature(time: Array, rate: Array) -> Array:
