@@ -159,12 +159,7 @@ def read_bytes(path: str | Path, max_size: int) -> bytes:
 
 
 def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
-    """
-    Replace a file by new content, as `open_replacement`, and return the version that was written.
-
-    As long as no other program writes, it is that of `file_version`.
-
-    """
+    """Replace a file by new content, as `open_replacement`; return its `file_version`."""
     with open_replacement(path) as file:
         file.write(data)
         file.flush()

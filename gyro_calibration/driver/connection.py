@@ -178,13 +178,7 @@ class ConnectionCounts:
 
 
 def resolve_port(port: str) -> str:
-    """
-    Return the port that matches a pattern such as ``/dev/serial/by-id/*A9003XYZ*``.
-
-    A path without wildcards is returned unchanged. `PortError` states that no port matches, or
-    several devices.
-
-    """
+    """Return the port that matches a pattern, or a path itself; none or several: `PortError`."""
     if os.path.exists(port) or not glob.has_magic(port):
         return port
     matches = sorted(glob.glob(port))

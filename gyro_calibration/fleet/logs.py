@@ -255,13 +255,8 @@ def compile_file_pattern(text: str) -> re.Pattern[str]:
 
 
 def describe_log(entry: FleetLog, file_pattern: re.Pattern[str] | None = None) -> FleetLog:
-    """
-    Return an entry with its empty fields filled from file name, notes or metadata.
-
-    The order of precedence is: table, pattern of the user (by `compile_file_pattern`), notes and
-    metadata, usual file names.
-
-    """
+    """Return an entry with its empty fields filled from file name, notes or metadata."""
+    # in order of precedence: table, pattern of the user, notes and metadata, usual file names
     stem = re.sub(f'({"|".join(map(re.escape, sorted(LOG_SUFFIXES, key=len, reverse=True)))})$',
                   '', Path(entry.log).name, flags=re.IGNORECASE)
     if file_pattern is not None and (found := file_pattern.fullmatch(stem)):

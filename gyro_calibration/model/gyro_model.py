@@ -232,12 +232,8 @@ class GyroModel:
                          for name in ('scale_factor_error', 'bias')])
 
     def range_excess(self, output: Number, temperature: Number) -> tuple[Number, Number]:
-        """
-        Return how far outputs and temperatures are outside of the calibrated ranges, rad/s and K.
-
-        The range of temperatures includes that of the self-calibration.
-
-        """
+        """Return how far outputs and temperatures are out of the calibrated ranges, rad/s, K."""
+        # the range of temperatures includes that of the self-calibration
         low, high = self.valid_temperatures
         known = self.self_calibration.temperature if self.self_calibration else None
         if known is not None:

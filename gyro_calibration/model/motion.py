@@ -46,13 +46,7 @@ class MotionError(InputError):
 
 @dataclass(frozen=True)
 class Motion:
-    """
-    A motion, given at some times.
-
-    Between them the rate is linear where rates are given, and the heading is linear where only
-    headings are given.
-
-    """
+    """A motion: rates, linear between given times, or headings alone, linear between them."""
 
     time: Array  # s, increasing, shape (n,), beginning at 0
     heading: Array  # rad, continuous, shape (n,), beginning at 0

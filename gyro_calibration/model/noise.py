@@ -143,18 +143,13 @@ class GaussMarkov:
 
 @dataclass(frozen=True)
 class NoiseTerm:
-    """
-    A noise term by the slope of its Allan deviation (IEEE Std 952, C.1).
-
-    Its Allan variance is ``factor * coefficient² * tau ** (2 slope)``.
-
-    """
+    """A noise term by the slope of its Allan deviation (IEEE Std 952, C.1)."""
 
     name: str
     symbol: str
     unit: str  # in SI
     slope: float  # of log Allan deviation over log averaging time
-    allan_factor: float
+    allan_factor: float  # of coefficient² * time ** (2 slope) in the Allan variance
     #: Covariance of the angle at a time difference, for a coefficient of 1, except terms that
     #: second differences remove.
     angle_covariance: Callable[[Number], Array]

@@ -194,12 +194,7 @@ class Protocol:
         return Decoder(self, settings or Settings())
 
     def encoder(self, settings: Settings | None = None) -> Callable[[Sample], bytes]:
-        """
-        Return ``encode(sample)`` of one device, which gives the bytes that it sends.
-
-        Beyond full scale it saturates. It raises as `check_settings` does.
-
-        """
+        """Return ``encode(sample)``: the bytes of a device, which saturates at full scale."""
         settings = settings or Settings()
         self.check_settings(settings)
         limit, factor, write = (self.effective_full_scale(settings), self.unit_scale(settings),
