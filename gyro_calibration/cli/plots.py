@@ -155,12 +155,8 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
 def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tuple[float, float],
                        temperature_range: tuple[float, float],
                        dwells: Dwells | None = None) -> Any:
-    """
-    Draw the error that a model removes, over output and temperature (figure 6 of Ojeda et al.).
-
-    Without a range of temperatures it is that at the reference temperature. Dwells are dots.
-
-    """
+    """Draw the error that a model removes, over output and temperature (Ojeda et al., fig. 6)."""
+    # without a range of temperatures at the reference temperature; dwells are dots
     output = np.linspace(*rate_range, 161)
     has_temperature = bool(np.isfinite(temperature_range).all()
                            and temperature_range[0] < temperature_range[1])

@@ -58,13 +58,7 @@ _CLOCK_STEP_THRESHOLD = 0.1  # s; largest difference of a clock that is slewed, 
 
 
 class LowerLine:
-    """
-    The line below all points of the last 20 s with the least sum of distances.
-
-    Only the lowest point of each block of time is kept. The line is the edge of their lower hull
-    over their mean. With less than two points, the slope is the given one.
-
-    """
+    """The line below all points of the last 20 s with the least sum of distances."""
 
     def __init__(self, slope: float):
         self.slope = slope
@@ -84,6 +78,7 @@ class LowerLine:
         """Add a point that is not lower than the one before; x is larger than before."""
         if not self.points:
             self._begin, self._anchor = y, (x, y)
+        # only the lowest point of each block of time is kept
         if y - self._block_begin >= _LINE_WINDOW / _WINDOW_BLOCKS:
             self.points.append((x, y))
             self._block_begin = y
@@ -101,6 +96,7 @@ class LowerLine:
         self.points = deque([*kept, *moved], _WINDOW_BLOCKS)
 
     def _fit(self) -> None:
+        # the edge of the lower hull over the mean; of a single point the given slope remains
         hull = _lower_hull(self.points)
         middle = sum(x for x, _ in self.points) / len(self.points)
         left, right = next((edge for edge in pairwise(hull) if edge[1][0] >= middle),

@@ -64,13 +64,9 @@ MAX_SPECIFIC_FORCE = 1e5
 
 @dataclass(frozen=True)
 class Assumptions:
-    """
-    Standard deviations of uncalibrated values, and of the bias at temperatures without data.
+    """Standard deviations of uncalibrated values, and of the bias at temperatures without data."""
 
-    The variance of the tracker contains only the errors that it is given.
-
-    """
-
+    # the variance of the tracker contains only the errors that it is given
     bias: float = 0.5 * DEGREE  # rad/s
     scale_factor_error: float = 0.03
     #: rad/s/K; 0 for a gyro with temperature compensation.

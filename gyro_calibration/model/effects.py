@@ -38,13 +38,7 @@ from scipy.interpolate import CubicSpline
 
 @dataclass(frozen=True)
 class Channels:
-    """
-    Inputs of effects, at one instant (numbers) or at many (arrays of shape (n,)).
-
-    The channels ``lagged`` and ``heating`` depend on earlier samples; `model.channels` makes them.
-    Without them the past is taken to be constant.
-
-    """
+    """Inputs of effects, at one instant (numbers) or at many (arrays of shape (n,))."""
 
     rate: Number  # true rate, rad/s
     output: Number  # output of the gyro, rad/s
@@ -53,6 +47,7 @@ class Channels:
     specific_force: Number = 0.0  # along the input axis, m/s²
     supply: Number | None = None  # V; None where it is not known
     heading: Number = 0.0  # rad
+    # of earlier samples, by `model.channels`; without them the past is taken to be constant
     # (channel, time constant) -> the channel through a first-order lag; channels are
     # 'temperature', 'specific_force', and 'vibration', the squared deviation of the specific force
     # from its own mean over 1 s

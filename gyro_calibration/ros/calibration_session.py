@@ -475,12 +475,8 @@ class CalibrationSession:
 
 def fit_run(run: CalibrationRun, noise: Noise, date: str,
             prior: Array | None = None) -> tuple[SelfCalibration, str]:
-    """
-    Return the calibration by a complete run, and a remark; raise `DataRefused` as its methods do.
-
-    The prior is that of a fleet model; it is used in runs against a motion.
-
-    """
+    """Return the calibration by a run, and a remark; raise `DataRefused` as its methods do."""
+    # the prior is that of a fleet model, for runs against a motion
     time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
     limits = run.limits
     temperature = float(np.mean(run.temperatures)) if run.temperatures else None
