@@ -28,13 +28,8 @@ from pathlib import Path
 import reprlib
 from typing import Any
 
-from gyro_calibration.allan import (
-    allan_deviation,
-    AllanChart,
-    build_rest_record,
-    fit_noise,
-    NoiseFit,
-)
+from gyro_calibration.allan.deviation import allan_deviation, AllanChart, build_rest_record
+from gyro_calibration.allan.noise_fit import fit_noise, NoiseFit
 from gyro_calibration.calibration.encoder import EncoderCalibration
 from gyro_calibration.calibration.heading_regression import TECHNOLOGY_PRIORS
 from gyro_calibration.calibration.likelihood import ScaleBiasFit as RunFit
@@ -158,23 +153,14 @@ def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: flo
 
 @dataclass(frozen=True)
 class Headings(_PrintedResult):
-    """
-    Rates and heading of a log, corrected by a model; nan where the output was not plausible.
+    """Rates and heading of a log, corrected by a model; nan where the output was not plausible."""
 
-    Attributes
-    ----------
-    log : that was corrected
-    rate, rate_std : rad/s, shape (n,)
-    heading, heading_std : from 0 on, rad, shape (n,); None for a log without time
-    columns : all columns that `gyro_calibration compensate` adds, by name
-
-    """
-
-    log: Log
-    rate: Array
-    rate_std: Array
-    heading: Array | None
-    heading_std: Array | None
+    log: Log  # that was corrected
+    rate: Array  # rad/s, shape (n,)
+    rate_std: Array  # rad/s, shape (n,)
+    heading: Array | None  # from 0 on, rad, shape (n,); None for a log without time
+    heading_std: Array | None  # rad, shape (n,)
+    #: All columns that `gyro_calibration compensate` adds, by name.
     columns: Mapping[str, Array] = field(repr=False)
 
     def __str__(self) -> str:
@@ -240,24 +226,14 @@ def _make_headings(log: Log, blocks: Iterator[CompensatedBlock]) -> Headings:
 
 @dataclass(frozen=True)
 class Run(_PrintedResult):
-    """
-    A self-calibration.
+    """A self-calibration."""
 
-    Attributes
-    ----------
-    model : the given model with the new self-calibration
-    scale_factor_error, bias : 1 and rad/s
-    scale_factor_error_std, bias_std : 1 and rad/s
-    fit : all results of the fit, with the delay of the gyro and the goodness of fit
-
-    """
-
-    model: GyroModel
+    model: GyroModel  # the given model with the new self-calibration
     scale_factor_error: float
-    bias: float
+    bias: float  # rad/s
     scale_factor_error_std: float
-    bias_std: float
-    fit: RunFit = field(repr=False)
+    bias_std: float  # rad/s
+    fit: RunFit = field(repr=False)  # with the delay of the gyro and the goodness of fit
     _run: CalibratedRun = field(repr=False)
 
     def __str__(self) -> str:
@@ -297,17 +273,10 @@ def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel 
 
 @dataclass(frozen=True)
 class Fitted(_PrintedResult):
-    """
-    A calibration by a rate table, a turntable or a reference heading.
+    """A calibration by a rate table, a turntable or a reference heading."""
 
-    Attributes
-    ----------
-    model : with the fitted effects and their covariance
-    found : effects, dwells and residuals; or the fit of a reference heading
-
-    """
-
-    model: GyroModel
+    model: GyroModel  # with the fitted effects and their covariance
+    #: Effects, dwells and residuals; or the fit of a reference heading.
     found: Selection | EncoderCalibration = field(repr=False)
 
     def __str__(self) -> str:

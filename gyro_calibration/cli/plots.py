@@ -26,7 +26,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, TYPE_CHECKING
 
-from gyro_calibration.allan import AllanChart, NoiseFit
+from gyro_calibration.allan.deviation import AllanChart
+from gyro_calibration.allan.noise_fit import NoiseFit
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration, TurnErrors
 from gyro_calibration.calibration.scatter import rms
@@ -159,12 +160,8 @@ def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
 def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tuple[float, float],
                        temperature_range: tuple[float, float],
                        dwells: Dwells | None = None) -> Any:
-    """
-    Draw the error that a model removes, over output and temperature (figure 6 of Ojeda et al.).
-
-    Without a range of temperatures it is that at the reference temperature. Dwells are dots.
-
-    """
+    """Draw the error that a model removes, over output and temperature (Ojeda et al., fig. 6)."""
+    # without a range of temperatures at the reference temperature; dwells are dots
     output = np.linspace(*rate_range, 161)
     has_temperature = bool(np.isfinite(temperature_range).all()
                            and temperature_range[0] < temperature_range[1])
@@ -259,12 +256,8 @@ def _draw_errors(axes: Any, across: Array, error: Array, is_inlier: Mask,
 
 
 def draw_turn_errors(path: str | Path | None, errors: TurnErrors, min_rate: float) -> Any:
-    """
-    Draw the errors of full turns with a static bias only and with the model.
-
-    They are figures 8 and 9 of Ojeda et al.; turns slower than `min_rate`, rad/s, are left out.
-
-    """
+    """Draw the errors of full turns with a static bias only and with the model."""
+    # They are figures 8 and 9 of Ojeda et al.; turns slower than `min_rate`, rad/s, are left out.
     figure, panels = _panels(2, 1, (8.5, 8))
     temperature = errors.turns.temperature
     for axes, error, words in zip(panels[:, 0], (errors.static, errors.modelled),

@@ -570,13 +570,9 @@ def _is_in_degrees(reference_time: Array, heading: Array, time: Array, output: A
 
 
 def refuse_wrapped(log: Log) -> None:
-    """
-    Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped.
-
-    Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
-    heading in deg instead of rad are none.
-
-    """
+    """Raise `DataRefused` for a reference heading that jumps by full turns: it is wrapped."""
+    # Over a gap of the reference, a jump is a full turn that the gyro does not show. Changes of a
+    # heading in deg instead of rad are none.
     if log.time is None or log.reference_heading is None:
         return
     known = np.flatnonzero(np.isfinite(log.reference_heading))

@@ -107,9 +107,8 @@ class HealthMonitor:
     """
     Monitor of noise and bias at rest on a robot.
 
-    `noise_alarm` and `bias_alarm` are a sentence each, or ''; `last_rest` is the last stretch at
-    rest, or None, `examined_count` the number of them, and `has_noise_at_rest` whether one had the
-    noise and the bias of the model.
+    The alarms are a sentence each, or ''; `examined_count` is the number of stretches at rest, and
+    `has_noise_at_rest` tells whether one had the noise and the bias of the model.
 
     """
 

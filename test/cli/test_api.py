@@ -60,7 +60,7 @@ def run_model():
 def test_allan_is_a_function_and_a_folder_whichever_comes_first(order):
     program = order.format('from gyro_calibration import allan') + """
 import gyro_calibration, gyro_calibration.allan.deviation as chart, numpy
-from gyro_calibration.allan import allan_deviation
+from gyro_calibration.allan.deviation import allan_deviation
 log = gyro_calibration.simulate(gyro_calibration.read_model(
     {'effects': {}, 'noise': {'angle_random_walk': 1e-3}}), 'rest', seed=1)
 assert str(allan(log)) == str(gyro_calibration.allan(log)) and chart.allan_deviation

@@ -103,8 +103,8 @@ def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibrat
     temperature[12500] = 1e9
     time, output, temperature = lossy(time, output, temperature)
     model = GyroModel((Term(BIAS, (0.005,)),), noise=NOISE, self_calibration=calibration)
-    single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), 10.0,
-                                      NOW) for _ in range(2))
+    single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), NOW)
+                     for _ in range(2))
     expected = np.empty((len(time), 6))
     for place, (at, degc) in enumerate(zip(time.tolist(), temperature.tolist())):
         if degc == degc:

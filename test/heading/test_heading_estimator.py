@@ -45,7 +45,7 @@ MODEL = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
 def begun(model=MODEL, table=None, assumptions=None, now=NOW, temperature=25.0):
     """Return a heading that begins; with a temperature, if one is given."""
     live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(),
-                            Settings(), 10.0, now)
+                            Settings(), now)
     if temperature is not None:
         live.add_temperature(0.0, temperature)
     return live
