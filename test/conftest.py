@@ -25,6 +25,7 @@ import sys
 import tempfile
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -173,6 +174,40 @@ def run(capsys):
             code = end.code
         return code, *capsys.readouterr()
     return run
+
+
+@pytest.fixture
+def compensate(run, tmp_path):
+    """
+    Return a function that compensates a log by a model, which are paths or are written to files.
+
+    It gives ``code``, ``text`` and ``error`` of the program, and of the log that it wrote ``log``
+    and the columns that are new in it as numbers, ``columns``.
+
+    """
+    from gyro_calibration.logs.log import read_log, write_log
+    from gyro_calibration.model.model_file import write_model
+    import numpy as np
+
+    def compensate(log, model, *words):
+        if not isinstance(log, Path):
+            write_log(tmp_path / 'log.csv', log)
+            log = tmp_path / 'log.csv'
+        if not isinstance(model, Path):
+            if isinstance(model, str):
+                (tmp_path / 'model.yaml').write_text(model)
+            else:
+                write_model(tmp_path / 'model.yaml', model)
+            model = tmp_path / 'model.yaml'
+        out = tmp_path / 'out.csv'
+        code, text, error = run('compensate', log, '--model', model, '--out', out, *words)
+        done = SimpleNamespace(code=code, text=text, error=error, log=None)
+        if out.exists():
+            done.log = read_log(out)
+            done.columns = {name: np.array(values, float)
+                            for name, values in done.log.others.items()}
+        return done
+    return compensate
 
 
 @pytest.fixture
