@@ -21,7 +21,6 @@ from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
-    polynomial_to_matrix,
     rate_temperature_polynomial,
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
@@ -31,7 +30,6 @@ from gyro_calibration.model.effects import (
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
-from numpy.polynomial.polynomial import polyval2d
 import pytest
 from recovery import CUBIC, gyros, LINEAR, POLYNOMIAL, run, SINE, Table
 from scipy.stats import binom, chi2, linregress
@@ -131,20 +129,6 @@ def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_sca
     sizes = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(fit.model.covariance / np.outer(sizes, sizes),
                                covariance / np.outer(sizes, sizes), atol=1e-5)
-
-
-def test_the_matrix_of_the_paper_is_the_polynomial():
-    table = measured(SINE)
-    fit = fit_effects(table, [rate_temperature_polynomial(3, 2)])
-    matrix = polynomial_to_matrix(fit.terms[0].effect, fit.terms[0].values)
-    by_matrix = polyval2d(table.temperature, table.output / DEGREE, matrix[::-1, ::-1])
-    np.testing.assert_allclose(by_matrix * DEGREE, fit.terms[0].error(channels_of(table)),
-                               atol=1e-9)
-    raw = np.column_stack([table.temperature ** j * (table.output / DEGREE) ** i for j in range(3)
-                           for i in range(4)])
-    columns = np.column_stack(fit.terms[0].columns(channels_of(table)))
-    assert (fit.condition_number < 100.0
-            and np.linalg.cond(columns) < 1e3 < 1e9 < np.linalg.cond(raw))
 
 
 # few dwells

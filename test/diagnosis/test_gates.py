@@ -13,6 +13,7 @@
 from dataclasses import replace
 import re
 
+from chance import seeds
 from gyro_calibration import fit
 from gyro_calibration.diagnosis.gates import check_gates
 from gyro_calibration.diagnosis.pipeline import diagnose
@@ -102,14 +103,14 @@ def tilted(seed, noise):
     return replace(log, output=0.15 * MOTION + noise * vibration)
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', seeds(3))
 def test_an_axis_that_follows_in_part_by_another_factor_is_another_motion(seed):
     # half of the variance is common, which alone passes as the noise of a reference
     gate, = (each for each in check_gates(tilted(seed, 0.2)) if each.passed is False)
     assert gate.name == 'motion' and 'the output is 0.' in gate.evidence, gate
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', seeds(3))
 def test_a_noisy_gyro_of_the_right_factor_passes(seed):
     log = tilted(seed, 0.0)
     noisy = replace(log, output=log.output / 0.15 + 2.0 * np.repeat(
