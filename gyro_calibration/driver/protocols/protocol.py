@@ -94,7 +94,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Reading:
-    """The content of one frame; what is not said here is as in `Sample`."""
+    """The content of one frame; what is not stated here is as in `Sample`."""
 
     value: float | None  # in unit and sense of the device; None in a correct frame without a rate
     valid: bool = True  # by the status that the device reports
