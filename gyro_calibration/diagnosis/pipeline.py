@@ -278,12 +278,15 @@ def _settled_dwells(log: Log, fit: RegressionFit,
 
     The motion then follows the commanded rate with dynamics of its own, or the gyro the motion
     with dynamics that no cause describes. The mean squares of the whitened residual are compared
-    stretch by stretch (Mann and Whitney), and have to be twice as large between dwells.
+    stretch by stretch (Mann and Whitney), and have to be twice as large between dwells. Dwells of
+    less than half the range of rates, such as rests alone, do not show what the motion does.
 
     """
     try:
         dwells = find_dwells(log)
     except DataRefused:
+        return None
+    if np.ptp(dwells.rate) < 0.5 * (np.nanmax(log.reference_rate) - np.nanmin(log.reference_rate)):
         return None
     time = fit.problem.replays[0].channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
