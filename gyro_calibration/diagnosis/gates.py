@@ -641,14 +641,20 @@ def _regress_changes(gyro: Array, steps: Array, change: Array) -> Agreement:
     """Return the agreement without outlying spans."""
     scale = math.sqrt(float(np.mean(gyro ** 2))) or 1.0
     columns = np.column_stack([gyro / scale, steps / steps.mean()])
+    turned = np.abs(gyro), np.abs(change)
     kept = np.ones(len(change), dtype=bool)
     for _ in range(3):
         values = np.linalg.lstsq(columns[kept], change[kept], rcond=None)[0]
         off = change - columns @ values
         kept = np.abs(off) <= 6.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-15
-        if kept.sum() < max(_MIN_SPANS, len(change) // 2):
+        # Beside long rests, all turns of the gyro are outlying if the reference makes others.
+        if kept.sum() < _MIN_SPANS or turned[0][kept].sum() < 0.5 * turned[0].sum():
             kept[:] = True
     variance, left = float(np.var(change[kept])), float(np.var(off[kept]))
+    if (left >= (1.0 - _MIN_MOTION_COHERENCE) * variance
+            and turned[1][kept].sum() < 0.5 * turned[1].sum()):
+        # those of the reference are outlying, and the rest agrees no better
+        variance, left = float(np.var(change)), float(np.var(off))
     coherence = max(1.0 - left / variance, 0.0) if variance > 0.0 else 0.0
     deviation = math.sqrt(
         left / max(kept.sum() - 2, 1) / max(float(np.var(columns[kept, 0])), 1e-300))
