@@ -380,7 +380,7 @@ def _log_problems(log: Log) -> Iterator[str]:
                    f'{MIN_SAMPLES} and a tenth are needed: record again, and repair the line if '
                    'it loses samples')
         if duration < MIN_DURATION:
-            yield (f'the log lasts {duration:.1f} s; a diagnosis needs at least '
+            yield (f'the log lasts {duration:.4g} s; a diagnosis needs at least '
                    f'{MIN_DURATION:g} s: record longer')
         if duration > MAX_DURATION:
             yield (f'the log lasts {duration:.3g} s by its stamps; check that time_s is in s, or '
@@ -493,6 +493,11 @@ def check_gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     if log.time is None or log.reference_heading is None and log.reference_rate is None:
         return
+    if (late := np.diff(log.time) <= 0.0).any():
+        row = int(np.argmax(late)) + 1
+        raise DataRefused(f'the time of sample {row + 1}, {log.time[row]:g} s, is not later than '
+                          f'that before it, {log.time[row - 1]:g} s; sort the samples, and leave '
+                          'out those with the stamp of another')
     if log.reference_rate is None:
         try:
             refuse_wrapped(log)

@@ -286,9 +286,10 @@ def _settled_dwells(log: Log, fit: RegressionFit,
         dwells = find_dwells(log)
     except DataRefused:
         return None
-    if np.ptp(dwells.rate) < 0.5 * (np.nanmax(log.reference_rate) - np.nanmin(log.reference_rate)):
+    channels = fit.problem.replays[0].channels
+    if np.ptp(dwells.rate) < 0.5 * np.ptp(np.asarray(channels.rate)):
         return None
-    time = fit.problem.replays[0].channels.time
+    time = channels.time
     within = mark_rows([(rows[0], rows[-1]) for rows in dwells.rows], len(time))
     white, valid = fit.whitened_series()[0], fit.problem.replays[0].valid
     at = time[valid][0] + fit.problem.replays[0].point_interval * np.arange(len(white))
