@@ -123,6 +123,25 @@ def test_a_gyro_that_follows_passes_all_gates(noise):
     assert all(gate.passed for gate in check_gates(drive(1, noise)))
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_turns_between_long_rests_that_the_gyro_does_not_make_are_another_motion(seed):
+    generator = np.random.default_rng(seed)
+    turns = np.zeros((2, len(TIME)))  # of the gyro, and of the reference
+    for row in turns:
+        for begin in generator.integers(0, len(TIME) - 200, 8):
+            row[begin:begin + 200] = generator.uniform(-1.5, 1.5)
+    log = Log(TIME, turns[0] + 1e-3 * generator.standard_normal(len(TIME)),
+              reference_heading=np.cumsum(turns[1]) * 0.01)
+    gate = check_gates(log)[-1]
+    assert gate.name == 'motion' and gate.passed is False, gate
+
+
+def test_samples_with_the_stamp_of_another_are_refused():
+    log = drive()
+    with pytest.raises(DataRefused, match='sample 7, 0.05 s, is not later .* 0.05 s; sort'):
+        check_gates(replace(log, time=np.where(np.arange(len(TIME)) == 6, TIME[5], TIME)))
+
+
 def test_a_late_reference_passes_all_gates():
     log = drive(2, 1.0 * DEGREE)
     assert all(gate.passed for gate in check_gates(
