@@ -493,11 +493,6 @@ def check_gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
 def _run_gates(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     if log.time is None or log.reference_heading is None and log.reference_rate is None:
         return
-    if (late := np.diff(log.time) <= 0.0).any():
-        row = int(np.argmax(late)) + 1
-        raise DataRefused(f'the time of sample {row + 1}, {log.time[row]:g} s, is not later than '
-                          f'that before it, {log.time[row - 1]:g} s; sort the samples, and leave '
-                          'out those with the stamp of another')
     if log.reference_rate is None:
         try:
             refuse_wrapped(log)
