@@ -182,6 +182,12 @@ REPEATED = {  # outputs, what comes then, rate of the odometry, whether it is a 
                           None, False),
     'saturated': (coarse(0.002), np.full(500, 0.3), None, True),
     'saturated, or by chance, in coarse steps': (coarse(0.02), np.full(500, 0.3), None, False),
+    'two codes': (coarse(0.0005), np.resize([0.3, 0.3005, 0.3005, 0.3], 500), None, True),
+    'two codes after noise at rest': (
+        np.round(noisy(15.0) / 1e-4) * 1e-4, np.resize([0.0, 1e-4, 1e-4], 500), None, True),
+    'two codes of a coarse gyro': (
+        np.round(noisy(20.0, 0.01) / 0.02) * 0.02, np.round(noisy(60.0, 0.01) / 0.02) * 0.02,
+        None, False),
     'zero where odometry turns': ([], np.zeros(50), 0.3, True),
 }
 
