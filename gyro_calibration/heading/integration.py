@@ -264,8 +264,8 @@ class BlockIntegrator:
         """Begin at heading zero; `covariance` is that of the calibration, shape (m, m)."""
         self._settings, self._noise, self._covariance = settings, noise, covariance
         self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
-        self._last_rows: Array = np.zeros((2 + len(covariance), 0))
-        self._integrals: Array = np.zeros(2 + len(covariance))
+        self._last_rows: Array = np.zeros((3 + len(covariance), 0))
+        self._integrals: Array = np.zeros(3 + len(covariance))
         self._gap_variance, self.intervals = 0.0, Intervals()
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
@@ -288,7 +288,9 @@ class BlockIntegrator:
         # from the last sample of the block before on
         before = min(carried, 1)
         time, rate = time[carried - before:], rate[carried - before:]
-        rows = np.hstack([self._last_rows, np.vstack([filtered, kept, kept * sensitivity])])
+        deleted = rate[before:] - filtered
+        rows = np.hstack(
+            [self._last_rows, np.vstack([filtered, kept, deleted, kept * sensitivity])])
         interval, step, used = np.diff(time), np.diff(rate), rows[1] > 0.0
         usual, lost = self.intervals.add_many(interval)
         is_long = (lost > 0) & (interval > MAX_GAP)
@@ -310,6 +312,6 @@ class BlockIntegrator:
         unseen = np.cumsum(unseen)
         self._last_rows, self._integrals = rows[:, -1:], grown[:, -1]
         self._gap_variance = float(unseen[-1])
-        variance = (quadratic_form(self._covariance, grown[2:])
-                    + self._noise.heading_variance(grown[1]) + unseen)
+        variance = (quadratic_form(self._covariance, grown[3:])
+                    + self._noise.heading_variance(grown[1]) + grown[2] ** 2 + unseen)
         return filtered, grown[0, before:], np.sqrt(variance[before:])

@@ -174,6 +174,7 @@ class HeadingTracker:
                                     age if len(covariance) else None)
         self._still_sensitivity: Array | None = None
         self._open_variance: float | None = None
+        self._filtered_turn = 0.0  # deleted by the threshold filter, rad
         self._zero_integral = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
         self._block_integral, self._open_integral = self._new_integral(), self._zero_integral
         if self._last_sample is not None:
@@ -185,6 +186,8 @@ class HeadingTracker:
     def configure(self, settings: Settings) -> None:  # noqa: A003
         """Go on with other settings."""
         self._settings = settings
+        self._state = self._state.with_added_variance(HEADING_INDEX, self._filtered_turn ** 2)
+        self._filtered_turn = 0.0
         self._detects_rest = (settings.false_alarms > 0.0
                               and self._model_noise.angle_random_walk > 0.0)
         self._energy.configure(self._model_noise, settings.false_alarms)
@@ -233,7 +236,7 @@ class HeadingTracker:
     def set_heading(self, heading: float, variance: float) -> None:
         """Set the heading, rad, and its variance, rad²; the bias estimate remains."""
         self._advance_to_last_sample()
-        self.heading, self._suspected_turn = heading, None
+        self.heading, self._suspected_turn, self._filtered_turn = heading, None, 0.0
         self._state = self._state.with_heading(heading, variance)
         self._begin_anew()
 
@@ -247,7 +250,8 @@ class HeadingTracker:
             self._open_variance = self._state.heading_variance(
                 self._with_unbiased_sensitivity(self._open_integral))
         part = self._block_integral
-        return (self._open_variance + self._state.noise.angle_random_walk ** 2 * part.duration
+        return (self._open_variance + self._filtered_turn ** 2
+                + self._state.noise.angle_random_walk ** 2 * part.duration
                 + part.lost_variance + part.extra_noise_variance + self._pending_correction ** 2)
 
     # Samples
@@ -502,7 +506,9 @@ class HeadingTracker:
         if self.is_resting:
             self.deleted_heading += corrected
             return
-        self.deleted_heading += half * (rate - filtered + last_rate - last_filtered)
+        deleted = half * (rate - filtered + last_rate - last_filtered)
+        self.deleted_heading += deleted
+        self._filtered_turn += deleted
         settled = self._pending_correction * duration / SETTLING_TIME
         self._pending_correction -= settled
         self.heading += corrected + settled

@@ -13,7 +13,7 @@
 import math
 
 from chance import RARE, rms_bounds
-from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
 from gyro_calibration.heading.kalman import (
     HEADING_INDEX,
     initial_state,
@@ -223,6 +223,19 @@ def test_a_slow_turn_until_the_wheels_stop_is_no_bias(after):
                     True if index < turning else after)
     assert tracker.is_resting and abs(tracker.bias[0]) < 1e-4 * DEGREE
     assert tracker.finish().mean[HEADING_INDEX] == pytest.approx(4.0 * DEGREE, abs=0.01 * DEGREE)
+
+
+def test_the_deviation_includes_what_the_threshold_filter_deletes():
+    """10 min at 0.1 deg/s, below the threshold; the verb and the tracker state the same."""
+    time, _, heading, rate = gyro(constant_rate_motion([(5, 20), (600, 0.1), (5, -20)]),
+                                  np.random.default_rng(15))
+    sensitivity, threshold = -np.vstack([rate, np.ones(len(rate))]), Threshold()
+    live = follow(time, rate, Settings(0.0, threshold))
+    _, written, deviation = BlockIntegrator(threshold, XV3500, KNOWN).add(time, rate, sensitivity)
+    assert abs(live.heading[-1] - heading[-1]) > 30.0 * DEGREE
+    for error, stated in ((live.heading - heading, np.sqrt(live.variance)),
+                          (written - heading, deviation)):
+        assert 0.5 < abs(error[-1]) / stated[-1] < 2.0
 
 
 def test_the_slowest_turn_that_is_noticed_is_noticed():
