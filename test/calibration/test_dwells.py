@@ -278,7 +278,7 @@ def test_a_simulation_without_noise_claims_nothing(generator):
 def test_stamps_that_come_in_bursts_do_not_hide_dwells(generator):
     bursts = np.floor(TIME / 0.08) * 0.08 + 1e-4 * (np.arange(len(TIME)) % 8)
     found = find_dwells(replace(run(generator),
-                                time=np.maximum.accumulate(bursts) + 1e-9 * np.arange(len(TIME))))
+                                time=np.maximum.accumulate(bursts) + 1e-8 * np.arange(len(TIME))))
     assert len(found) == len(RATES) and 'missing' not in ' '.join(found.remarks)
 
 
