@@ -633,9 +633,10 @@ def _find_steps(fit: SpanFit, causes: Sequence[CauseTerm],
     """
     Return the steps of the bias given some causes, at most three.
 
-    A step is tried at each point, and around the best of them; first also two at once. The noise is fitted again with the
-    steps, so that a random walk that they had caused does not hide them, and one that the log has
-    is not a step. Of three steps those that are not significant are removed, the weakest first.
+    A step is tried at each point, and around the best of them; first also two at once. The noise
+    is fitted again with the steps, so that a random walk that they had caused does not hide them,
+    and one that the log has is not a step. Of three steps those that are not significant are
+    removed, the weakest first.
 
     """
     times = fit.spans.time[2:-2]
