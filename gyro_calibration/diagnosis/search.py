@@ -439,7 +439,8 @@ def _with_part_of_log(search: Search, causes: Causes) -> Causes:
     steps = [each for each in search.candidates if each.cause == 'bias_step'][::2]
     pairs = [pair for pair in combinations(range(len(steps)), 2)
              if steps[pair[0]].log_index == steps[pair[1]].log_index]
-    if not pairs or len(causes) + 2 > MAX_CAUSES:
+    # without generic terms nothing tells a part from another structure in time
+    if not pairs or len(causes) + 2 > MAX_CAUSES or all(map(is_named, search.candidates)):
         return ()
     fit = fit_causes(search.problem, causes)
     columns = np.concatenate([candidate_transforms(each, fit.distorted) for each in steps])
